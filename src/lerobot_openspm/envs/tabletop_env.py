@@ -1,0 +1,169 @@
+"""The tabletop as a Gymnasium environment, observed and acted on like LeRobot's LIBERO."""
+
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from gymnasium import spaces
+from scipy.spatial.transform import Rotation
+
+from lerobot_openspm.envs import scene
+from lerobot_openspm.envs.layout import sample_layout
+from lerobot_openspm.envs.simulator import TabletopSimulator
+from lerobot_openspm.envs.tasks import TASKS, select_tasks
+
+STATE_NAMES = ("x", "y", "z", "axis_angle_x", "axis_angle_y", "axis_angle_z", "finger_left", "finger_right")
+ACTION_NAMES = (
+    "delta_x",
+    "delta_y",
+    "delta_z",
+    "delta_axis_angle_x",
+    "delta_axis_angle_y",
+    "delta_axis_angle_z",
+    "gripper",
+)
+OBJECT_POSE_NAMES = tuple(f"{n}.{c}" for n in scene.OBJECT_NAMES for c in ("x", "y", "z", "qw", "qx", "qy", "qz"))
+SUCCESS_HOLD_STEPS = 5
+MIN_IMAGE_SIZE, MAX_IMAGE_SIZE = 128, 256
+RENDER_SIZE = 256
+
+
+def axis_angle(rotation: np.ndarray) -> np.ndarray:
+    """Axis-angle of a rotation as LIBERO writes it: near (pi, 0, 0) for a hand that points down, growing past pi.
+
+    The quaternion's x is kept positive, so that the vector does not jump while the hand points down or level.
+
+    Args:
+        rotation: (3, 3), R_world_ee.
+
+    Returns:
+        (3,) axis times angle, angle in [0, 2 pi].
+    """
+    quat_xyzw = Rotation.from_matrix(rotation).as_quat()
+    if quat_xyzw[0] < 0:
+        quat_xyzw = -quat_xyzw
+    norm = float(np.linalg.norm(quat_xyzw[:3]))
+    if norm < 1e-9:
+        return np.zeros(3)
+    return quat_xyzw[:3] / norm * 2.0 * np.arctan2(norm, quat_xyzw[3])
+
+
+class TabletopEnv(gym.Env):
+    """One task on the tabletop.
+
+    Observation: "pixels" (front, side, wrist: upright uint8 RGB), "agent_pos" (8,) float32 as in `STATE_NAMES` and,
+    if asked for, "object_poses" (49,) float32, the simulator's true poses, for oracle ablations only.
+    Action: (7,) in [-1, 1], as in `TabletopSimulator.apply`; 20 actions a second.
+    """
+
+    metadata = {"render_modes": ["rgb_array"], "render_fps": 20}
+
+    def __init__(
+        self,
+        task: str = "bowl_on_plate",
+        episode_length: int = 300,
+        observation_height: int = 256,
+        observation_width: int = 256,
+        object_poses: bool = False,
+        render_mode: str = "rgb_array",
+    ) -> None:
+        super().__init__()
+        for label, size in (("observation_height", observation_height), ("observation_width", observation_width)):
+            if not MIN_IMAGE_SIZE <= size <= MAX_IMAGE_SIZE:
+                raise ValueError(f"{label} must lie in [{MIN_IMAGE_SIZE}, {MAX_IMAGE_SIZE}], got {size}")
+        if episode_length <= 0:
+            raise ValueError(f"episode_length must be positive, got {episode_length}")
+        (self.task,) = select_tasks(task)
+        self.task_description = TASKS[self.task].instruction
+        self._max_episode_steps = episode_length
+        self.render_mode = render_mode
+        self._size = (observation_height, observation_width)
+        self._with_object_poses = object_poses
+        self._simulator: TabletopSimulator | None = None
+        self._steps = 0
+        self._held = 0
+        image = spaces.Box(0, 255, (*self._size, 3), np.uint8)
+        entries: dict[str, spaces.Space] = {
+            "pixels": spaces.Dict({name: image for name in scene.CAMERA_NAMES}),
+            "agent_pos": spaces.Box(-np.inf, np.inf, (len(STATE_NAMES),), np.float32),
+        }
+        if object_poses:
+            entries["object_poses"] = spaces.Box(-np.inf, np.inf, (len(OBJECT_POSE_NAMES),), np.float32)
+        self.observation_space = spaces.Dict(entries)
+        self.action_space = spaces.Box(-1.0, 1.0, (len(ACTION_NAMES),), np.float32)
+
+    @property
+    def simulator(self) -> TabletopSimulator:
+        """The physics behind this environment; made on first use, in the process that uses it."""
+        if self._simulator is None:
+            self._simulator = TabletopSimulator()
+        return self._simulator
+
+    def reset(self, *, seed: int | None = None, options: dict | None = None) -> tuple[dict, dict[str, Any]]:
+        """Draw a new layout from the seed; the options are those of Gymnasium and are not used."""
+        super().reset(seed=seed)
+        self.simulator.reset(sample_layout(self.np_random))
+        self._steps = self._held = 0
+        return self._observe(), self._info("running")
+
+    def step(self, action: np.ndarray) -> tuple[dict, float, bool, bool, dict[str, Any]]:
+        """Apply one action; success has to hold for `SUCCESS_HOLD_STEPS` steps in a row.
+
+        Raises:
+            ValueError: The action has the wrong shape or is not finite.
+        """
+        action = np.asarray(action, dtype=np.float64)
+        if action.shape != (len(ACTION_NAMES),) or not np.isfinite(action).all():
+            raise ValueError(f"action must be {len(ACTION_NAMES)} finite numbers, got shape {action.shape}: {action}")
+        self.simulator.apply(np.clip(action, -1.0, 1.0))
+        self._steps += 1
+        if self.simulator.is_unstable():
+            return self._observe(), 0.0, True, False, self._info("unstable")
+        self._held = self._held + 1 if TASKS[self.task].is_done(self.simulator) else 0
+        if self._held >= SUCCESS_HOLD_STEPS:
+            return self._observe(), 1.0, True, False, self._info("success")
+        truncated = self._steps >= self._max_episode_steps
+        return self._observe(), 0.0, False, truncated, self._info("time_limit" if truncated else "running")
+
+    def _info(self, status: str) -> dict[str, Any]:
+        return {"is_success": status == "success", "status": status, "unstable": status == "unstable"}
+
+    def _observe(self) -> dict[str, Any]:
+        observation: dict[str, Any] = {
+            "pixels": {name: self.simulator.render(name, *self._size) for name in scene.CAMERA_NAMES},
+            "agent_pos": self.state(),
+        }
+        if self._with_object_poses:
+            observation["object_poses"] = self.object_pose_vector()
+        return observation
+
+    def state(self) -> np.ndarray:
+        """(8,) float32, as in `STATE_NAMES`: ee position (m), ee axis-angle (rad), finger positions (m)."""
+        pose = self.simulator.ee_pose()
+        return np.concatenate([pose[:3, 3], axis_angle(pose[:3, :3]), self.simulator.finger_positions()]).astype(np.float32)
+
+    def object_poses(self) -> dict[str, np.ndarray]:
+        """T_world_obj, (4, 4), per object name: the simulator's truth."""
+        return self.simulator.object_poses()
+
+    def ee_pose(self) -> np.ndarray:
+        """T_world_ee, (4, 4): the simulator's truth."""
+        return self.simulator.ee_pose()
+
+    def object_pose_vector(self) -> np.ndarray:
+        """(49,) float32, as in `OBJECT_POSE_NAMES`: position (m) and quat_wxyz (w >= 0) per object."""
+        parts = []
+        for pose in self.object_poses().values():
+            x, y, z, w = Rotation.from_matrix(pose[:3, :3]).as_quat(canonical=True)
+            parts.append([*pose[:3, 3], w, x, y, z])
+        return np.concatenate(parts).astype(np.float32)
+
+    def render(self) -> np.ndarray:
+        """The front view, 256 x 256 RGB."""
+        return self.simulator.render("front", RENDER_SIZE, RENDER_SIZE)
+
+    def close(self) -> None:
+        """Free the renderers; the environment can be reset again afterwards."""
+        if self._simulator is not None:
+            self._simulator.close()
+            self._simulator = None
