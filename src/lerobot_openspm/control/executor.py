@@ -1,0 +1,229 @@
+"""The state of one environment: which key pose is next, and what to do until the hand is there."""
+
+from __future__ import annotations
+
+import logging
+from collections import deque
+from collections.abc import Sequence
+from dataclasses import dataclass
+from enum import StrEnum
+from typing import Literal
+
+import numpy as np
+
+from lerobot_openspm.control.transfer import Target
+from lerobot_openspm.flow.condition import Query, progress
+from lerobot_openspm.geometry import se3
+from lerobot_openspm.geometry.se3 import Array
+from lerobot_openspm.memory.robot import RobotModel
+
+logger = logging.getLogger(__name__)
+
+Execution = Literal["open_loop", "closed_loop", "closed_loop_trc"]
+EXECUTIONS: tuple[Execution, ...] = ("open_loop", "closed_loop", "closed_loop_trc")
+
+# An opening below this share of the demonstrated one means that the fingers hold nothing.
+HELD_SHARE = 0.4
+# Where the demonstration's fingers stood further apart than this share of open, they held something.
+HOLDING_SHARE = 0.03
+
+
+class Status(StrEnum):
+    """What one environment's execution is up to. Only the world causes these; bad input raises."""
+
+    WAITING = "waiting"  # no plan yet
+    RUNNING = "running"
+    DONE = "done"  # every key pose was reached; the hand holds still
+    OBJECT_NOT_FOUND = "object_not_found"
+    INFEASIBLE = "infeasible"  # no entry passes the transfer checks here
+    NO_PROGRESS = "no_progress"  # retries are used up
+
+
+@dataclass(frozen=True)
+class ControlSettings:
+    """How key poses are followed.
+
+    Attributes:
+        execution: ``open_loop`` plans every chunk from where the hand should be; ``closed_loop`` from where it
+            is; ``closed_loop_trc`` adds terminal residual correction.
+        residual_m: The paper's epsilon_r: a precise key pose is met within this distance ...
+        residual_rad: ... and this angle.
+        passing_m: A key pose that is only passed by is met within this distance ...
+        passing_rad: ... and this angle.
+        max_corrections: Corrective chunks per key pose.
+        max_attempts: How often a grasp that missed, or a key pose that was not met, is tried again.
+    """
+
+    execution: Execution = "closed_loop_trc"
+    residual_m: float = 0.004
+    residual_rad: float = 0.06
+    passing_m: float = 0.015
+    passing_rad: float = 0.15
+    max_corrections: int = 8
+    max_attempts: int = 3
+
+
+@dataclass(frozen=True)
+class Hand:
+    """What proprioception says: pose ``T_world_ee`` ``(4, 4)``, and opening in the units of the state."""
+
+    T_world_ee: Array
+    opening: float
+
+
+class Executor:
+    """Follows one plan in one environment. Holds everything that must be forgotten at a reset."""
+
+    def __init__(self, settings: ControlSettings, robot: RobotModel):
+        self._settings, self._robot = settings, robot
+        self.status = Status.WAITING
+        self.plan: tuple[Target, ...] = ()
+        self.index = 0
+        self.attempts = 0
+        self.corrections = 0
+        self.replans = 0  # chunks asked for so far; seeds the noise of each
+        self._steps = 0
+        self._start = np.eye(4)
+        self._believed = np.eye(4)  # open loop: where the hand should be
+        self._queue: deque[Array] = deque()
+
+    def begin(self, plan: Sequence[Target], hand: Hand, index: int = 0) -> None:
+        """Start following a plan, or a better version of the same one, from a key pose on."""
+        self.plan, self.status = tuple(plan), Status.RUNNING
+        self._believed = hand.T_world_ee
+        self._enter(index, hand)
+
+    def revise(self, plan: Sequence[Target]) -> None:
+        """Replace the targets by better estimates of the same key poses, without losing the place."""
+        self.plan = tuple(plan)
+
+    @property
+    def target(self) -> Target | None:
+        return self.plan[self.index] if self.status is Status.RUNNING else None
+
+    def advance(self, hand: Hand) -> bool:
+        """Look at the hand and move on to the next key pose where one is reached.
+
+        Returns:
+            True when the objects have to be found again: a grasp missed, a held object was lost, or a key
+            pose could not be met, and an attempt is left.
+        """
+        while self.status is Status.RUNNING:
+            if self._lost_grip(hand):
+                return self._retry("the fingers hold nothing")
+            if not self._finished(hand):
+                break
+            if self.index + 1 == len(self.plan):
+                self.status = Status.DONE
+                self._queue.clear()
+            else:
+                self._enter(self.index + 1, hand)
+        if self.status is Status.RUNNING and self.corrections > self._settings.max_corrections:
+            # A hand that is held up short of a key pose it only passes by goes on to the next one.
+            if not self.plan[self.index].precise and self.index + 1 < len(self.plan):
+                self._enter(self.index + 1, hand)
+                return False
+            return self._retry("it does not get closer")
+        return False
+
+    def next_action(self) -> Array | None:
+        """The next queued canonical action ``(7,)``, or None when a chunk is needed (:meth:`query`)."""
+        if self.status is not Status.RUNNING:
+            return self.hold()
+        if not self._queue:
+            return None
+        self._steps += 1
+        action = self._queue.popleft()
+        if self._settings.execution == "open_loop":
+            gains = [self._robot.metres_per_action] * 3 + [self._robot.radians_per_action] * 3
+            self._believed = se3.apply_increment(self._believed, action[:6] * np.array(gains))
+        return action
+
+    def hold(self) -> Array:
+        """The action that stays where it is, fingers as they are."""
+        closed = self.plan[self.index].memory.closed if self.plan else False
+        return np.array([0.0] * 6 + [self._robot.command(closed)])
+
+    def query(self, hand: Hand) -> Query:
+        """The condition of the next chunk. Counts it, and counts it as a correction once time is up."""
+        target = self.plan[self.index]
+        if self._steps >= self._nominal_steps():
+            self.corrections += 1
+        self.replans += 1
+        here = self._believed if self._settings.execution == "open_loop" else hand.T_world_ee
+        return Query(
+            T_world_ee=here,
+            T_world_target=target.T_world_ee,
+            progress=progress(self._start, here, target.T_world_ee),
+            closed=np.asarray(float(target.memory.closed)),
+            opening=np.asarray(hand.opening / max(self._robot.open_width, 1e-9)),
+            dwell=np.asarray(float(target.memory.dwell)),
+        )
+
+    def push_chunk(self, actions: Array) -> None:
+        """Queue a chunk of canonical actions ``(H, 7)``; non-finite numbers never reach the robot."""
+        if not np.isfinite(actions).all():
+            raise FloatingPointError(f"the flow model gave non-finite actions {actions}")
+        self._queue.extend(actions)
+
+    def _enter(self, index: int, hand: Hand) -> None:
+        if self._settings.execution == "open_loop" and index > 0:
+            self._believed = self.plan[index - 1].T_world_ee
+        self._start = self._believed if self._settings.execution == "open_loop" else hand.T_world_ee
+        self.index, self._steps, self.corrections = index, 0, 0
+        self._queue.clear()
+
+    def _nominal_steps(self) -> int:
+        """How long the way to the key pose should take, by the demonstration and by its length here."""
+        target = self.plan[self.index]
+        if target.memory.dwell:
+            return target.memory.n_steps
+        length = float(se3.distance(self._start, target.T_world_ee))
+        return max(target.memory.n_steps, int(np.ceil(length / self._robot.metres_per_step)))
+
+    def _finished(self, hand: Hand) -> bool:
+        target, settings = self.plan[self.index], self._settings
+        time_is_up = self._steps >= self._nominal_steps()
+        if target.memory.dwell or settings.execution == "open_loop":
+            return time_is_up
+        if settings.execution == "closed_loop" and time_is_up:
+            return True
+        metres, radians = se3.distances(hand.T_world_ee, target.T_world_ee)
+        if target.precise:
+            return bool(metres <= settings.residual_m and radians <= settings.residual_rad)
+        return bool(metres <= settings.passing_m and radians <= settings.passing_rad)
+
+    def _lost_grip(self, hand: Hand) -> bool:
+        """Whether the fingers closed further than the demonstration's did around the object."""
+        if self._settings.execution != "closed_loop_trc" or self.index == 0:
+            return False
+        before, now = self.plan[self.index - 1].memory, self.plan[self.index].memory
+        grasped = next(
+            (p.memory for p in reversed(self.plan[: self.index]) if p.memory.phase == "grasp"), None
+        )
+        if not (before.closed and now.closed) or now.phase == "push" or grasped is None:
+            return False
+        if grasped.opening < HOLDING_SHARE * self._robot.open_width:
+            return False
+        return hand.opening < HELD_SHARE * grasped.opening
+
+    def _retry(self, why: str) -> bool:
+        """Give the key poses of this contact another try, from its approach on, if attempts are left."""
+        self.attempts += 1
+        phase = self.plan[self.index].memory.phase
+        if self.attempts > self._settings.max_attempts:
+            self.status = Status.NO_PROGRESS
+            self._queue.clear()
+            logger.info("giving up at key pose %d (%s): %s", self.index, phase, why)
+            return False
+        logger.info("trying key pose %d (%s) again: %s", self.index, phase, why)
+        return True
+
+    def retry_index(self) -> int:
+        """The first key pose of the approach that the present one depends on."""
+        index = self.index
+        while index > 0 and self.plan[index].memory.phase != "approach":
+            index -= 1
+        while index > 0 and self.plan[index - 1].memory.phase == "approach":
+            index -= 1
+        return index

@@ -1,0 +1,115 @@
+"""Carrying key poses over to the present scene, and checking that the hand can follow them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from lerobot_openspm.geometry import se3
+from lerobot_openspm.geometry.se3 import Array
+from lerobot_openspm.memory.entry import MemoryEntry, MemoryKeyPose
+from lerobot_openspm.memory.robot import RobotModel
+
+# Phases in which the hand touches something: their key poses are met precisely, the others in passing.
+PRECISE_PHASES = ("grasp", "place", "release", "push", "open", "turn")
+
+
+@dataclass(frozen=True)
+class Target:
+    """A key pose in the present scene.
+
+    Attributes:
+        T_world_ee: Where the hand is to be, ``(4, 4)``.
+        memory: The key pose it was carried over from.
+        precise: Whether it is met by terminal residual correction, or only passed by.
+    """
+
+    T_world_ee: Array
+    memory: MemoryKeyPose
+    precise: bool
+
+
+def transfer_pose(T_world_obj: Array, T_obj_ee: Array) -> Array:
+    """``T_world_ee = T_world_obj @ T_obj_ee``, the paper's transfer rule; batched over leading axes."""
+    return T_world_obj @ T_obj_ee
+
+
+def transfer(
+    entry: MemoryEntry, layout: Mapping[str, Array], yaw_periods: Mapping[str, float], T_world_ee: Array
+) -> tuple[Target, ...]:
+    """Carry an entry's key poses over to the scene.
+
+    An object that looks the same after, say, half a turn may be met from either side; the side that needs
+    less turning of the hand is taken.
+
+    Args:
+        entry: The entry to execute.
+        layout: Present poses ``T_world_obj`` ``(4, 4)`` of its anchors.
+        yaw_periods: Angle by object that turns it into itself, radians; 0 for a body of revolution.
+        T_world_ee: Present hand pose ``(4, 4)``.
+    """
+    chosen: dict[str, Array] = {}
+    targets: list[Target] = []
+    before = T_world_ee
+    for i, pose in enumerate(entry.key_poses):
+        if pose.anchor not in chosen:
+            choices = se3.yaw_equivalents(layout[pose.anchor], yaw_periods.get(pose.anchor, 2 * np.pi))
+            turns = [float(se3.distances(before, transfer_pose(T, pose.T_obj_ee))[1]) for T in choices]
+            chosen[pose.anchor] = choices[int(np.argmin(turns))]
+        before = transfer_pose(chosen[pose.anchor], pose.T_obj_ee)
+        after = entry.key_poses[i + 1] if i + 1 < len(entry.key_poses) else None
+        # The arrival before the fingers move is where a grasp or a release is decided.
+        precise = pose.phase in PRECISE_PHASES or (
+            after is not None and (after.dwell or after.phase == "push")
+        )
+        targets.append(Target(before, pose, precise))
+    return tuple(targets)
+
+
+@dataclass(frozen=True)
+class TransferLimits:
+    """Bounds of the checks on transferred key poses.
+
+    Attributes:
+        reach_margin_m: How far outside the box that the demonstrations covered the hand may go.
+        max_jump_m: Longest way between consecutive key poses.
+        max_jump_rad: Largest turn between consecutive key poses.
+        min_clearance_m: How far below the lowest demonstrated hand position the hand may go.
+    """
+
+    reach_margin_m: float = 0.10
+    max_jump_m: float = 0.8
+    max_jump_rad: float = 2.8
+    min_clearance_m: float = 0.01
+
+
+def check_transfer(
+    targets: Sequence[Target], T_world_ee: Array, robot: RobotModel, limits: TransferLimits
+) -> list[str]:
+    """The paper's checks: reachability, pose jump, minimum distance. Returns what is wrong, in words.
+
+    Minimum distance is kept from the support surface: the lowest point that the hand reached in the
+    demonstrations bounds how low it may be sent.
+    """
+    problems = []
+    low, high = robot.workspace
+    before = T_world_ee
+    for i, target in enumerate(targets):
+        where = f"key pose {i} ({target.memory.phase} at {target.memory.anchor})"
+        p = target.T_world_ee[:3, 3]
+        outside = np.maximum(np.maximum(low - p, p - high), 0.0)
+        if (beyond := float(np.linalg.norm(outside[:2]))) > limits.reach_margin_m or (
+            p[2] - high[2] > limits.reach_margin_m
+        ):
+            problems.append(
+                f"{where} is {max(beyond, p[2] - high[2]):.3f} m outside the demonstrated workspace"
+            )
+        if low[2] - p[2] > limits.min_clearance_m:
+            problems.append(f"{where} is {low[2] - p[2]:.3f} m below the lowest demonstrated hand position")
+        metres, radians = se3.distances(before, target.T_world_ee)
+        if metres > limits.max_jump_m or radians > limits.max_jump_rad:
+            problems.append(f"{where} is {metres:.2f} m and {radians:.2f} rad from the one before")
+        before = target.T_world_ee
+    return problems

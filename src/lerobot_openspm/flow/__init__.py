@@ -1,0 +1,1 @@
+"""The flow-matching model that fills the motion between key poses."""

@@ -1,0 +1,104 @@
+"""What the flow model is told, and the frame in which it answers.
+
+``paper``: current pose, target pose, their relative pose and the progress, all in the world; actions in the
+world. ``equivariant``: the relative pose and the progress in the frame of the target; actions in that frame.
+A scene that is moved and turned as a whole looks the same to the second.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from lerobot_openspm.geometry import se3
+from lerobot_openspm.geometry.se3 import Array
+
+Conditioning = Literal["paper", "equivariant"]
+CONDITIONINGS: tuple[Conditioning, ...] = ("paper", "equivariant")
+
+# Relative poses are given at several scales: the coarse one says how far, the fine ones resolve the last
+# centimetres, where a single scale would leave millimetres in the noise.
+POSITION_SCALES_M = (0.2, 0.03, 0.006)
+ROTATION_SCALES_RAD = (1.0, 0.1)
+_RELATIVE = 3 * len(POSITION_SCALES_M) + 3 * len(ROTATION_SCALES_RAD)
+_COMMON = 4
+CONDITION_DIM: dict[Conditioning, int] = {
+    "paper": 18 + _RELATIVE + _COMMON,
+    "equivariant": _RELATIVE + _COMMON,
+}
+
+
+@dataclass(frozen=True)
+class Query:
+    """Where the hand is, where it goes, and how far along it is: ``c_t`` of the paper, batched over ``(...)``.
+
+    Attributes:
+        T_world_ee: Current hand pose ``(..., 4, 4)``.
+        T_world_target: Target key pose ``(..., 4, 4)``.
+        progress: Share ``(...)`` of the segment that lies behind, the paper's tau, 0 to 1.
+        closed: Whether the gripper is to be closed on the way, ``(...)`` of 0 and 1.
+        opening: Gripper opening ``(...)`` as a share of the open gripper's.
+        dwell: Whether the hand waits for the fingers, ``(...)`` of 0 and 1.
+    """
+
+    T_world_ee: Array
+    T_world_target: Array
+    progress: Array
+    closed: Array
+    opening: Array
+    dwell: Array
+
+
+def progress(T_world_start: ArrayLike, T_world_ee: ArrayLike, T_world_target: ArrayLike) -> Array:
+    """Progress tau ``(...)`` along a segment, by what remains of its length.
+
+    It is measured on the geometry and not on the clock, so that a pause or a push does not let it run ahead.
+    """
+    whole = np.maximum(se3.distance(T_world_start, T_world_target), 1e-3)
+    return np.clip(1 - se3.distance(T_world_ee, T_world_target) / whole, 0.0, 1.0)
+
+
+def encode(query: Query, conditioning: Conditioning) -> Array:
+    """Condition vectors ``(..., CONDITION_DIM[conditioning])`` of queries."""
+    common = np.stack([query.progress, query.closed, query.opening, query.dwell], axis=-1).astype(float)
+    if conditioning == "equivariant":
+        relative = se3.inverse(query.T_world_target) @ query.T_world_ee
+        return np.concatenate([_relative_features(relative), common], axis=-1)
+    relative = se3.inverse(query.T_world_ee) @ query.T_world_target
+    poses = [_pose_features(query.T_world_ee), _pose_features(query.T_world_target)]
+    return np.concatenate([*poses, _relative_features(relative), common], axis=-1)
+
+
+def to_model_frame(actions: ArrayLike, T_world_target: ArrayLike, conditioning: Conditioning) -> Array:
+    """Express world actions ``(..., 7)`` in the frame that the model answers in."""
+    return _rotate(actions, np.swapaxes(np.asarray(T_world_target)[..., :3, :3], -1, -2), conditioning)
+
+
+def to_world_frame(actions: ArrayLike, T_world_target: ArrayLike, conditioning: Conditioning) -> Array:
+    """Inverse of :func:`to_model_frame`."""
+    return _rotate(actions, np.asarray(T_world_target)[..., :3, :3], conditioning)
+
+
+def _rotate(actions: ArrayLike, R: Array, conditioning: Conditioning) -> Array:
+    actions = np.asarray(actions, float)
+    if conditioning == "paper":
+        return actions
+    turned = [(R @ part[..., None])[..., 0] for part in (actions[..., :3], actions[..., 3:6])]
+    return np.concatenate([*turned, actions[..., 6:]], axis=-1)
+
+
+def _relative_features(T: Array) -> Array:
+    position, rotvec = T[..., :3, 3], se3.log_so3(T[..., :3, :3])
+    parts = [position / POSITION_SCALES_M[0], rotvec / ROTATION_SCALES_RAD[0]]
+    parts += [np.tanh(position / scale) for scale in POSITION_SCALES_M[1:]]
+    parts += [np.tanh(rotvec / scale) for scale in ROTATION_SCALES_RAD[1:]]
+    return np.concatenate(parts, axis=-1)
+
+
+def _pose_features(T: Array) -> Array:
+    """Position in decimetres and the first two columns of the rotation, which vary continuously."""
+    columns = np.swapaxes(T[..., :3, :2], -1, -2).reshape(*T.shape[:-2], 6)
+    return np.concatenate([T[..., :3, 3] / POSITION_SCALES_M[0], columns], axis=-1)

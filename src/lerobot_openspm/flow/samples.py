@@ -1,0 +1,132 @@
+"""Training samples: (condition, action chunk) from the segments between key poses."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lerobot_openspm.flow.condition import Conditioning, Query, encode, progress, to_model_frame
+from lerobot_openspm.geometry import se3
+from lerobot_openspm.geometry.se3 import Array
+from lerobot_openspm.memory.robot import RobotModel
+from lerobot_openspm.mining.key_poses import KeyPose
+from lerobot_openspm.mining.signals import Episode
+
+# A hand that is further than this from its target and hardly commanded to move is pausing.
+PAUSE_DISTANCE_M = 0.012
+PAUSE_FRACTION = 0.15
+
+
+@dataclass(frozen=True)
+class SegmentFrames:
+    """Every frame of every segment of the demonstrations, `n` in all: what chunks are learned from.
+
+    Attributes:
+        index: Dataset index ``(n,)`` of the frame.
+        episode: Episode index ``(n,)``.
+        query: Condition of the frame, batched over ``(n,)``.
+        T_world_start: Where the segment began, ``(n, 4, 4)``.
+        actions: The chunk that followed, ``(n, H, 7)`` in the world; after the end of the segment the hand
+            holds still.
+    """
+
+    index: NDArray[np.int64]
+    episode: NDArray[np.int64]
+    query: Query
+    T_world_start: Array
+    actions: Array
+
+    def __len__(self) -> int:
+        return len(self.index)
+
+
+def segment_frames(
+    episodes: Sequence[Episode], key_poses: Sequence[Sequence[KeyPose]], robot: RobotModel, chunk_size: int
+) -> SegmentFrames:
+    """Cut demonstrations into segments and take every frame of them, human pauses left out."""
+    parts = [
+        _one_segment(episode, before, pose, robot, chunk_size)
+        for episode, poses in zip(episodes, key_poses, strict=True)
+        for before, pose in zip([0, *(p.frame for p in poses[:-1])], poses, strict=True)
+        if pose.frame > before
+    ]
+    parts = [part for part in parts if len(part)]
+    stack = {
+        name: np.concatenate([getattr(p.query, name) for p in parts]) for name in Query.__dataclass_fields__
+    }
+    return SegmentFrames(
+        index=np.concatenate([p.index for p in parts]),
+        episode=np.concatenate([p.episode for p in parts]),
+        query=Query(**stack),
+        T_world_start=np.concatenate([p.T_world_start for p in parts]),
+        actions=np.concatenate([p.actions for p in parts]),
+    )
+
+
+def _one_segment(
+    episode: Episode, first: int, pose: KeyPose, robot: RobotModel, chunk_size: int
+) -> SegmentFrames:
+    frames = np.arange(first, pose.frame)
+    ahead = frames[:, None] + np.arange(chunk_size)
+    actions = episode.actions[np.minimum(ahead, pose.frame - 1)]
+    actions[ahead >= pose.frame, :6] = 0.0
+    actions[..., 6] = robot.command(pose.closed)
+    T_world_ee = episode.T_world_ee[frames]
+    away = se3.distance(T_world_ee, pose.T_world_ee)
+    effort = np.linalg.norm(actions[:, 0, :6], axis=-1)
+    usual = np.median(np.linalg.norm(episode.actions[:, :6], axis=-1))
+    keep = (effort > PAUSE_FRACTION * usual) | (away < PAUSE_DISTANCE_M) | pose.dwell
+    frames, T_world_ee, actions = frames[keep], T_world_ee[keep], actions[keep]
+    n = len(frames)
+    start = np.broadcast_to(episode.T_world_ee[first], (n, 4, 4))
+    target = np.broadcast_to(pose.T_world_ee, (n, 4, 4))
+    query = Query(
+        T_world_ee=T_world_ee,
+        T_world_target=target,
+        progress=progress(start, T_world_ee, target),
+        closed=np.full(n, float(pose.closed)),
+        opening=episode.opening[frames] / max(robot.open_width, 1e-9),
+        dwell=np.full(n, float(pose.dwell)),
+    )
+    index = episode.from_index + frames
+    return SegmentFrames(index, np.full(n, episode.index), query, np.array(start), actions)
+
+
+def perturbed(
+    frames: SegmentFrames, robot: RobotModel, std_m: float, std_rad: float, rng: np.random.Generator
+) -> SegmentFrames:
+    """Move each frame's hand a little and correct its chunk so that it ends where it did.
+
+    Closed-loop execution leaves the demonstrated paths by the error of the model and of the controller.
+    These samples show the way back. The displacement grows with the distance from the target, and waiting
+    frames stay as they are.
+    """
+    query, n = frames.query, len(frames)
+    away = se3.distance(query.T_world_ee, query.T_world_target)
+    size = (np.minimum(1.0, 0.25 + away / 0.1) * (1 - query.dwell))[:, None]
+    shift = rng.normal(size=(n, 6)) * size * np.array([std_m] * 3 + [std_rad] * 3)
+    moved = se3.apply_increment(query.T_world_ee, shift)
+    gains = np.array([robot.metres_per_action] * 3 + [robot.radians_per_action] * 3)
+    correction = np.where(gains > 0, -shift / np.maximum(gains, 1e-9), 0.0)
+    actions = frames.actions.copy()
+    actions[..., :6] += correction[:, None] / actions.shape[1]
+    query = Query(
+        moved, query.T_world_target, progress(frames.T_world_start, moved, query.T_world_target),
+        query.closed, query.opening, query.dwell,
+    )  # fmt: skip
+    return SegmentFrames(frames.index, frames.episode, query, frames.T_world_start, actions)
+
+
+def conditions_and_chunks(frames: SegmentFrames, conditioning: Conditioning) -> tuple[Array, Array]:
+    """Network inputs ``(n, condition_dim)`` and targets ``(n, H, 7)`` in the frame the model answers in."""
+    target = frames.query.T_world_target[:, None]
+    return encode(frames.query, conditioning), to_model_frame(frames.actions, target, conditioning)
+
+
+def action_scale(chunks: Array) -> Array:
+    """Spread ``(7,)`` of the actions: one for translations, one for rotations, one for the gripper."""
+    groups = [chunks[..., :3], chunks[..., 3:6], chunks[..., 6:]]
+    return np.concatenate([np.full(g.shape[-1], max(float(np.sqrt((g**2).mean())), 1e-3)) for g in groups])

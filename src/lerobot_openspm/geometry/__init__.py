@@ -1,0 +1,1 @@
+"""SE(3), cameras and vector layouts. Knows nothing of LeRobot or MuJoCo."""

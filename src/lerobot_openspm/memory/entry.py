@@ -1,0 +1,95 @@
+"""Memory entries, the paper's ``M_i = {k_i, l_i, {T_obj_ee, c, gamma}, r_i, nu_i}``."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+from lerobot_openspm.geometry.se3 import Array
+
+PHASES = (
+    "approach", "grasp", "lift", "pre-place", "place", "release", "retreat", "push", "open", "turn",
+)  # fmt: skip
+
+
+@dataclass(frozen=True)
+class SubTask:
+    """One thing to do, as an instruction says it.
+
+    Attributes:
+        operation: What is done: put, open, close, push, turn on, turn off.
+        target: The object it is done to.
+        part: The part of the target that is meant ("top drawer"), or "".
+        relation: Where the target goes relative to the landmark ("on", "in", "front of"), or "".
+        landmark: The object it goes to, or "".
+    """
+
+    operation: str
+    target: str
+    part: str = ""
+    relation: str = ""
+    landmark: str = ""
+
+    @property
+    def objects(self) -> tuple[str, ...]:
+        return tuple(name for name in (self.target, self.landmark) if name)
+
+
+@dataclass(frozen=True)
+class RetrievalKey:
+    """The paper's ``k_i``: operations with their objects, and the phase structure of the demonstration."""
+
+    sub_tasks: tuple[SubTask, ...]
+    phases: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class MemoryKeyPose:
+    """Where the hand was relative to the object that mattered, at one phase boundary.
+
+    Attributes:
+        anchor: Name of the object whose frame the pose is kept in.
+        T_obj_ee: Pose ``(4, 4)`` of the hand in the anchor's frame, the paper's ``Delta T_j``.
+        phase: The phase that ends here, one of :data:`PHASES`.
+        confidence: The paper's ``gamma``, 0 to 1.
+        closed: Whether the gripper is closed (or closing) on the way to this pose.
+        opening: Gripper opening observed here, in the units of the robot's state.
+        n_steps: Control steps the demonstration took to get here from the key pose before, pauses left out.
+        dwell: Whether the hand stands still on the way here while the gripper opens or closes.
+    """
+
+    anchor: str
+    T_obj_ee: Array
+    phase: str
+    confidence: float
+    closed: bool
+    opening: float
+    n_steps: int
+    dwell: bool
+
+
+@dataclass(frozen=True)
+class MemoryEntry:
+    """One demonstration, compressed.
+
+    Attributes:
+        key: What the entry is found by, ``k_i``.
+        language: The instruction of the demonstration, ``l_i``.
+        key_poses: In the order of execution.
+        quality: The paper's ``r_i``, 0 to 1: how closely the demonstration agrees with the others of its task.
+        version: The paper's ``nu_i``: counts up when an entry is replaced.
+        source: Dataset and episode the entry was mined from.
+        layout: Poses ``T_world_obj`` ``(4, 4)`` of the objects at the start of the demonstration.
+    """
+
+    key: RetrievalKey
+    language: str
+    key_poses: tuple[MemoryKeyPose, ...]
+    quality: float
+    version: int
+    source: str
+    layout: dict[str, Array] = field(default_factory=dict[str, Array])
+
+    @property
+    def anchors(self) -> tuple[str, ...]:
+        """The objects the entry needs a pose of, each once, in the order of their first use."""
+        return tuple(dict.fromkeys(pose.anchor for pose in self.key_poses))

@@ -1,0 +1,126 @@
+"""Retrieval by the paper's score: semantics, geometry, quality."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from lerobot_openspm.errors import InstructionError
+from lerobot_openspm.geometry.se3 import Array
+from lerobot_openspm.memory.entry import MemoryEntry, SubTask
+from lerobot_openspm.memory.instruction import parse_instruction
+
+# Below this semantic score an entry is about something else.
+MIN_SEMANTIC = 0.75
+# Layouts whose objects stand this much differently relative to one another count as 1/e alike.
+LAYOUT_SCALE_M = 0.15
+
+
+@dataclass(frozen=True)
+class ScoreWeights:
+    """The paper's lambda_s, lambda_g and lambda_r."""
+
+    semantic: float = 1.0
+    geometric: float = 0.5
+    quality: float = 0.5
+
+
+@dataclass(frozen=True)
+class Scored:
+    """An entry with the three terms of its score."""
+
+    entry: MemoryEntry
+    semantic: float
+    geometric: float
+    quality: float
+    total: float
+
+
+def semantic_candidates(instruction: str, entries: Sequence[MemoryEntry]) -> list[tuple[MemoryEntry, float]]:
+    """Entries that are about what the instruction says, with ``S_sem``, best first.
+
+    Raises:
+        InstructionError: No entry is. The error lists the instructions the memory knows.
+    """
+    sub_tasks = parse_instruction(instruction)
+    scored = [(entry, semantic_score(sub_tasks, entry.key.sub_tasks)) for entry in entries]
+    best = max((score for _, score in scored), default=0.0)
+    if best < MIN_SEMANTIC:
+        known = "; ".join(sorted({entry.language for entry in entries})) or "nothing yet"
+        raise InstructionError(
+            f"the memory holds no experience for the instruction {instruction!r}; it knows: {known}. "
+            "Record demonstrations of it and train again, or use one of these instructions"
+        )
+    close = [(entry, score) for entry, score in scored if score >= best - 1e-9]
+    return sorted(close, key=lambda item: -item[1])
+
+
+def semantic_score(asked: Sequence[SubTask], known: Sequence[SubTask]) -> float:
+    """``S_sem`` in 0..1: how many task elements agree, sub-task by sub-task, in order."""
+    if len(asked) != len(known):
+        return 0.0
+    scores = [_sub_task_score(a, k) for a, k in zip(asked, known, strict=True)]
+    return min(scores) if scores else 0.0
+
+
+def _sub_task_score(asked: SubTask, known: SubTask) -> float:
+    if asked.operation != known.operation:
+        return 0.0
+    terms = [
+        (0.35, _names_agree(asked.target, known.target)),
+        (0.35, _names_agree(asked.landmark, known.landmark)),
+        (0.2, _names_agree(asked.part, known.part)),
+        (0.1, float(asked.relation == known.relation)),
+    ]
+    return 0.0 if min(terms[0][1], terms[1][1]) == 0.0 else sum(weight * value for weight, value in terms)
+
+
+def _names_agree(asked: str, known: str) -> float:
+    """1 for the same words, less for a shorter or longer name of the same thing ("bottle"), 0 for another."""
+    if asked == known:
+        return 1.0
+    a, k = asked.split(), known.split()
+    shared = len(set(a) & set(k))
+    return 0.8 if a and k and shared == min(len(set(a)), len(set(k))) else 0.0
+
+
+def layout_similarity(now: Mapping[str, Array], then: Mapping[str, Array]) -> float:
+    """How alike two layouts ``{name: T_world_obj}`` are in 0..1, by where the objects stand to one another."""
+    shared = sorted(set(now) & set(then))
+    if not shared:
+        return 0.0
+    p_now = np.stack([now[name][:3, 3] for name in shared])
+    p_then = np.stack([then[name][:3, 3] for name in shared])
+    if len(shared) > 1:
+        p_now, p_then = p_now - p_now.mean(axis=0), p_then - p_then.mean(axis=0)
+    return float(np.exp(-np.linalg.norm(p_now - p_then, axis=1).mean() / LAYOUT_SCALE_M))
+
+
+def retrieve(
+    candidates: Sequence[tuple[MemoryEntry, float]],
+    layout: Mapping[str, Array],
+    feasible: Callable[[MemoryEntry], bool],
+    weights: ScoreWeights,
+) -> list[Scored]:
+    """Rank entries by ``lambda_s S_sem + lambda_g S_geo + lambda_r r``, best first.
+
+    Args:
+        candidates: Entries with their semantic score.
+        layout: Poses ``T_world_obj`` of the objects found in the present scene.
+        feasible: Whether an entry's key poses, carried over to the scene, pass the transfer checks.
+        weights: The three lambdas.
+
+    Returns:
+        Ranked entries. ``S_geo`` is 0 for an entry with an object that was not found or with infeasible key
+        poses, so that such an entry comes first only when there is no other.
+    """
+    ranked = []
+    for entry, semantic in candidates:
+        usable = all(name in layout for name in entry.anchors) and feasible(entry)
+        geometric = 0.5 + 0.5 * layout_similarity(layout, entry.layout) if usable else 0.0
+        total = weights.semantic * semantic + weights.geometric * geometric + weights.quality * entry.quality
+        ranked.append(Scored(entry, semantic, geometric, entry.quality, total))
+    # Usable entries first whatever the weights: an infeasible one cannot be executed.
+    return sorted(ranked, key=lambda scored: (scored.geometric == 0.0, -scored.total))

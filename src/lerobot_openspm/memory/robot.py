@@ -1,0 +1,42 @@
+"""What the memory knows of the robot that gave the demonstrations."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lerobot_openspm.geometry.se3 import Array
+
+
+@dataclass(frozen=True)
+class RobotModel:
+    """What the demonstrations tell of the robot, so that nothing about it is written into the code.
+
+    Attributes:
+        close_command: Gripper command that closes.
+        open_command: Gripper command that opens.
+        open_width: Opening of the open gripper, in the units of the state.
+        metres_per_action: Displacement per unit of commanded position increment and step.
+        radians_per_action: Rotation per unit of commanded rotation increment and step.
+        metres_per_step: Usual speed of the moving hand, rotation included as in :func:`se3.distance`.
+        workspace: Lowest and highest hand position ``(2, 3)`` in the world.
+    """
+
+    close_command: float
+    open_command: float
+    open_width: float
+    metres_per_action: float
+    radians_per_action: float
+    metres_per_step: float
+    workspace: Array
+
+    def closed(self, gripper_commands: Array) -> NDArray[np.bool_]:
+        """Which of the commands ``(...)`` close the gripper."""
+        middle = (self.close_command + self.open_command) / 2
+        return np.asarray((gripper_commands - middle) * (self.close_command - middle) > 0)
+
+    def command(self, closed: bool) -> float:
+        """The gripper command that closes or opens."""
+        return self.close_command if closed else self.open_command

@@ -1,0 +1,1 @@
+"""From demonstrations to key poses: signals, key poses, anchors. One episode in, key poses out."""

@@ -1,0 +1,145 @@
+"""Anchors by consensus: in the frame of which object does a key pose vary least over the demonstrations?"""
+
+from __future__ import annotations
+
+from collections import Counter, defaultdict
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from lerobot_openspm.geometry import se3
+from lerobot_openspm.geometry.se3 import Array
+from lerobot_openspm.memory.entry import SubTask
+from lerobot_openspm.mining.key_poses import KeyPose
+
+# An anchor other than the one the instruction suggests must explain the demonstrations better by this much,
+# shared among them: with one demonstration the instruction decides, with many the evidence does.
+PRIOR_M = 0.05
+# Key poses at contacts decide; the deviation of a good demonstration there is of this order.
+QUALITY_SCALE_M = 0.02
+
+Role = tuple[int, str, int]
+CONTACT_PHASES = ("grasp", "place", "release", "push", "open", "turn")
+
+
+@dataclass(frozen=True)
+class Demonstration:
+    """One episode, ready for the consensus.
+
+    Attributes:
+        key_poses: Its key poses, in order.
+        layout: Pose ``T_world_obj`` ``(4, 4)`` of every object found in its first frame.
+    """
+
+    key_poses: tuple[KeyPose, ...]
+    layout: Mapping[str, Array]
+
+
+def roles(key_poses: Sequence[KeyPose]) -> list[Role]:
+    """What each key pose is for: which contact, which phase, and which of several with both the same.
+
+    The last ones of a kind are counted first (0 is the one nearest to the contact), so that an extra corner
+    far away in one demonstration does not shift the others.
+    """
+    seen: Counter[tuple[int, str]] = Counter()
+    backwards: list[Role] = []
+    for pose in reversed(key_poses):
+        backwards.append((pose.contact, pose.phase, seen[pose.contact, pose.phase]))
+        seen[pose.contact, pose.phase] += 1
+    return backwards[::-1]
+
+
+def sub_task_of(pose: KeyPose, sub_tasks: Sequence[SubTask]) -> SubTask:
+    """The sub-task a key pose serves: each one takes two gripper transitions, and leaving is part of it."""
+    contact = pose.contact - 1 if pose.phase == "retreat" else pose.contact
+    return sub_tasks[min(max(contact, 0) // 2, len(sub_tasks) - 1)]
+
+
+def suggested_anchor(pose: KeyPose, sub_tasks: Sequence[SubTask]) -> str:
+    """The object that the instruction suggests for a phase: what is grasped, or where it goes."""
+    sub_task = sub_task_of(pose, sub_tasks)
+    arriving = pose.phase in ("pre-place", "place", "release", "retreat", "push")
+    return sub_task.landmark if arriving and sub_task.landmark else sub_task.target
+
+
+def consensus(demonstrations: Sequence[Demonstration], sub_tasks: Sequence[SubTask]) -> dict[Role, str]:
+    """Choose an anchor for every role of one task.
+
+    Candidates are the objects of the instruction that were found in every demonstration showing the role;
+    an object not named in it is never an anchor, because nothing would look for it at run time.
+    """
+    named = [name for sub_task in sub_tasks for name in sub_task.objects]
+    gathered: dict[Role, list[tuple[KeyPose, Mapping[str, Array]]]] = defaultdict(list)
+    for demonstration in demonstrations:
+        for role, pose in zip(roles(demonstration.key_poses), demonstration.key_poses, strict=True):
+            gathered[role].append((pose, demonstration.layout))
+    anchors: dict[Role, str] = {}
+    for role, members in gathered.items():
+        suggested = suggested_anchor(members[0][0], sub_tasks)
+        costs = {}
+        for name in dict.fromkeys(named):
+            T_obj_ee = [
+                se3.inverse(layout[name]) @ pose.T_world_ee for pose, layout in members if name in layout
+            ]
+            if T_obj_ee:
+                prior = 0.0 if name == suggested else PRIOR_M / len(T_obj_ee)
+                missing = PRIOR_M * (1 - len(T_obj_ee) / len(members))
+                costs[name] = spread(np.stack(T_obj_ee)) + prior + missing
+        if costs:
+            anchors[role] = min(costs, key=lambda name: costs[name])
+    return anchors
+
+
+def spread(T_obj_ee: Array) -> float:
+    """Median distance in metres of poses ``(n, 4, 4)`` from their medoid; 0 for a single one."""
+    return float(np.median(deviations(T_obj_ee)))
+
+
+def deviations(T_obj_ee: Array) -> Array:
+    """Distance ``(n,)`` in metres of each pose from the medoid of all."""
+    between = se3.distance(T_obj_ee[:, None], T_obj_ee[None])
+    return between[int(np.argmin(between.sum(axis=1)))]
+
+
+def align_symmetric(
+    demonstrations: Sequence[Demonstration], yaw_periods: Mapping[str, float]
+) -> list[Demonstration]:
+    """Turn the frames of symmetric objects so that the demonstrations agree.
+
+    Perception cannot tell such an object from itself turned by its period, so each demonstration may hold
+    any choice. All are brought to that of the first demonstration in which the object was found.
+    """
+    references: dict[str, Array] = {}
+    aligned = []
+    for demonstration in demonstrations:
+        layout = dict(demonstration.layout)
+        contacts = [p.T_world_ee for p in demonstration.key_poses if p.phase in CONTACT_PHASES]
+        for name, T_world_obj in layout.items():
+            equivalents = se3.yaw_equivalents(T_world_obj, yaw_periods.get(name, 2 * np.pi))
+            if len(equivalents) == 1 or not contacts:
+                continue
+            relative = [se3.inverse(T) @ np.stack(contacts) for T in equivalents]
+            reference = references.setdefault(name, relative[0])
+            n = min(len(reference), len(contacts))
+            # The contact nearest to the object tells most about which way round it is.
+            costs = [float(np.min(se3.distance(T_obj_ee[:n], reference[:n]))) for T_obj_ee in relative]
+            layout[name] = equivalents[int(np.argmin(costs))]
+        aligned.append(Demonstration(demonstration.key_poses, layout))
+    return aligned
+
+
+def qualities(demonstrations: Sequence[Demonstration], anchors: Mapping[Role, str]) -> list[float]:
+    """The paper's ``r`` of each demonstration: 1 where it agrees with the others at its contacts."""
+    gathered: dict[Role, list[tuple[int, Array]]] = defaultdict(list)
+    for i, demonstration in enumerate(demonstrations):
+        for role, pose in zip(roles(demonstration.key_poses), demonstration.key_poses, strict=True):
+            name = anchors.get(role)
+            if pose.phase in CONTACT_PHASES and name in demonstration.layout:
+                gathered[role].append((i, se3.inverse(demonstration.layout[name]) @ pose.T_world_ee))
+    worst = np.zeros(len(demonstrations))
+    for members in gathered.values():
+        distances = deviations(np.stack([T for _, T in members]))
+        for (i, _), distance in zip(members, distances, strict=True):
+            worst[i] = max(worst[i], distance)
+    return [float(np.exp(-((w / QUALITY_SCALE_M) ** 2))) for w in worst]

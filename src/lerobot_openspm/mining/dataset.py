@@ -1,0 +1,108 @@
+"""Reading a LeRobotDataset for mining: low-dimensional columns for all frames, images for a few."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+from lerobot.datasets import LeRobotDataset
+from lerobot.utils.constants import ACTION, OBS_STATE
+
+from lerobot_openspm.errors import DatasetError
+from lerobot_openspm.geometry import se3
+from lerobot_openspm.geometry.camera import Camera
+from lerobot_openspm.geometry.layout import VectorLayout
+from lerobot_openspm.geometry.se3 import Array
+from lerobot_openspm.mining.signals import Episode
+from lerobot_openspm.perception.types import View
+
+# True object poses of simulated demonstrations; read for the oracle ablation alone.
+SIMULATOR_POSES = "simulator.object_poses"
+
+
+class Demonstrations:
+    """The episodes of a LeRobotDataset as mining reads them.
+
+    Columns come straight from the parquet files. A frame's images are decoded only when asked for: going
+    through ``dataset[i]`` for every frame would decode every video once over.
+    """
+
+    def __init__(self, dataset: LeRobotDataset, state_layout: VectorLayout, action_layout: VectorLayout):
+        self._dataset = dataset
+        self._state_layout, self._action_layout = state_layout, action_layout
+        missing = [key for key in (OBS_STATE, ACTION) if key not in dataset.features]
+        if missing:
+            raise DatasetError(
+                f"dataset {dataset.repo_id} lacks {missing}; it has {sorted(dataset.features)}. OpenSPM mines "
+                "end-effector poses and increments: record them, or rename the features"
+            )
+
+    @property
+    def name(self) -> str:
+        return str(self._dataset.repo_id)
+
+    def episodes(self, indices: Sequence[int] | None = None) -> list[Episode]:
+        """Read the given episodes, or all of them. Raises DatasetError for an index that does not exist."""
+        meta = self._dataset.meta.episodes
+        n_episodes = self._dataset.meta.total_episodes
+        wanted = list(range(n_episodes)) if indices is None else list(indices)
+        if bad := [index for index in wanted if not 0 <= index < n_episodes]:
+            raise DatasetError(f"dataset {self.name} has episodes 0 to {n_episodes - 1}, got {bad}")
+        columns = self._dataset.hf_dataset.select_columns([OBS_STATE, ACTION, "task_index"]).with_format(
+            "numpy"
+        )
+        table = columns[:]
+        names = {int(row["task_index"]): str(task) for task, row in self._dataset.meta.tasks.iterrows()}
+        episodes = []
+        for index in wanted:
+            first, last = int(meta["dataset_from_index"][index]), int(meta["dataset_to_index"][index])
+            state = np.asarray(table[OBS_STATE][first:last], float)
+            action = np.asarray(table[ACTION][first:last], float)
+            episodes.append(
+                Episode(
+                    index=index,
+                    task=names[int(table["task_index"][first])],
+                    from_index=first,
+                    T_world_ee=self._state_layout.poses(state),
+                    opening=self._state_layout.openings(state),
+                    actions=self._action_layout.decode_actions(action),
+                )
+            )
+        return episodes
+
+    def views(self, episode: Episode, frame: int, cameras: Mapping[str, Camera]) -> dict[str, View]:
+        """Decode one frame's images of the calibrated cameras, keyed by camera."""
+        item = self._dataset[episode.from_index + frame]
+        views = {}
+        for key, camera in cameras.items():
+            if key not in item:
+                raise DatasetError(
+                    f"dataset {self.name} has no camera {key!r} that the calibration names; it has "
+                    f"{self._dataset.meta.camera_keys}"
+                )
+            image = item[key].numpy().transpose(1, 2, 0)
+            image = image if image.dtype == np.uint8 else np.round(image * 255).astype(np.uint8)
+            scaled = camera.scaled(image.shape[1], image.shape[0])
+            views[key] = View(image, scaled, scaled.T_world_cam(episode.T_world_ee[frame]))
+        return views
+
+    def simulator_poses(self, episode: Episode, frame: int) -> dict[str, Array]:
+        """True object poses ``T_world_obj`` by name, where a simulator recorded them (oracle ablation only)."""
+        if SIMULATOR_POSES not in self._dataset.features:
+            raise DatasetError(
+                f"dataset {self.name} has no {SIMULATOR_POSES!r}, which --policy.perception=oracle needs; "
+                "use perception=demonstrations, or record with openspm collect"
+            )
+        feature = self._dataset.features[SIMULATOR_POSES]
+        row = self._dataset.hf_dataset.select_columns([SIMULATOR_POSES]).with_format("numpy")
+        values = np.asarray(row[episode.from_index + frame][SIMULATOR_POSES], float)
+        return decode_object_poses(values, feature["names"])
+
+
+def decode_object_poses(values: Array, names: Sequence[str]) -> dict[str, Array]:
+    """Read ``n * 7`` numbers (position, quat_wxyz per object); names are ``<object>.<component>``."""
+    objects = list(dict.fromkeys(name.rsplit(".", 1)[0] for name in names))
+    rows = np.asarray(values, float).reshape(len(objects), 7)
+    quat_xyzw = rows[:, [4, 5, 6, 3]]
+    T = se3.transform(se3.matrix_from_quat_xyzw(quat_xyzw), rows[:, :3])
+    return dict(zip(objects, T, strict=True))

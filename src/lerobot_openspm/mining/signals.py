@@ -1,0 +1,80 @@
+"""The low-dimensional signals of episodes, and what they say about the robot."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from lerobot_openspm.geometry import se3
+from lerobot_openspm.geometry.se3 import Array
+from lerobot_openspm.memory.robot import RobotModel
+
+# Commanded and achieved motion are compared over windows this long, because an operational-space
+# controller answers a command over several steps.
+GAIN_WINDOW_STEPS = 5
+
+
+@dataclass(frozen=True)
+class Episode:
+    """What mining reads of one demonstration, `n` frames long.
+
+    Attributes:
+        index: Episode index in the dataset.
+        task: The instruction.
+        from_index: Dataset index of the first frame.
+        T_world_ee: Hand poses ``(n, 4, 4)``.
+        opening: Gripper opening ``(n,)`` in the units of the state.
+        actions: Canonical actions ``(n, 7)`` in the units of the dataset.
+    """
+
+    index: int
+    task: str
+    from_index: int
+    T_world_ee: Array
+    opening: Array
+    actions: Array
+
+    def __len__(self) -> int:
+        return len(self.opening)
+
+
+def observe_robot(episodes: Sequence[Episode]) -> RobotModel:
+    """Fit the gripper's convention and the gain from action to motion over all episodes."""
+    commands = np.concatenate([episode.actions[:, 6] for episode in episodes])
+    low, high = np.percentile(commands, [2, 98]) if len(commands) else (-1.0, 1.0)
+    middle = (low + high) / 2
+    # Under the command that closes, the opening shrinks over the following steps.
+    trend = sum(
+        float(((episode.actions[:-5, 6] - middle) * (episode.opening[5:] - episode.opening[:-5])).sum())
+        for episode in episodes
+        if len(episode) > 5
+    )
+    close, open_ = (high, low) if trend <= 0 else (low, high)
+    opening = np.concatenate([episode.opening for episode in episodes])
+    positions = np.concatenate([episode.T_world_ee[:, :3, 3] for episode in episodes])
+    speed = np.concatenate([se3.distance(e.T_world_ee[:-1], e.T_world_ee[1:]) for e in episodes])
+    return RobotModel(
+        close_command=float(close),
+        open_command=float(open_),
+        open_width=float(np.percentile(opening, 98)),
+        metres_per_action=_gain(episodes, slice(0, 3)),
+        radians_per_action=_gain(episodes, slice(3, 6)),
+        metres_per_step=float(np.median(speed[speed > 0.1 * speed.max()])),
+        workspace=np.stack([positions.min(axis=0), positions.max(axis=0)]),
+    )
+
+
+def _gain(episodes: Sequence[Episode], part: slice) -> float:
+    """Least-squares slope of achieved over commanded motion; 0 when nothing was commanded."""
+    k, cross, power = GAIN_WINDOW_STEPS, 0.0, 0.0
+    for episode in episodes:
+        if len(episode) <= 2 * k:
+            continue
+        achieved = se3.increment(episode.T_world_ee[:-k], episode.T_world_ee[k:])[:, part]
+        sums = np.cumsum(np.vstack([np.zeros(7), episode.actions]), axis=0)
+        commanded = (sums[k:-1] - sums[: -k - 1])[: len(achieved), part]
+        cross += float((achieved * commanded).sum())
+        power += float((commanded**2).sum())
+    return cross / power if power > 0 else 0.0
