@@ -9,10 +9,10 @@ from lerobot_openspm.envs import scene
 
 # (x, y) in the world, metres.
 NOMINAL_XY = {
-    "bowl": (0.16, 0.10),
+    "bowl": (0.20, 0.05),
     "plate": (0.17, -0.24),
     "box": (0.08, 0.28),
-    "bottle": (0.27, -0.06),
+    "bottle": (0.28, -0.08),
     "rack": (0.27, 0.27),
     "cabinet": (-0.22, 0.22),
     "stove": (-0.20, -0.22),
@@ -29,6 +29,9 @@ HAND_GAP = 0.01
 HAND_RADIUS = 0.055
 MAX_TRIES = 20_000
 PLATE_MIN_WAY = 0.08
+# Before the cabinet (x, half y, its frame): the bottle is taller than a drawer's underside, and a bowl under an open
+# drawer could not be taken from above.
+DRAWERS_WAY = {"bottle": (0.50, 0.09), "bowl": (0.37, 0.19)}
 
 
 class LayoutError(RuntimeError):
@@ -148,11 +151,12 @@ def plate_goal(stove: Placement) -> tuple[float, float]:
 
 
 def _ways_are_free(layout: dict[str, Placement], discs: dict) -> bool:
-    """The bottle stays out of the drawers' way, and nothing stands on the plate's way to the stove's front."""
-    bottle, cabinet, plate = layout["bottle"], layout["cabinet"], layout["plate"]
-    local_x, local_y = cabinet.to_local(bottle.x, bottle.y)
-    if local_x < 0.50 and abs(local_y) < 0.09:
-        return False
+    """Bottle and bowl stay out of the drawers' way, and nothing stands on the plate's way to the stove's front."""
+    cabinet, plate = layout["cabinet"], layout["plate"]
+    for name, (way_x, way_y) in DRAWERS_WAY.items():
+        local_x, local_y = cabinet.to_local(layout[name].x, layout[name].y)
+        if local_x < way_x and abs(local_y) < way_y:
+            return False
     goal = plate_goal(layout["stove"])
     if math.hypot(goal[0] - plate.x, goal[1] - plate.y) < PLATE_MIN_WAY:
         return False

@@ -1,0 +1,127 @@
+"""Motion primitives of the scripted experts: proportional control through the 7-D actions, imperfect like a person's.
+
+Every primitive is a generator: it yields one action, is resumed after the environment has stepped, and looks again.
+"""
+
+import math
+from collections.abc import Iterator
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from lerobot_openspm.envs.simulator import HOME_ROTATION, MAX_STEP_M, MAX_STEP_RAD, TabletopSimulator
+
+GAIN = 0.5
+ACTION_NOISE = 0.03
+PAUSE_SEGMENTS = 8
+VIA_CHANCE = 0.6
+GRASP_NOISE_M = 0.0012
+GRASP_NOISE_RAD = math.radians(1.5)
+# Fingers pointing along the cabinet's -x with the camera above: the hand at home, turned by 90 degrees about y.
+LEVEL_ROTATION = Rotation.from_euler("y", 90, degrees=True).as_matrix() @ HOME_ROTATION
+
+Actions = Iterator[np.ndarray]
+
+
+def yaw_matrix(yaw: float) -> np.ndarray:
+    """Rotation about the world's z, (3, 3)."""
+    return Rotation.from_euler("z", yaw).as_matrix()
+
+
+def pose(position: np.ndarray, rotation: np.ndarray) -> np.ndarray:
+    """Build a (4, 4) transform."""
+    result = np.eye(4)
+    result[:3, :3], result[:3, 3] = rotation, position
+    return result
+
+
+def pointing_down(position: np.ndarray, yaw: float = 0.0) -> np.ndarray:
+    """T_world_ee of a hand that points down, (4, 4); at yaw 0 the fingers open along the world's y."""
+    return pose(position, yaw_matrix(yaw) @ HOME_ROTATION)
+
+
+class ScriptedHand:
+    """Moves the hand of a simulator towards poses, one action at a time, with a person's imperfections.
+
+    Args:
+        simulator: Where the true poses are read from.
+        rng: Source of every imperfection of this episode.
+    """
+
+    def __init__(self, simulator: TabletopSimulator, rng: np.random.Generator) -> None:
+        self.simulator = simulator
+        self.rng = rng
+        self.closing = False
+        self._segment = 0
+        self._pause_at = set(rng.integers(0, PAUSE_SEGMENTS, size=int(rng.integers(0, 4))).tolist())
+
+    def grasp_noise(self) -> tuple[np.ndarray, float]:
+        """Offset of a grasp or a release: (3,) metres in the horizontal plane, and a yaw in radians."""
+        offset = np.append(self.rng.normal(0.0, GRASP_NOISE_M, size=2), 0.0)
+        return np.clip(offset, -0.0025, 0.0025), float(self.rng.normal(0.0, GRASP_NOISE_RAD))
+
+    def travel(self, goal: np.ndarray) -> Actions:
+        """Cross free space to T_world_ee `goal`, often not quite straight; ends near the goal, still moving."""
+        yield from self._maybe_pause()
+        start = self.simulator.ee_pose()
+        if self.rng.random() < VIA_CHANCE and np.linalg.norm(goal[:3, 3] - start[:3, 3]) > 0.12:
+            direction = self.rng.normal(size=3)
+            direction[2] = abs(direction[2])
+            detour = direction / np.linalg.norm(direction) * self.rng.uniform(0.01, 0.04)
+            via = pose((start[:3, 3] + goal[:3, 3]) / 2 + detour, goal[:3, :3])
+            yield from self._approach(via, 0.03, math.inf)
+        yield from self._approach(goal, 0.012, 0.12)
+
+    def advance(self, goal: np.ndarray, slowness: float = 1.0) -> Actions:
+        """Move straight to T_world_ee `goal` and arrive precisely."""
+        yield from self._maybe_pause()
+        yield from self._approach(goal, 0.0025, 0.035, slowness)
+
+    def grip(self, closing: bool) -> Actions:
+        """Close or open the fingers and hold still until they have settled."""
+        self.closing = closing
+        goal = self.simulator.ee_pose()
+        for _ in range(int(self.rng.integers(7, 11))):
+            yield self._towards(goal, 0.3)
+
+    def hold(self, steps: int) -> Actions:
+        """Stay where the hand is."""
+        goal = self.simulator.ee_pose()
+        for _ in range(steps):
+            yield self._towards(goal, 0.3)
+
+    def _maybe_pause(self) -> Actions:
+        self._segment += 1
+        if self._segment - 1 in self._pause_at:
+            yield from self.hold(int(self.rng.integers(3, 11)))
+
+    def _approach(self, goal: np.ndarray, tolerance_m: float, tolerance_rad: float, slowness: float = 1.0) -> Actions:
+        speed = float(self.rng.uniform(0.6, 1.0)) * slowness
+        distance, angle = self._remaining(goal)
+        limit = 25 + int((distance / MAX_STEP_M + angle / MAX_STEP_RAD) / speed)
+        for _ in range(limit):
+            distance, angle = self._remaining(goal)
+            if distance < tolerance_m and angle < tolerance_rad:
+                return
+            yield self._towards(goal, speed)
+
+    def _remaining(self, goal: np.ndarray) -> tuple[float, float]:
+        position, turn = self._errors(goal)
+        return float(np.linalg.norm(position)), float(np.linalg.norm(turn))
+
+    def _errors(self, goal: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        current = self.simulator.ee_pose()
+        return goal[:3, 3] - current[:3, 3], Rotation.from_matrix(goal[:3, :3] @ current[:3, :3].T).as_rotvec()
+
+    def _towards(self, goal: np.ndarray, speed: float) -> np.ndarray:
+        position, turn = self._errors(goal)
+        command = np.concatenate([_scaled(position / MAX_STEP_M, speed), _scaled(turn / MAX_STEP_RAD, speed)])
+        command += self.rng.normal(0.0, ACTION_NOISE, size=6)
+        return np.append(np.clip(command, -1.0, 1.0), 1.0 if self.closing else -1.0).astype(np.float32)
+
+
+def _scaled(error: np.ndarray, speed: float) -> np.ndarray:
+    """Proportional command, its length bounded by `speed` so that the path stays straight."""
+    command = GAIN * error
+    length = float(np.linalg.norm(command))
+    return command if length <= speed else command * (speed / length)
