@@ -212,7 +212,7 @@ def _finger(name: str, sign: int) -> str:
     low, high = sorted((-0.001 * sign, (FINGER_TRAVEL + 0.001) * sign))
     return (
         f'<body name="{name}" gravcomp="1"><joint name="{name}" type="slide" axis="0 1 0" range="{low} {high}" limited="true" '
-        f'damping="40" armature="0.05"/>{_inertial(0.05, -0.02, (1e-5, 1e-5, 1e-5))}'
+        f'damping="70" armature="0.05"/>{_inertial(0.05, -0.02, (1e-5, 1e-5, 1e-5))}'
         + _geom("box", (0.010, 0.004, 0.030), (0, sign * 0.004, FINGERTIP_BEYOND_EE - 0.030), "finger", 'class="finger"')
         + "</body>"
     )
@@ -256,7 +256,7 @@ def build_mjcf() -> str:
   </visual>
   <default>
     <geom friction="0.6 0.005 0.0001" condim="4"/>
-    <default class="finger"><geom friction="1.5 0.05 0.0002" condim="4" priority="1"/></default>
+    <default class="finger"><geom friction="1.5 0.05 0.0002" condim="4" priority="1" solref="0.008 1" solimp="0.95 0.99 0.0005"/></default>
   </default>
   <worldbody>
     <light directional="true" pos="0 0 2" dir="-0.25 0.2 -1" diffuse="0.45 0.45 0.45" specular="0 0 0" castshadow="false"/>
@@ -271,7 +271,7 @@ def build_mjcf() -> str:
     <joint joint1="finger_left" joint2="finger_right" polycoef="0 -1 0 0 0" solref="0.005 1"/>
   </equality>
   <actuator>
-    <position name="finger_left" joint="finger_left" kp="600" forcerange="-15 15"/>
-    <position name="finger_right" joint="finger_right" kp="600" forcerange="-15 15"/>
+    <position name="finger_left" joint="finger_left" kp="600" forcerange="-10 10"/>
+    <position name="finger_right" joint="finger_right" kp="600" forcerange="-10 10"/>
   </actuator>
 </mujoco>"""
