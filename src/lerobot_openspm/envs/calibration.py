@@ -1,0 +1,72 @@
+"""Calibration of the tabletop's cameras, read from the MuJoCo model and written as a camera file."""
+
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from lerobot_openspm.envs.scene import CAMERA_NAMES
+from lerobot_openspm.envs.simulator import compiled_model
+
+# MuJoCo's cameras look along -z with y up, OpenCV's along z with y down.
+MUJOCO_FROM_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
+MOUNTS = {"front": "world", "side": "world", "wrist": "ee"}
+
+
+def camera_calibration(camera: str, height: int = 256, width: int = 256) -> dict[str, Any]:
+    """Intrinsics and mounting of one camera at an image size.
+
+    Pixel centres are at integer coordinates; the camera's frame is OpenCV's (x right, y down, z forward).
+
+    Args:
+        camera: A name in `CAMERA_NAMES`.
+        height: Image height in pixels.
+        width: Image width in pixels.
+
+    Returns:
+        width, height, fx, fy, cx, cy (pixels), mount ("world" or "ee") and T_mount_cam as nested lists (4, 4).
+    """
+    model = compiled_model()
+    index = model.camera(camera).id
+    focal = 0.5 * height / math.tan(math.radians(float(model.cam_fovy[index])) / 2)
+    T_mount_mujoco = np.eye(4)
+    T_mount_mujoco[:3, :3] = _matrix(model.cam_quat[index])
+    # The hand's body frame is the ee frame, so a camera on the hand is given in ee coordinates already.
+    T_mount_mujoco[:3, 3] = model.cam_pos[index]
+    return {
+        "width": width,
+        "height": height,
+        "fx": focal,
+        "fy": focal,
+        "cx": (width - 1) / 2,
+        "cy": (height - 1) / 2,
+        "mount": MOUNTS[camera],
+        "T_mount_cam": np.round(T_mount_mujoco @ MUJOCO_FROM_OPENCV, 9).tolist(),
+    }
+
+
+def calibration_document(height: int = 256, width: int = 256) -> dict[str, Any]:
+    """All cameras in the camera file's format, keyed by LeRobot's observation names."""
+    cameras = {f"observation.images.{name}": camera_calibration(name, height, width) for name in CAMERA_NAMES}
+    return {"format": "openspm-cameras", "version": 1, "cameras": cameras}
+
+
+def write_calibration(path: Path, height: int = 256, width: int = 256) -> None:
+    """Write the camera file to `path`."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(json.dumps(calibration_document(height, width), indent=2) + "\n", encoding="utf-8")
+
+
+def project(calibration: dict[str, Any], T_world_cam: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """Project world points (n, 3) to pixels (n, 2), given where the camera is."""
+    local = (np.linalg.inv(T_world_cam) @ np.c_[points, np.ones(len(points))].T).T
+    u = calibration["fx"] * local[:, 0] / local[:, 2] + calibration["cx"]
+    v = calibration["fy"] * local[:, 1] / local[:, 2] + calibration["cy"]
+    return np.stack([u, v], axis=1)
+
+
+def _matrix(quat_wxyz: np.ndarray) -> np.ndarray:
+    return Rotation.from_quat(np.roll(quat_wxyz, -1)).as_matrix()
