@@ -1,0 +1,153 @@
+"""Finding a learned object in new images: candidates from colour, poses by aligning silhouettes, one answer."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from lerobot_openspm.errors import ObservationError
+from lerobot_openspm.geometry import se3
+from lerobot_openspm.geometry.camera import intersect_plane
+from lerobot_openspm.geometry.se3 import Array
+from lerobot_openspm.perception import colour
+from lerobot_openspm.perception.blobs import find_blobs
+from lerobot_openspm.perception.fitting import Cloud, Evidence, Fit, Freedom, fit
+from lerobot_openspm.perception.model import ObjectModel
+from lerobot_openspm.perception.types import UNKNOWN_YAW_STD, PoseEstimate, View
+
+COARSE_CUTS_PX = (30.0, 20.0, 12.0)
+FINE_CUTS_PX = (6.0, 4.0, 3.0, 3.0)
+BLOBS_PER_VIEW = 3
+MAX_CANDIDATES = 3
+# Relative to the overlap that is typical of the object's demonstrations.
+FOUND_CONFIDENCE = 0.5
+RIVAL_SHARE = 0.93
+
+
+@dataclass(frozen=True)
+class Prepared:
+    """A view with its colours binned, so that several objects can be sought in it at little cost."""
+
+    view: View
+
+    @cached_property
+    def bins(self) -> colour.Bins:
+        """Colour bin ``(H, W)`` of every pixel; computed once."""
+        return colour.lab_bins(self.view.image)
+
+
+def prepare(view: View) -> Prepared:
+    """Check a view and make it ready for any number of :func:`localise` calls.
+
+    Raises:
+        ObservationError: The image is not RGB uint8 of the camera's size, or the camera's pose is not rigid.
+    """
+    expected = (view.camera.height, view.camera.width, 3)
+    if view.image.shape != expected or view.image.dtype != np.uint8:
+        raise ObservationError(
+            f"image of shape {view.image.shape} and type {view.image.dtype}, expected {expected} of uint8; "
+            "scale the camera to the image with Camera.scaled"
+        )
+    if not se3.is_rigid(view.T_world_cam):
+        raise ObservationError("T_world_cam of a view is not a rigid (4, 4) transform; check the hand's pose")
+    return Prepared(view)
+
+
+def localise(views: Mapping[str, View | Prepared], model: ObjectModel, freedom: Freedom | None = None) -> PoseEstimate:
+    """Find an object in the views of one moment.
+
+    Args:
+        views: Views, or prepared views, by camera name.
+        model: The object.
+        freedom: Prior around the start poses; by default the object stands on its support plane, at any place
+            and any yaw within the range that its demonstrations showed.
+
+    Raises:
+        ObservationError: There is no view, or one is malformed.
+    """
+    if not views:
+        raise ObservationError("no camera views to look for an object in; pass at least one")
+    prepared = [view if isinstance(view, Prepared) else prepare(view) for view in views.values()]
+    evidence = [Evidence(one.view, colour.foreground(one.bins, model.log_odds)) for one in prepared]
+    masks = {name: one.probability > 0.5 for name, one in zip(views, evidence)}
+    fits = search(evidence, model, freedom or Freedom())
+    if not fits:
+        return PoseEstimate("not_found", np.eye(4), _ignorance(), 0.0, masks)
+    best = fits[0]
+    confidence = float(np.clip(best.score / max(model.typical_overlap, 1e-3), 0, 1))
+    status = "found" if confidence >= FOUND_CONFIDENCE else "not_found"
+    if status == "found" and len(fits) > 1 and fits[1].score > RIVAL_SHARE * best.score:
+        status = "ambiguous"
+    covariance = best.covariance.copy()
+    if model.yaw_period == 0:
+        covariance[3, :] = covariance[:, 3] = 0
+        covariance[3, 3] = UNKNOWN_YAW_STD**2
+    return PoseEstimate(status, canonical(best.T_world_obj, model), covariance, confidence, masks)
+
+
+def search(evidence: Sequence[Evidence], model: ObjectModel, freedom: Freedom) -> list[Fit]:
+    """Fits at distinct places, the best first."""
+    cloud = Cloud(model.points.astype(float), model.spacing)
+    if model.yaw_period == 0:
+        freedom = Freedom(freedom.position, freedom.height, 0.0)
+    fits: list[Fit] = []
+    for point in candidates(evidence, model):
+        starts = [
+            fit(evidence, cloud, se3.from_yaw(point, yaw), freedom, COARSE_CUTS_PX) for yaw in model.search_yaws()
+        ]
+        start = max(starts, key=lambda one: one.score)
+        if start.score > 0:
+            fits.append(fit(evidence, cloud, start.T_world_obj, freedom, FINE_CUTS_PX))
+    fits.sort(key=lambda one: -one.score)
+    return _distinct(fits, model.radius)
+
+
+def candidates(evidence: Sequence[Evidence], model: ObjectModel) -> list[Array]:
+    """Places ``(3,)`` of the object's origin that patches of its colours suggest, the most likely first."""
+    votes: list[tuple[Array, float]] = []
+    middle = model.height + model.middle_height
+    for one in evidence:
+        for blob in find_blobs(one.probability, 12, BLOBS_PER_VIEW):
+            point = intersect_plane(one.view.camera, one.view.T_world_cam, blob.centre, middle)
+            distance = float(np.linalg.norm(point - one.view.T_world_cam[:3, 3]))
+            expected = (one.view.camera.fx / distance) ** 2 * model.points.std(axis=0)[:2].prod() * 12
+            # The pixel that the plane's point comes from must lie ahead of the camera, not behind it.
+            if (point - one.view.T_world_cam[:3, 3]) @ one.view.T_world_cam[:3, 2] > 0:
+                votes.append((point, min(blob.area / max(expected, 1.0), 1.0)))
+    places: list[Array] = []
+    strength: list[float] = []
+    for point, weight in sorted(votes, key=lambda vote: -vote[1]):
+        near = [i for i, place in enumerate(places) if np.linalg.norm(place[:2] - point[:2]) < 0.6 * model.radius]
+        if near:
+            i = near[0]
+            places[i] = (places[i] * strength[i] + point * weight) / (strength[i] + weight)
+            strength[i] += weight
+        else:
+            places.append(point)
+            strength.append(weight)
+    order = np.argsort(-np.array(strength), kind="stable")[:MAX_CANDIDATES]
+    return [np.array([places[i][0], places[i][1], model.height]) for i in order]
+
+
+def canonical(T_world_obj: Array, model: ObjectModel) -> Array:
+    """The same pose with its yaw brought to within half a period of the demonstrations' middle yaw."""
+    if model.yaw_period == 0:
+        return se3.from_yaw(T_world_obj[:3, 3], 0.0)
+    turn = se3.wrap_angle(se3.yaw_of(T_world_obj) - model.yaw_centre, model.yaw_period)
+    return se3.from_yaw(T_world_obj[:3, 3], model.yaw_centre + turn)
+
+
+def _distinct(fits: list[Fit], radius: float) -> list[Fit]:
+    kept: list[Fit] = []
+    for one in fits:
+        places = [other.T_world_obj[:2, 3] for other in kept]
+        if all(np.linalg.norm(one.T_world_obj[:2, 3] - place) > 0.7 * radius for place in places):
+            kept.append(one)
+    return kept
+
+
+def _ignorance() -> Array:
+    return np.diag([1.0, 1.0, 1.0, UNKNOWN_YAW_STD**2])

@@ -1,0 +1,56 @@
+"""What is known of one object after learning: its colours, its shape, how it stands and how it may be turned."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lerobot_openspm.geometry.se3 import Array
+
+
+@dataclass(frozen=True)
+class ObjectModel:
+    """A learned object.
+
+    Attributes:
+        name: The noun phrase.
+        log_odds: Foreground log-odds ``(N_BINS,)`` per colour, float32.
+        points: Surface points ``(n, 3)`` in the object's frame, metres, float32. The frame is upright, its origin
+            at the footprint's centre on the support plane.
+        spacing: Distance between neighbouring points, metres.
+        height: World z of the support plane the object stood on, metres.
+        yaw_period: Turning by this angle (radians) leaves the object unchanged; 0 for a body of revolution.
+        yaw_centre: Middle of the yaws seen in the demonstrations, radians.
+        yaw_halfwidth: Half the width of the range of yaws to search, at most ``yaw_period / 2``, radians.
+        typical_overlap: Intersection over union of drawing and mask, median over the demonstrations.
+    """
+
+    name: str
+    log_odds: NDArray[np.float32]
+    points: NDArray[np.float32]
+    spacing: float
+    height: float
+    yaw_period: float
+    yaw_centre: float
+    yaw_halfwidth: float
+    typical_overlap: float
+
+    @property
+    def radius(self) -> float:
+        """Largest distance of a point from the vertical axis, metres."""
+        return float(np.linalg.norm(self.points[:, :2], axis=1).max())
+
+    @property
+    def middle_height(self) -> float:
+        """Height of the points' mean above the support plane, metres."""
+        return float(self.points[:, 2].mean())
+
+    def search_yaws(self) -> Array:
+        """Yaws ``(k,)`` in radians to start a search from, at most about 45 degrees apart."""
+        if self.yaw_period == 0:
+            return np.zeros(1)
+        count = max(1, int(np.ceil(2 * self.yaw_halfwidth / np.deg2rad(46))))
+        steps = (np.arange(count) + 0.5) / count * 2 - 1
+        return self.yaw_centre + steps * self.yaw_halfwidth
