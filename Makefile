@@ -1,0 +1,53 @@
+# `make help` lists the targets. Everything runs in .venv, which `make setup` makes and later runs reuse.
+
+.DEFAULT_GOAL := setup
+.NOTPARALLEL:
+.PHONY: help setup egl demo figures test lint typecheck format clean
+
+# The demo's total time counts the set-up, so the clock starts before anything else does.
+STARTED_AT := $(shell date +%s)
+
+DEMOS ?= 10
+EPISODES ?= 20
+PYTEST_ARGS ?=
+
+BIN := .venv/bin
+
+ifeq ($(shell uname -s),Linux)
+export MUJOCO_GL ?= egl
+endif
+export PYTHON
+
+help: ## list the targets
+	@grep -hE '^[a-z]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 12
+
+setup: ## make .venv with Python 3.12 or 3.13 (PYTHON=... chooses one) and install everything
+	@scripts/setup.sh
+
+egl: setup
+	@$(BIN)/python scripts/check_egl.py
+
+demo: egl ## collect DEMOS demonstrations, train, evaluate EPISODES episodes; the last line is JSON
+	@$(BIN)/openspm demo --demos=$(DEMOS) --episodes=$(EPISODES) --started_at=$(STARTED_AT)
+
+figures: egl ## draw the figures of the documentation
+	@$(BIN)/openspm figures
+
+test: egl ## run the tests, without those marked slow, libero or gpu (PYTEST_ARGS=... adds arguments)
+	@$(BIN)/python -m pytest -n 2 $(PYTEST_ARGS)
+
+lint: setup ## ruff's rules and format, then the types; changes nothing
+	@$(BIN)/ruff check .
+	@$(BIN)/ruff format --check .
+	@$(BIN)/pyright
+
+typecheck: setup ## the types alone
+	@$(BIN)/pyright
+
+format: setup ## put the code into ruff's format and mend what ruff can mend
+	@$(BIN)/ruff check --fix .
+	@$(BIN)/ruff format .
+
+clean: ## remove caches and built packages; .venv and outputs/ stay
+	@rm -rf build dist .pytest_cache .ruff_cache .hypothesis
+	@find src tests benchmarks examples scripts -name __pycache__ -type d -prune -exec rm -rf {} +
