@@ -16,6 +16,8 @@ BOWL_GRASP = np.array([0.0, scene.BOWL_RADIUS - scene.BOWL_WALL / 2, 0.040])
 BOX_GRASP_Z = 0.020
 BOTTLE_GRASP_Z = 0.140
 RELEASE_GAP = 0.003
+# How high the underside of a carried object crosses the table: above the bottle, or above the bowl and the rack.
+TRANSIT_Z = {"bowl": 0.175, "box": 0.175, "bottle": 0.095}
 DRAWER_PULL = {"drawer_middle": 0.135, "drawer_top": 0.152}
 KNOB_TURN = math.radians(98)
 KNOB_GRASP_Z = 0.053
@@ -62,9 +64,10 @@ def _pick(hand: ScriptedHand, grasp: np.ndarray, yaw: float, carry_z: float) -> 
     yield from hand.travel(pointing_down(_above(grasp, carry_z), yaw))
 
 
-def _place(hand: ScriptedHand, name: str, goal: np.ndarray, approach: float = 0.07) -> Actions:
+def _place(hand: ScriptedHand, name: str, goal: np.ndarray) -> Actions:
     """Put the grasped object's origin at a world point (3,), let go and retreat upwards."""
     release = goal + hand.grasp_noise()[0] + (0.0, 0.0, RELEASE_GAP)
+    approach = max(0.05, TRANSIT_Z[name] - release[2])
     yield from hand.travel(_carried(hand, name, release + (0.0, 0.0, approach)))
     yield from hand.advance(_carried(hand, name, release))
     yield from hand.grip(closing=False)
@@ -127,13 +130,13 @@ def _pick_bottle(hand: ScriptedHand, carry_z: float) -> Actions:
 def _bottle_on_cabinet(hand: ScriptedHand) -> Actions:
     yield from _pick_bottle(hand, BOTTLE_GRASP_Z + scene.CABINET_HEIGHT + 0.06)
     cabinet = hand.simulator.object_poses()["cabinet"]
-    yield from _place(hand, "bottle", _in_frame(cabinet, 0, 0, scene.CABINET_HEIGHT), approach=0.05)
+    yield from _place(hand, "bottle", _in_frame(cabinet, 0, 0, scene.CABINET_HEIGHT))
 
 
 def _bottle_on_rack(hand: ScriptedHand) -> Actions:
     yield from _pick_bottle(hand, BOTTLE_GRASP_Z + 0.13)
     rack = hand.simulator.object_poses()["rack"]
-    yield from _place(hand, "bottle", _in_frame(rack, 0, 0, scene.RACK_SHELF_HEIGHT), approach=0.05)
+    yield from _place(hand, "bottle", _in_frame(rack, 0, 0, scene.RACK_SHELF_HEIGHT))
 
 
 def _open_drawer(hand: ScriptedHand, name: str) -> Actions:
@@ -168,7 +171,7 @@ def _bowl_in_top_drawer(hand: ScriptedHand) -> Actions:
     front = scene.CABINET_HALF[0] + hand.simulator.joint_position("drawer_top")
     middle = (scene.CABINET_HALF[0] + front) / 2
     goal = _in_frame(cabinet, middle, BOWL_IN_DRAWER_Y, scene.drawer_height(2) + 0.008)
-    yield from _place(hand, "bowl", goal, approach=0.09)
+    yield from _place(hand, "bowl", goal)
 
 
 def _push_plate(hand: ScriptedHand) -> Actions:

@@ -212,7 +212,7 @@ def _finger(name: str, sign: int) -> str:
     low, high = sorted((-0.001 * sign, (FINGER_TRAVEL + 0.001) * sign))
     return (
         f'<body name="{name}" gravcomp="1"><joint name="{name}" type="slide" axis="0 1 0" range="{low} {high}" limited="true" '
-        f'damping="70" armature="0.05"/>{_inertial(0.05, -0.02, (1e-5, 1e-5, 1e-5))}'
+        f'damping="70" armature="0.05" solreflimit="0.006 1" solimplimit="0.95 0.99 0.0005"/>{_inertial(0.05, -0.02, (1e-5, 1e-5, 1e-5))}'
         + _geom("box", (0.010, 0.004, 0.030), (0, sign * 0.004, FINGERTIP_BEYOND_EE - 0.030), "finger", 'class="finger"')
         + "</body>"
     )

@@ -1,0 +1,72 @@
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+from lerobot.envs.utils import NEW_ROLLOUT_OPTION, env_to_policy_features, preprocess_observation
+
+from lerobot_openspm.envs.configuration_tabletop import TabletopEnvConfig
+from lerobot_openspm.envs.tasks import TASK_NAMES
+
+NEW_ROLLOUT = {NEW_ROLLOUT_OPTION: True}
+SMALL = {"observation_height": 128, "observation_width": 128}
+
+
+def test_importing_the_config_does_not_import_mujoco():
+    code = "import sys, lerobot_openspm.envs.configuration_tabletop; sys.exit('mujoco' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
+
+
+def test_policy_features_are_liberos():
+    features = env_to_policy_features(TabletopEnvConfig(object_poses=True))
+    assert features["observation.state"].shape == (8,)
+    assert features["action"].shape == (7,)
+    assert features["observation.object_poses"].shape == (49,)
+    assert features["observation.images.front"].shape == (3, 256, 256)
+    assert "observation.object_poses" not in env_to_policy_features(TabletopEnvConfig())
+
+
+def test_all_selects_ten_tasks_and_lists_keep_their_ids():
+    assert list(TabletopEnvConfig(**SMALL).create_envs(1)["openspm_tabletop"]) == list(range(10))
+    envs = TabletopEnvConfig(task="push_plate, bowl_on_plate", **SMALL).create_envs(1)["openspm_tabletop"]
+    assert list(envs) == [TASK_NAMES.index("push_plate"), 0]
+
+
+@pytest.mark.parametrize("task", ["fly", "", "bowl_on_plate,fly"])
+def test_unknown_tasks_are_refused_with_the_valid_ones(task):
+    with pytest.raises(ValueError, match="bowl_on_plate, bowl_on_stove"):
+        TabletopEnvConfig(task=task)
+
+
+@pytest.mark.parametrize("use_async_envs", [False, True])
+def test_vector_envs_freeze_finished_rows(use_async_envs):
+    config = TabletopEnvConfig(task="turn_on_stove", episode_length=3, object_poses=True, **SMALL)
+    env = config.create_envs(2, use_async_envs)["openspm_tabletop"][9]
+    try:
+        observation, info = env.reset(seed=[0, 1], options=NEW_ROLLOUT)
+        assert not np.any(info["is_success"])
+        assert preprocess_observation(observation)["observation.object_poses"].shape == (2, 49)
+        assert list(env.call("task_description")) == ["turn on the stove"] * 2
+        assert env.call("_max_episode_steps")[0] == 3
+        assert env.unwrapped.metadata["render_fps"] == 20
+        for _ in range(5):
+            previous = observation
+            observation, _, _, _, _ = env.step(np.ones((2, 7), np.float32))
+        np.testing.assert_array_equal(observation["agent_pos"], previous["agent_pos"])
+        again, _ = env.reset(seed=[1, 0], options=NEW_ROLLOUT)
+        assert not np.array_equal(again["object_poses"][0], observation["object_poses"][0])
+        assert env.call("render")[0].shape == (256, 256, 3)
+    finally:
+        env.close()
+
+
+def test_missing_egl_is_one_clear_error(monkeypatch):
+    from lerobot_openspm.envs import simulator
+    from lerobot_openspm.envs.gl_backend import RenderingUnavailableError
+
+    def broken(*_):
+        raise ImportError("Cannot initialize a EGL device display.")
+
+    monkeypatch.setattr(simulator.mujoco, "Renderer", broken)
+    with pytest.raises(RenderingUnavailableError, match="libegl1 libegl-mesa0 libgl1-mesa-dri libgles2"):
+        simulator.TabletopSimulator().render("front", 128, 128)
