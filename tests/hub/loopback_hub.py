@@ -1,4 +1,4 @@
-"""A Hugging Face Hub on 127.0.0.1 that lives in memory, for tests that push and pull with huggingface_hub itself.
+"""A Hugging Face Hub on 127.0.0.1, in memory, for tests that push and pull with huggingface_hub itself.
 
 It speaks what `HfApi.create_repo`, `upload_folder`, `repo_info`, `list_repo_tree`, `hf_hub_download` and
 `snapshot_download` ask for. Every file is taken as a regular one (no LFS, no Xet), inline in the commit.
@@ -40,7 +40,9 @@ class Repo:
     def commit(self, files: dict[str, bytes], summary: str) -> str:
         """Append a commit and return its id."""
         parent = self.commits[-1][0] if self.commits else ""
-        listing = json.dumps([len(self.commits), parent, summary, {p: git_blob_id(c) for p, c in files.items()}])
+        listing = json.dumps(
+            [len(self.commits), parent, summary, {p: git_blob_id(c) for p, c in files.items()}]
+        )
         commit_id = hashlib.sha1(listing.encode()).hexdigest()
         self.commits.append((commit_id, files))
         return commit_id
@@ -63,7 +65,7 @@ class HubError(Exception):
 
 
 class LoopbackHub:
-    """The store and its server. `requests` holds "METHOD path" of everything asked for, for tests to look at."""
+    """The store and its server. `requests` holds "METHOD path" of everything that was asked for."""
 
     def __init__(self) -> None:
         self.repos: dict[tuple[str, str], Repo] = {}
@@ -76,7 +78,9 @@ class LoopbackHub:
     @contextmanager
     def running(self) -> Iterator["LoopbackHub"]:
         """Serve until the block ends."""
-        thread = threading.Thread(target=self._server.serve_forever, kwargs={"poll_interval": 0.05}, daemon=True)
+        thread = threading.Thread(
+            target=self._server.serve_forever, kwargs={"poll_interval": 0.05}, daemon=True
+        )
         thread.start()
         try:
             yield self
@@ -86,8 +90,10 @@ class LoopbackHub:
             thread.join()
 
     def env(self, home: Path, *, offline: bool = False) -> dict[str, str]:
-        """Return the environment of a process that takes this server for the Hub and keeps its cache in `home`."""
-        inherited = {key: value for key, value in os.environ.items() if not key.startswith(("HF_", "HUGGING"))}
+        """Return a process environment in which this server is the Hub and `home` holds the cache."""
+        inherited = {
+            key: value for key, value in os.environ.items() if not key.startswith(("HF_", "HUGGING"))
+        }
         return inherited | {
             "HF_ENDPOINT": self.endpoint,
             "HF_HOME": str(home),
@@ -255,7 +261,7 @@ class _Handler(BaseHTTPRequestHandler):
     def _file(self, parts: list[str]) -> tuple[bytes, dict[str, str]]:
         kind = parts.pop(0) if parts[0] in TYPES else "models"
         match self.command, parts:
-            case ("GET" | "HEAD"), [owner, name, "resolve", revision, *path]:
+            case (("GET" | "HEAD"), [owner, name, "resolve", revision, *path]):
                 commit_id, files = self.hub.tree(kind, f"{owner}/{name}", revision)
                 content = files.get("/".join(path))
                 if content is None:

@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 import pytest
 from safetensors.numpy import save_file
-
 from tests.hub.loopback_hub import LoopbackHub
 
 REPO = "someone/openspm-test"
@@ -92,7 +91,9 @@ def test_a_second_push_sends_only_what_changed(loopback_hub: LoopbackHub, folder
     assert json.loads(loopback_hub.files(REPO)["config.json"])["n_steps"] == 5
 
 
-def test_what_is_missing_raises_the_clients_own_errors(loopback_hub: LoopbackHub, folder: Path, tmp_path: Path):
+def test_what_is_missing_raises_the_clients_own_errors(
+    loopback_hub: LoopbackHub, folder: Path, tmp_path: Path
+):
     push(loopback_hub, tmp_path / "home", folder)
     errors = run(
         loopback_hub,

@@ -1,0 +1,135 @@
+"""Imports go one way: geometry <- perception, mining, memory, flow <- control <- policy.
+
+envs and cli are leaves.
+"""
+
+import ast
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+SRC = Path(__file__).parents[2] / "src"
+PACKAGE = "lerobot_openspm"
+FACE = "lerobot_policy_openspm"
+LEAVES = {"envs", "cli"}
+# What each part may import of ours besides itself and `errors`. Modules directly in the package
+# (configuration_openspm, modeling_openspm, processor_openspm and their helpers) are the part "policy".
+ALLOWED = {
+    "geometry": set(),
+    "perception": {"geometry"},
+    "memory": {"geometry"},
+    "mining": {"geometry", "perception", "memory"},
+    "flow": {"geometry", "mining"},
+    "control": {"geometry", "perception", "memory", "mining", "flow"},
+    "policy": {"geometry", "perception", "memory", "mining", "flow", "control"},
+}
+PURE = ("geometry", "perception", "memory", "control")
+
+
+def part_of(module: str) -> str:
+    """Return the part that a module of ours belongs to: a folder's name, "errors", "policy" or "face"."""
+    names = module.split(".")
+    if names[0] == FACE:
+        return "face"
+    if len(names) > 1 and (SRC / PACKAGE / names[1]).is_dir():
+        return names[1]
+    return "errors" if names[1:2] == ["errors"] else "policy"
+
+
+def imported(tree: ast.AST, module: str, *, top_only: bool = False) -> Iterator[str]:
+    """Yield the dotted names that a module imports, anywhere or only when it is itself imported."""
+    for node in _run_at_import(tree) if top_only else ast.walk(tree):
+        if isinstance(node, ast.Import):
+            yield from (alias.name for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            base = node.module or ""
+            if node.level:
+                package = module.split(".")[: -node.level]
+                base = ".".join([*package, base] if base else package)
+            # `from package import part` names a part by its alias.
+            yield from (f"{base}.{alias.name}" for alias in node.names)
+
+
+def _run_at_import(tree: ast.AST) -> Iterator[ast.AST]:
+    for node in ast.iter_child_nodes(tree):
+        if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef | ast.Lambda):
+            continue
+        if isinstance(node, ast.If) and "TYPE_CHECKING" in ast.unparse(node.test):
+            continue
+        yield node
+        yield from _run_at_import(node)
+
+
+def modules() -> dict[str, ast.Module]:
+    """Return every module of ours by its dotted name (a package's is `package.__init__`)."""
+    found = {}
+    for package in (PACKAGE, FACE):
+        for path in sorted((SRC / package).rglob("*.py")):
+            name = ".".join(path.relative_to(SRC).with_suffix("").parts)
+            found[name] = ast.parse(path.read_text(encoding="utf-8"))
+    return found
+
+
+MODULES = modules()
+
+
+def ours(module: str) -> Iterator[tuple[str, str]]:
+    """Yield (imported name, its part) for a module's imports of ours from other parts."""
+    for name in imported(MODULES[module], module):
+        if name.split(".")[0] in (PACKAGE, FACE) and part_of(name) not in (part_of(module), "errors"):
+            yield name, part_of(name)
+
+
+@pytest.mark.parametrize("part", sorted(ALLOWED))
+def test_a_part_imports_only_what_lies_below_it(part: str):
+    wrong = [
+        f"{module} imports {name}"
+        for module in MODULES
+        if part_of(module) == part
+        for name, target in ours(module)
+        if target not in ALLOWED[part]
+    ]
+    assert wrong == []
+
+
+def test_envs_and_cli_are_leaves():
+    allowed = {(FACE + ".__init__", f"{PACKAGE}.envs.configuration_tabletop")}
+    wrong = [
+        f"{module} imports {name}"
+        for module in MODULES
+        if part_of(module) not in LEAVES
+        for name, target in ours(module)
+        if target in LEAVES and (module, name.rpartition(".")[0]) not in allowed
+    ]
+    assert wrong == []
+
+
+def test_errors_imports_nothing_of_ours():
+    name = f"{PACKAGE}.errors"
+    assert [n for n in imported(MODULES[name], name) if n.startswith((PACKAGE, FACE))] == []
+
+
+@pytest.mark.parametrize("part", PURE)
+def test_the_method_needs_neither_lerobot_nor_mujoco(part: str):
+    wrong = [
+        f"{module} imports {name}"
+        for module, tree in MODULES.items()
+        if part_of(module) == part
+        for name in imported(tree, module, top_only=True)
+        if name.split(".")[0] in ("lerobot", "mujoco")
+    ]
+    assert wrong == []
+
+
+@pytest.mark.parametrize(
+    ("code", "expected"),
+    [
+        ("from lerobot_openspm import control", ["lerobot_openspm.control"]),
+        ("from ..control import row", ["lerobot_openspm.control.row"]),
+        ("def f():\n    import mujoco", []),
+        ("try:\n    import mujoco\nexcept ImportError:\n    pass", ["mujoco"]),
+    ],
+)
+def test_the_reader_of_imports(code: str, expected: list[str]):
+    assert list(imported(ast.parse(code), "lerobot_openspm.memory.entry", top_only=True)) == expected
