@@ -43,6 +43,7 @@ class CollectConfig:
     height: int = 256
     width: int = 256
     vcodec: str = "h264"
+    pix_fmt: str = "yuv444p"  # full colour resolution; yuv420p plays in every browser but smears colours at edges
     crf: int = 16  # lower keeps colours better
     workers: int = 2  # processes that simulate; 0 simulates in this one
     overwrite: bool = False  # replace an existing dataset at `root`
@@ -72,7 +73,7 @@ def collect(config: CollectConfig) -> dict[str, Any]:
     partial = root.with_name(root.name + ".partial")
     shutil.rmtree(partial, ignore_errors=True)
     root.parent.mkdir(parents=True, exist_ok=True)
-    with _sampled_image_statistics():
+    with _quiet_libraries(), _sampled_image_statistics():
         dataset = _create_dataset(config, partial)
         try:
             episodes, discarded = _record_all(config, dataset)
@@ -139,12 +140,33 @@ def _create_dataset(config: CollectConfig, root: Path) -> "LeRobotDataset":
         root=root,
         robot_type="openspm_tabletop",
         use_videos=True,
-        rgb_encoder=RGBEncoderConfig(vcodec=config.vcodec, crf=config.crf, preset=presets.get(config.vcodec)),
+        # Nothing is read back here; naming a decoder spares the search for another one.
+        video_backend="pyav",
+        rgb_encoder=RGBEncoderConfig(
+            vcodec=config.vcodec, pix_fmt=config.pix_fmt, crf=config.crf, preset=presets.get(config.vcodec)
+        ),
         streaming_encoding=True,
         # A full queue drops frames; one that holds the longest episode never is.
         encoder_queue_maxsize=1000,
         encoder_threads=1,
     )
+
+
+@contextlib.contextmanager
+def _quiet_libraries() -> Iterator[None]:
+    """Keep the encoder's and the table writer's messages per episode away from the progress bar."""
+    import av
+    import datasets
+
+    level, bars = av.logging.get_level(), datasets.are_progress_bars_disabled()
+    av.logging.set_libav_level(av.logging.ERROR)
+    datasets.disable_progress_bars()
+    try:
+        yield
+    finally:
+        av.logging.set_libav_level(level if level is not None else av.logging.INFO)
+        if not bars:
+            datasets.enable_progress_bars()
 
 
 @contextlib.contextmanager
