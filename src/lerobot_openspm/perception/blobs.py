@@ -23,11 +23,13 @@ class Blob:
         mask: Its pixels ``(H, W)``.
         centre: Mean pixel coordinates ``(2,)``.
         area: Number of pixels.
+        whole: Whether it ends before the image does; else its centre is not the object's.
     """
 
     mask: Mask
     centre: Array
     area: float
+    whole: bool
 
 
 def find_blobs(probability: Float32, min_area: float, limit: int) -> list[Blob]:
@@ -45,7 +47,8 @@ def find_blobs(probability: Float32, min_area: float, limit: int) -> list[Blob]:
         own = np.zeros(mask.shape, bool)
         own[y : y + height, x : x + width] = patch
         v, u = np.nonzero(patch)
-        blobs.append(Blob(own, np.array([u.mean() + x, v.mean() + y]), float(area)))
+        whole = x > 0 and y > 0 and x + width < mask.shape[1] and y + height < mask.shape[0]
+        blobs.append(Blob(own, np.array([u.mean() + x, v.mean() + y]), float(area), whole))
     return blobs
 
 

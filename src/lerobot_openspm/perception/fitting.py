@@ -14,6 +14,7 @@ from lerobot_openspm.perception import silhouette
 from lerobot_openspm.perception.types import UNKNOWN_YAW_STD, View
 
 LIMIT_PX = 40.0
+COARSE_PX, FINE_PX = 64.0, 160.0
 # Residuals along a contour are alike over several pixels: so many of them count as one observation.
 CORRELATED_PX = 4.0
 MIN_RESIDUAL_PX = 0.4
@@ -22,10 +23,18 @@ MIN_VISIBLE_SHARE = 0.35
 
 @dataclass(frozen=True)
 class Evidence:
-    """One view with its foreground probability ``(H, W)``, float32."""
+    """One view with its foreground probability.
+
+    Attributes:
+        view: The view.
+        probability: Values ``(H, W)`` from 0 to 1, float32.
+        visible: 0 where something is known to hide whatever lies behind, else 1, ``(H, W)`` float32; None for
+            nothing known.
+    """
 
     view: View
     probability: silhouette.Float32
+    visible: silhouette.Float32 | None = None
 
     @cached_property
     def distance(self) -> silhouette.Float32:
@@ -72,7 +81,12 @@ class Fit:
 
 
 def fit(
-    evidence: Sequence[Evidence], cloud: Cloud, T_start: Array, freedom: Freedom, cuts_px: Sequence[float]
+    evidence: Sequence[Evidence],
+    cloud: Cloud,
+    T_start: Array,
+    freedom: Freedom,
+    cuts_px: Sequence[float],
+    detail_px: float = FINE_PX,
 ) -> Fit:
     """Move a model from ``T_start`` to where its silhouettes match the masks.
 
@@ -82,16 +96,19 @@ def fit(
         T_start: Start pose ``(4, 4)``, upright.
         freedom: What may move, and how far.
         cuts_px: One Gauss-Newton step per entry; residuals beyond the entry are outliers in that step.
+        detail_px: Size of the drawings, see :func:`silhouette.draw`.
     """
     T, prior, offset = np.array(T_start, float), freedom.information, np.zeros(4)
     hessian, scale = np.zeros((4, 4)), 1.0
     for cut in cuts_px:
         hessian, gradient, squares, weights = np.zeros((4, 4)), np.zeros(4), 0.0, 0.0
         for one in evidence:
-            drawing = silhouette.draw(cloud.points, cloud.spacing, T, one.view)
+            drawing = silhouette.draw(cloud.points, cloud.spacing, T, one.view, detail_px)
             if drawing is None:
                 continue
-            part = silhouette.normal_equations(drawing, one.distance, one.view, T, cloud.points, cut)
+            part = silhouette.normal_equations(
+                drawing, one.distance, one.visible, one.view, T, cloud.points, cut
+            )
             hessian, gradient = hessian + part[0], gradient + part[1]
             squares, weights = squares + part[2], weights + part[3]
         if weights < 8:
@@ -103,18 +120,20 @@ def fit(
         step = np.clip(step, [-0.04, -0.04, -0.04, -0.5], [0.04, 0.04, 0.04, 0.5])
         offset += step
         T = se3.from_yaw(T[:3, 3] + step[:3], se3.yaw_of(T) + step[3])
-    overlaps = measure(evidence, cloud, T)
+    overlaps = measure(evidence, cloud, T, detail_px)
     return Fit(T, _covariance(hessian / scale, prior), overlaps, score(overlaps))
 
 
-def measure(evidence: Sequence[Evidence], cloud: Cloud, T_world_obj: Array) -> Array:
+def measure(
+    evidence: Sequence[Evidence], cloud: Cloud, T_world_obj: Array, detail_px: float = COARSE_PX
+) -> Array:
     """Intersection over union of drawing and mask per view ``(v,)``; NaN where the model is out of sight."""
     overlaps = np.full(len(evidence), np.nan)
     for i, one in enumerate(evidence):
-        drawing = silhouette.draw(cloud.points, cloud.spacing, T_world_obj, one.view)
+        drawing = silhouette.draw(cloud.points, cloud.spacing, T_world_obj, one.view, detail_px)
         if drawing is None:
             continue
-        common, model, mask = silhouette.overlap(drawing, one.probability)
+        common, model, mask = silhouette.overlap(drawing, one.probability, one.visible)
         whole = np.count_nonzero(drawing.distance > 0) / drawing.scale**2
         # What is mostly cut off by the image's border says little about the fit.
         if model > max(20.0, MIN_VISIBLE_SHARE * whole):

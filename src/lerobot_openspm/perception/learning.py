@@ -15,25 +15,29 @@ from lerobot_openspm.geometry import se3
 from lerobot_openspm.geometry.camera import intersect_plane
 from lerobot_openspm.geometry.se3 import Array
 from lerobot_openspm.perception import colour, seeding, shape
-from lerobot_openspm.perception.blobs import triangulate
-from lerobot_openspm.perception.fitting import Cloud, Evidence, Fit, Freedom, fit, measure, score
+from lerobot_openspm.perception.blobs import Blob, triangulate
+from lerobot_openspm.perception.fitting import COARSE_PX, FINE_PX, Cloud, Evidence, Fit, Freedom, fit, measure, score
 from lerobot_openspm.perception.localise import COARSE_CUTS_PX, FINE_CUTS_PX, prepare
 from lerobot_openspm.perception.model import ObjectModel
 from lerobot_openspm.perception.seeding import Picture
-from lerobot_openspm.perception.shape import Posed
-from lerobot_openspm.perception.types import Scene
+from lerobot_openspm.perception.shape import Posed, Votes
+from lerobot_openspm.perception.types import Scene, View
 
 log = logging.getLogger(__name__)
 
 MAX_SCENES = 30
 REFERENCES = 3
+JUDGES = 8
 ROUNDS = 3
+SYMMETRY_ROUNDS = 2
 THRESHOLDS = (0.6, 0.7, 0.8, 0.9)
 # Two rays that are to meet in an object may miss each other by this much, metres.
 MAX_RAY_GAP = 0.05
 # A more symmetric shape is preferred if it explains the masks as well as this.
-SYMMETRY_LOSS = 0.01
-BODY_OF_REVOLUTION = 12
+SYMMETRY_LOSS = 0.006
+BODY_OF_REVOLUTION = 24
+# What may be lost for a shape without the cones above and below that no camera sees.
+TRIM_LOSS = 0.002
 YAW_MARGIN = np.deg2rad(20)
 
 
@@ -87,7 +91,7 @@ def _pictures(index: int, name: str, scene: Scene, floor: float) -> list[Picture
     later = scene.later_views or {}
     return [
         Picture(
-            index, view, prepare(view).bins,
+            index, key, view, prepare(view).bins,
             seeding.changed_pixels(view, later[key]) if key in later else None, hints, floor,
         )
         for key, view in scene.views.items()
@@ -96,23 +100,24 @@ def _pictures(index: int, name: str, scene: Scene, floor: float) -> list[Picture
 
 def _first_poses(pictures: Sequence[Picture], log_odds: NDArray[np.float32]) -> tuple[list[Posed], float]:
     """Places from the patches' centres, all at one height and yaw 0, and half the size of a cube around the object."""
-    groups: dict[int, list[tuple[Picture, Evidence, object]]] = {}
+    visible = seeding.hiding_pixels(pictures, log_odds)
+    groups: dict[int, list[tuple[Evidence, Blob | None]]] = {}
     for picture in pictures:
-        evidence = Evidence(picture.view, colour.foreground(picture.bins, log_odds))
-        blob = seeding.hinted_blob(picture, log_odds)
-        groups.setdefault(picture.scene, []).append((picture, evidence, blob))
-    places, singles, sizes = {}, {}, []
+        probability = colour.foreground(picture.bins, log_odds)
+        evidence = Evidence(picture.view, probability, visible.get(picture.camera))
+        groups.setdefault(picture.scene, []).append((evidence, seeding.hinted_blob(picture, log_odds)))
+    places: dict[int, Array] = {}
+    singles: dict[int, tuple[View, Blob]] = {}
+    sizes: list[float] = []
     for index, group in groups.items():
-        seen = [(one.view, blob) for _, one, blob in group if blob is not None]
+        seen = [(one.view, blob) for one, blob in group if blob is not None]
+        # Patches cut off by the image's border have their centre in the wrong place: only if nothing else is left.
+        seen = [(view, blob) for view, blob in seen if blob.whole] or seen
         if len(seen) >= 2:
             point, gap = triangulate([view for view, _ in seen], [blob.centre for _, blob in seen])
             if gap < MAX_RAY_GAP:
                 places[index] = point
-                for view, blob in seen:
-                    distance = float(np.linalg.norm(point - view.T_world_cam[:3, 3]))
-                    v, u = np.nonzero(blob.mask)
-                    reach = np.hypot(u - blob.centre[0], v - blob.centre[1]).max()
-                    sizes.append(reach * distance / view.camera.fx)
+                sizes += [_reach(view, blob, point) for view, blob in seen]
         elif seen:
             singles[index] = seen[0]
     if not places:
@@ -121,26 +126,35 @@ def _first_poses(pictures: Sequence[Picture], log_odds: NDArray[np.float32]) -> 
     for index, (view, blob) in singles.items():
         places[index] = intersect_plane(view.camera, view.T_world_cam, blob.centre, height)
     posed = [
-        Posed(tuple(one for _, one, _ in groups[i]), se3.from_yaw([point[0], point[1], height], 0.0))
+        Posed(tuple(one for one, _ in groups[i]), se3.from_yaw([point[0], point[1], height], 0.0))
         for i, point in sorted(places.items())
     ]
     return posed, 1.25 * float(np.median(sizes))
 
 
+def _reach(view: View, blob: Blob, point_world: Array) -> float:
+    """Distance in metres, at a point's depth, from a patch's centre to its furthest pixel."""
+    v, u = np.nonzero(blob.mask)
+    distance = float(np.linalg.norm(point_world - view.T_world_cam[:3, 3]))
+    return float(np.hypot(u - blob.centre[0], v - blob.centre[1]).max()) * distance / view.camera.fx
+
+
 def _bootstrap(posed: list[Posed], half_size: float) -> tuple[Cloud, list[Posed]] | None:
     """A first common shape: that of the scene whose own hull, turned and moved, explains the others best."""
-    complete = sorted(range(len(posed)), key=lambda i: -sum(float((e.probability > 0.5).any()) for e in posed[i].evidence))
+    order = sorted(range(len(posed)), key=lambda i: -sum(bool((e.probability > 0.5).any()) for e in posed[i].evidence))
     yaws = np.arange(8) * np.pi / 4
-    best: tuple[float, Cloud, list[Posed]] | None = None
-    for reference in complete[:REFERENCES]:
-        cloud = shape.vote([posed[reference]], half_size, np.zeros(1)).cloud(0.9)
+    judges = [posed[i] for i in order[:JUDGES]]
+    best: tuple[float, Cloud] | None = None
+    for reference in order[:REFERENCES]:
+        cloud = shape.vote([posed[reference]], half_size).cloud(0.9)
         if cloud is None:
             continue
-        fits = [_fit_yaws(scene, cloud, yaws) for scene in posed]
-        total = float(np.median([one.score for one in fits]))
+        total = float(np.median([_fit_yaws(scene, cloud, yaws).score for scene in judges]))
         if best is None or total > best[0]:
-            best = (total, cloud, _moved(posed, fits))
-    return None if best is None else (best[1], best[2])
+            best = (total, cloud)
+    if best is None:
+        return None
+    return best[1], _moved(posed, [_fit_yaws(scene, best[1], yaws) for scene in posed])
 
 
 def _finish(posed: list[Posed], half_size: float, cloud: Cloud) -> tuple[Cloud, list[Posed], float, Array]:
@@ -149,35 +163,98 @@ def _finish(posed: list[Posed], half_size: float, cloud: Cloud) -> tuple[Cloud, 
     Returns:
         The shape, the poses, the yaw period (0 for a body of revolution), and the score of every scene.
     """
+    limits = (-np.inf, np.inf)
     for _ in range(ROUNDS):
-        cloud, _ = _best_cloud(_reliable(posed, cloud), half_size, np.zeros(1), cloud)
-        posed = _moved(posed, [fit(s.evidence, cloud, s.T_world_obj, Freedom(), (8.0, *FINE_CUTS_PX)) for s in posed])
-    reliable = _reliable(posed, cloud)
-    cloud, plain = _best_cloud(reliable, half_size, np.zeros(1), cloud)
-    period = 2 * np.pi
-    for order in (BODY_OF_REVOLUTION, 4, 2):
-        turns = np.arange(order) * 2 * np.pi / order
-        symmetric, worth = _best_cloud(reliable, half_size, turns, cloud)
-        if worth > plain - SYMMETRY_LOSS:
-            cloud, period = symmetric, 0.0 if order == BODY_OF_REVOLUTION else 2 * np.pi / order
-            break
-    freedom = Freedom(yaw=0.0) if period == 0 else Freedom()
-    fits = [fit(s.evidence, cloud, s.T_world_obj, freedom, FINE_CUTS_PX) for s in posed]
+        votes = shape.vote(_reliable(posed, cloud), half_size, shape.around(cloud, half_size))
+        reliable = _reliable(posed, cloud)
+        cloud, threshold = _best_cloud(reliable, votes, limits, cloud)
+        limits = _trimmed(reliable, votes, threshold)
+        cloud = votes.cloud(threshold, limits) or cloud
+        posed = _moved(posed, [_refit(scene, cloud, 2 * np.pi) for scene in posed])
+        posed, cloud, limits = _centred(posed, cloud, limits)
+    cloud, posed, period = _symmetrise(posed, half_size, cloud, limits)
+    fits = [_refit(scene, cloud, period) for scene in posed]
     return cloud, _moved(posed, fits), period, np.array([one.score for one in fits])
 
 
-def _best_cloud(posed: Sequence[Posed], half_size: float, turns: Array, fallback: Cloud) -> tuple[Cloud, float]:
-    """The hull at the vote threshold that explains the masks best, and its mean score."""
-    votes = shape.vote(posed, half_size, turns)
-    best, worth = fallback, -1.0
+def _symmetrise(
+    posed: list[Posed], half_size: float, cloud: Cloud, limits: tuple[float, float]
+) -> tuple[Cloud, list[Posed], float]:
+    """The most symmetric shape that explains the masks nearly as well as the free one, its poses and yaw period."""
+    free = float(np.mean([one.score for one in (_refit(scene, cloud, 2 * np.pi) for scene in _reliable(posed, cloud))]))
+    for order in (BODY_OF_REVOLUTION, 4, 2):
+        period = 0.0 if order == BODY_OF_REVOLUTION else 2 * np.pi / order
+        turned, moved = cloud, posed
+        for _ in range(SYMMETRY_ROUNDS):
+            reliable = _reliable(moved, turned)
+            votes = shape.vote(reliable, half_size, shape.around(turned, half_size)).turned(order)
+            turned, _ = _best_cloud(reliable, votes, limits, turned)
+            moved = _moved(moved, [_refit(scene, turned, period) for scene in moved])
+        worth = float(np.mean([score(measure(s.evidence, turned, s.T_world_obj, FINE_PX)) for s in _reliable(moved, turned)]))
+        log.debug("perception: symmetry of order %d explains %.3f of the masks, none %.3f", order, worth, free)
+        if worth > free - SYMMETRY_LOSS:
+            return turned, moved, period
+    return cloud, posed, 2 * np.pi
+
+
+def _best_cloud(
+    posed: Sequence[Posed], votes: Votes, limits: tuple[float, float], fallback: Cloud
+) -> tuple[Cloud, float]:
+    """The hull at the vote threshold that explains the masks best, and that threshold."""
+    best, chosen, worth = fallback, THRESHOLDS[0], -1.0
     for threshold in THRESHOLDS:
-        cloud = votes.cloud(threshold)
+        cloud = votes.cloud(threshold, limits)
         if cloud is None:
             continue
-        value = float(np.mean([score(measure(scene.evidence, cloud, scene.T_world_obj)) for scene in posed]))
+        value = _worth(posed, cloud)
         if value > worth:
-            best, worth = cloud, value
-    return best, worth
+            best, chosen, worth = cloud, threshold, value
+    return best, chosen
+
+
+def _trimmed(posed: Sequence[Posed], votes: Votes, threshold: float) -> tuple[float, float]:
+    """Limits in z between which the hull explains the masks as well as the whole hull.
+
+    Cameras that all look down leave a hull with a cone below the object and a roof above it, which no view can
+    tell from the object. The least body that will do is taken instead, so that its bottom is the support plane.
+    """
+    full = votes.cloud(threshold)
+    if full is None:
+        return -np.inf, np.inf
+    limits = [float(full.points[:, 2].min()), float(full.points[:, 2].max())]
+    judges = posed[:: max(1, len(posed) // JUDGES)]
+    worth, half = _worth(judges, full), 0.51 * votes.spacing
+    for end, sign in ((0, 1), (1, -1)):
+        step = 4 * votes.spacing
+        while step > 0.9 * votes.spacing:
+            tried = list(limits)
+            tried[end] += sign * step
+            cloud = votes.cloud(threshold, (tried[0] - half, tried[1] + half))
+            if cloud is not None and _worth(judges, cloud) > worth - TRIM_LOSS:
+                limits = tried
+            else:
+                step /= 2
+    return limits[0] - half, limits[1] + half
+
+
+def _worth(posed: Sequence[Posed], cloud: Cloud) -> float:
+    return float(np.mean([score(measure(scene.evidence, cloud, scene.T_world_obj)) for scene in posed]))
+
+
+def _centred(
+    posed: list[Posed], cloud: Cloud, limits: tuple[float, float]
+) -> tuple[list[Posed], Cloud, tuple[float, float]]:
+    """The same with the frame's axis through the footprint's centre and the origin half way up."""
+    middle = (float(cloud.points[:, 2].min()) + float(cloud.points[:, 2].max())) / 2
+    shift = np.array([*shape.footprint(cloud.points)[0], middle])
+    T_old_new = se3.from_yaw(shift, 0.0)
+    moved = [replace(scene, T_world_obj=scene.T_world_obj @ T_old_new) for scene in posed]
+    return moved, Cloud(cloud.points - shift, cloud.spacing), (limits[0] - middle, limits[1] - middle)
+
+
+def _refit(scene: Posed, cloud: Cloud, period: float) -> Fit:
+    freedom = Freedom(yaw=0.0) if period == 0 else Freedom()
+    return fit(scene.evidence, cloud, scene.T_world_obj, freedom, FINE_CUTS_PX)
 
 
 def _reliable(posed: Sequence[Posed], cloud: Cloud) -> list[Posed]:
@@ -186,7 +263,7 @@ def _reliable(posed: Sequence[Posed], cloud: Cloud) -> list[Posed]:
     for scene in posed:
         overlaps = measure(scene.evidence, cloud, scene.T_world_obj)
         best = np.nanmax(overlaps, initial=0.0)
-        good = [one for one, value in zip(scene.evidence, overlaps) if value > 0.75 * best]
+        good = [one for one, value in zip(scene.evidence, overlaps) if value > 0.6 * best]
         kept.append((best, Posed(tuple(good), scene.T_world_obj)))
     level = 0.8 * float(np.median([best for best, _ in kept]))
     return [scene for best, scene in kept if best >= level and scene.evidence]
@@ -194,7 +271,7 @@ def _reliable(posed: Sequence[Posed], cloud: Cloud) -> list[Posed]:
 
 def _fit_yaws(scene: Posed, cloud: Cloud, yaws: Array) -> Fit:
     place = scene.T_world_obj[:3, 3]
-    fits = [fit(scene.evidence, cloud, se3.from_yaw(place, yaw), Freedom(), COARSE_CUTS_PX) for yaw in yaws]
+    fits = [fit(scene.evidence, cloud, se3.from_yaw(place, yaw), Freedom(), COARSE_CUTS_PX, COARSE_PX) for yaw in yaws]
     return max(fits, key=lambda one: one.score)
 
 
@@ -229,6 +306,6 @@ def _yaw_range(yaws: Array, period: float) -> tuple[float, float]:
     widest = int(gaps.argmax())
     halfwidth = (period - gaps[widest]) / 2
     centre = float(se3.wrap_angle(ordered[(widest + 1) % len(ordered)] + halfwidth, 2 * np.pi))
-    if halfwidth > 0.3 * period:
+    if halfwidth > 0.2 * period:
         return centre, period / 2
     return centre, float(min(halfwidth + YAW_MARGIN, period / 2))

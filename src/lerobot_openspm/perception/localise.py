@@ -14,7 +14,7 @@ from lerobot_openspm.geometry.camera import intersect_plane
 from lerobot_openspm.geometry.se3 import Array
 from lerobot_openspm.perception import colour
 from lerobot_openspm.perception.blobs import find_blobs
-from lerobot_openspm.perception.fitting import Cloud, Evidence, Fit, Freedom, fit
+from lerobot_openspm.perception.fitting import COARSE_PX, Cloud, Evidence, Fit, Freedom, fit
 from lerobot_openspm.perception.model import ObjectModel
 from lerobot_openspm.perception.types import UNKNOWN_YAW_STD, PoseEstimate, View
 
@@ -96,7 +96,8 @@ def search(evidence: Sequence[Evidence], model: ObjectModel, freedom: Freedom) -
     fits: list[Fit] = []
     for point in candidates(evidence, model):
         starts = [
-            fit(evidence, cloud, se3.from_yaw(point, yaw), freedom, COARSE_CUTS_PX) for yaw in model.search_yaws()
+            fit(evidence, cloud, se3.from_yaw(point, yaw), freedom, COARSE_CUTS_PX, COARSE_PX)
+            for yaw in model.search_yaws()
         ]
         start = max(starts, key=lambda one: one.score)
         if start.score > 0:
@@ -116,7 +117,7 @@ def candidates(evidence: Sequence[Evidence], model: ObjectModel) -> list[Array]:
             expected = (one.view.camera.fx / distance) ** 2 * model.points.std(axis=0)[:2].prod() * 12
             # The pixel that the plane's point comes from must lie ahead of the camera, not behind it.
             if (point - one.view.T_world_cam[:3, 3]) @ one.view.T_world_cam[:3, 2] > 0:
-                votes.append((point, min(blob.area / max(expected, 1.0), 1.0)))
+                votes.append((point, min(blob.area / max(expected, 1.0), 1.0) * (1.0 if blob.whole else 0.3)))
     places: list[Array] = []
     strength: list[float] = []
     for point, weight in sorted(votes, key=lambda vote: -vote[1]):

@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -25,6 +26,7 @@ NEUTRAL_RADIUS = 0.22
 CHANGED_LEVELS = 25
 ROUNDS = 5
 PRESENCE = 0.55
+MIN_ENCLOSED = 4
 
 
 @dataclass(frozen=True)
@@ -33,6 +35,7 @@ class Picture:
 
     Attributes:
         scene: Index of the scene.
+        camera: Name of the camera.
         view: The view.
         bins: Its colour bins ``(H, W)``.
         changed: Pixels ``(H, W)`` that differ in the later frame; None without a later frame.
@@ -41,6 +44,7 @@ class Picture:
     """
 
     scene: int
+    camera: str
     view: View
     bins: colour.Bins
     changed: Mask | None
@@ -106,6 +110,31 @@ def hinted_blob(picture: Picture, log_odds: NDArray[np.float32]) -> Blob | None:
     touched = [(float((blob.mask & near).sum()), blob) for blob in blobs]
     count, blob = max(touched, key=lambda pair: pair[0], default=(0.0, None))
     return blob if count >= 4 else None
+
+
+def hiding_pixels(pictures: Sequence[Picture], log_odds: NDArray[np.float32]) -> dict[str, NDArray[np.float32]]:
+    """Per camera, 0 where the hand or the like always hides the object and 1 elsewhere, ``(H, W)``.
+
+    At the start of every episode the hand is at the same place. Pixels that lie within the convex hull of the
+    object's patch in some scenes, yet never show its colours, are taken for it.
+    """
+    enclosed: dict[str, NDArray[np.float32]] = {}
+    shown: dict[str, NDArray[np.float32]] = {}
+    for picture in pictures:
+        blob = hinted_blob(picture, log_odds)
+        if blob is None:
+            continue
+        hull = np.zeros(picture.bins.shape, np.uint8)
+        cv2.fillConvexPoly(hull, cv2.convexHull(np.argwhere(blob.mask)[:, ::-1].astype(np.int32)), 1)
+        colours = colour.foreground(picture.bins, log_odds) > 0.5
+        enclosed[picture.camera] = enclosed.get(picture.camera, 0) + hull.astype(np.float32)
+        shown[picture.camera] = shown.get(picture.camera, 0) + (hull & colours).astype(np.float32)
+    visible = {}
+    for camera, count in enclosed.items():
+        hides = (count >= MIN_ENCLOSED) & (shown[camera] <= 0.1 * count)
+        hides = cv2.morphologyEx(hides.astype(np.uint8), cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
+        visible[camera] = 1.0 - cv2.dilate(hides, np.ones((5, 5), np.uint8)).astype(np.float32)
+    return visible
 
 
 def _evidence(

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import label
 
 from lerobot_openspm.geometry import se3
 from lerobot_openspm.geometry.camera import project
@@ -38,9 +39,29 @@ class Votes:
     share: NDArray[np.float32]
     spacing: float
 
-    def cloud(self, threshold: float) -> Cloud | None:
-        """Surface voxels of the largest connected body with votes above the threshold; None if it is empty."""
-        return surface(_largest_body(self.share >= threshold), self.spacing)
+    def cloud(self, threshold: float, limits: tuple[float, float] = (-np.inf, np.inf)) -> Cloud | None:
+        """Surface of the largest connected body with votes above a threshold and z within limits; None if empty."""
+        z = self.axis
+        allowed = (z >= limits[0]) & (z <= limits[1])
+        return surface(_largest_body((self.share >= threshold) & allowed), self.spacing)
+
+    @property
+    def axis(self) -> Array:
+        """Coordinates ``(n,)`` of the voxels' centres along each axis, metres."""
+        n = self.share.shape[0]
+        return (np.arange(n) - (n - 1) / 2) * self.spacing
+
+    def turned(self, order: int) -> Votes:
+        """Votes averaged over ``order`` equal turns about the z axis."""
+        n = self.share.shape[0]
+        total = np.zeros_like(self.share)
+        # Slices along z are the channels of one image; OpenCV takes them by fours.
+        for k in range(order):
+            turn = cv2.getRotationMatrix2D(((n - 1) / 2, (n - 1) / 2), 360.0 * k / order, 1.0)
+            for start in range(0, n, 4):
+                part = np.ascontiguousarray(self.share[:, :, start : start + 4])
+                total[:, :, start : start + 4] += cv2.warpAffine(part, turn, (n, n)).reshape(part.shape)
+        return Votes(total / order, self.spacing)
 
 
 def surface(solid: NDArray[np.bool_], spacing: float) -> Cloud | None:
@@ -55,34 +76,37 @@ def surface(solid: NDArray[np.bool_], spacing: float) -> Cloud | None:
     return Cloud((index - (np.array(solid.shape) - 1) / 2) * spacing, spacing)
 
 
-def vote(scenes: Sequence[Posed], half_size: float, turns: Array) -> Votes:
+def vote(scenes: Sequence[Posed], half_size: float, worth: NDArray[np.bool_] | None = None) -> Votes:
     """Let every picture vote on every voxel of a cube around the object.
 
     Args:
         scenes: Evidence and poses.
         half_size: Half the cube's edge, metres.
-        turns: Yaws ``(k,)`` in radians; each scene votes once per entry, the object turned by it. One zero for no
-            symmetry.
+        worth: Voxels ``(n, n, n)`` to ask about; the others get no votes. All by default.
     """
     n = VOXELS_PER_AXIS
     spacing = 2 * half_size / n
     axis = (np.arange(n) - (n - 1) / 2) * spacing
-    centres = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), axis=-1).reshape(-1, 3)
-    votes, seen = np.zeros(n**3, np.float32), np.zeros(n**3, np.float32)
+    asked = np.argwhere(np.ones((n, n, n), bool) if worth is None else worth)
+    centres = axis[asked]
+    votes, seen = np.zeros(len(asked), np.float32), np.zeros(len(asked), np.float32)
     for scene in scenes:
-        for turn in turns:
-            T = scene.T_world_obj @ se3.from_yaw(np.zeros(3), turn)
-            points_world = se3.apply(T, centres)
-            for one in scene.evidence:
-                uv, depth = project(one.view.camera, one.view.T_world_cam, points_world)
-                size = [one.view.camera.width - 1, one.view.camera.height - 1]
-                inside = (depth > 0.01) & (np.nan_to_num(uv, nan=-1) >= 0).all(1) & (uv <= size).all(1)
-                value = bilinear(one.probability, np.nan_to_num(uv))
-                votes += np.where(inside, np.clip((value - 0.25) * 2, 0, 1), 0)
-                seen += inside
+        points_world = se3.apply(scene.T_world_obj, centres)
+        for one in scene.evidence:
+            uv, depth = project(one.view.camera, one.view.T_world_cam, points_world)
+            uv = np.nan_to_num(uv, nan=-1.0)
+            u, v = uv[:, 0], uv[:, 1]
+            height, width = one.probability.shape
+            inside = (depth > 0.01) & (u >= 0) & (v >= 0) & (u <= width - 1) & (v <= height - 1)
+            if one.visible is not None:
+                inside &= bilinear(one.visible, uv) > 0.9
+            value = bilinear(one.probability, uv)
+            votes += np.where(inside, np.clip((value - 0.25) * 2, 0, 1), 0)
+            seen += inside
+    share = np.zeros((n, n, n), np.float32)
     # A voxel that hardly any picture shows is no part of the object that pictures could confirm.
-    share = np.where(seen >= 0.3 * seen.max(), votes / np.maximum(seen, 1), 0)
-    return Votes(share.reshape(n, n, n), spacing)
+    share[tuple(asked.T)] = np.where(seen >= 0.3 * seen.max(initial=1), votes / np.maximum(seen, 1), 0)
+    return Votes(share, spacing)
 
 
 def footprint(points: Array) -> tuple[Array, float]:
@@ -92,10 +116,18 @@ def footprint(points: Array) -> tuple[Array, float]:
     return np.array([x, y]) / 1000, float(se3.wrap_angle(long_axis, np.pi))
 
 
+def around(cloud: Cloud, half_size: float) -> NDArray[np.bool_]:
+    """Voxels ``(n, n, n)`` of a cube that lie in the box around a cloud or up to three voxels beyond."""
+    n = VOXELS_PER_AXIS
+    spacing = 2 * half_size / n
+    axis = (np.arange(n) - (n - 1) / 2) * spacing
+    low, high = cloud.points.min(0) - 3 * spacing, cloud.points.max(0) + 3 * spacing
+    x, y, z = ((axis >= a) & (axis <= b) for a, b in zip(low, high, strict=True))
+    return x[:, None, None] & y[:, None] & z
+
+
 def _largest_body(solid: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """The largest 6-connected component of a solid."""
-    from scipy.ndimage import label
-
     labels, count = label(solid)
     if count <= 1:
         return solid

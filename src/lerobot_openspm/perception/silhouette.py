@@ -72,17 +72,21 @@ def observed_distance(probability: Float32, limit_px: float) -> Float32:
     return np.clip(signed_distance((large > 0.5).astype(np.uint8)) / 2, -limit_px, limit_px)
 
 
-def draw(points_obj: Array, spacing: float, T_world_obj: Array, view: View) -> Drawing | None:
-    """Draw surface points ``(n, 3)`` of a model, ``spacing`` metres apart; None where it is out of sight."""
+def draw(points_obj: Array, spacing: float, T_world_obj: Array, view: View, detail_px: float) -> Drawing | None:
+    """Draw surface points ``(n, 3)`` of a model, ``spacing`` metres apart; None where it is out of sight.
+
+    The drawing's longer side takes at most ``detail_px`` crop pixels: fewer are faster, more are exacter.
+    """
     uv, depth = project(view.camera, view.T_world_cam, se3.apply(T_world_obj, points_obj))
-    if (depth <= 0.01).any():
+    if depth.min() <= 0.01:
         return None
-    low, high = uv.min(axis=0), uv.max(axis=0)
+    u, v = uv[:, 0], uv[:, 1]
+    low, high = np.array([u.min(), v.min()]), np.array([u.max(), v.max()])
     size = np.array([view.camera.width, view.camera.height])
     if (high < 2).any() or (low > size - 3).any():
         return None
     # Small silhouettes are drawn larger than life, so that rounding to pixels does not move their edges.
-    scale = float(np.clip(180.0 / (high - low).max(), 0.25, 3.0))
+    scale = float(np.clip(detail_px / (high - low).max(), 0.25, 3.0))
     corner = low - PAD_PX
     shape = np.ceil((high - low + 2 * PAD_PX) * scale).astype(int) + 1
     mask = np.zeros((shape[1], shape[0]), np.uint8)
@@ -96,13 +100,18 @@ def draw(points_obj: Array, spacing: float, T_world_obj: Array, view: View) -> D
     return Drawing(uv, distance.astype(np.float32), corner, scale)
 
 
-def overlap(drawing: Drawing, probability: Float32) -> tuple[float, float, float]:
-    """Areas, in image pixels, of drawing and mask in common, of the drawing, and of the mask near the drawing."""
+def overlap(drawing: Drawing, probability: Float32, visible: Float32 | None) -> tuple[float, float, float]:
+    """Areas, in image pixels, of drawing and mask in common, of the drawing, and of the mask near the drawing.
+
+    Only what lies in the image and is not known to be hidden counts.
+    """
     height, width = drawing.distance.shape
     # Crop pixel c shows image pixel corner + c / scale.
     to_image = np.hstack([np.eye(2) / drawing.scale, drawing.corner[:, None]])
     flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
     seen = cv2.warpAffine(probability, to_image, (width, height), flags=flags, borderValue=-1.0)
+    if visible is not None:
+        seen[cv2.warpAffine(visible, to_image, (width, height), flags=flags, borderValue=1.0) < 0.9] = -1.0
     model, mask, known = drawing.distance > 0, seen > 0.5, seen >= 0
     area = 1 / drawing.scale**2
     common = np.count_nonzero(model & mask) * area
@@ -110,13 +119,20 @@ def overlap(drawing: Drawing, probability: Float32) -> tuple[float, float, float
 
 
 def normal_equations(
-    drawing: Drawing, observed: Float32, view: View, T_world_obj: Array, points_obj: Array, cut_px: float
+    drawing: Drawing,
+    observed: Float32,
+    visible: Float32 | None,
+    view: View,
+    T_world_obj: Array,
+    points_obj: Array,
+    cut_px: float,
 ) -> tuple[Array, Array, float, float]:
     """One view's part of a Gauss-Newton step over (x, y, z, yaw).
 
     Args:
         drawing: The model at its present pose.
         observed: From :func:`observed_distance`.
+        visible: 0 where the object is known to be hidden, else 1, ``(H, W)``; None for nothing known.
         view: The view.
         T_world_obj: Present pose ``(4, 4)``.
         points_obj: The model's points ``(n, 3)``.
@@ -126,7 +142,8 @@ def normal_equations(
         Hessian ``(4, 4)``, gradient ``(4,)``, sum of weighted squared residuals, sum of weights, all in pixels.
     """
     size = np.array([view.camera.width, view.camera.height])
-    inside = ((drawing.uv > 1) & (drawing.uv < size - 2)).all(axis=1)
+    u, v = drawing.uv[:, 0], drawing.uv[:, 1]
+    inside = (u > 1) & (u < size[0] - 2) & (v > 1) & (v < size[1] - 2)
     own = drawing.sample(drawing.distance, drawing.uv)
     rim = np.flatnonzero(inside & (own < 1.5))
     if len(rim) < 8:
@@ -142,6 +159,8 @@ def normal_equations(
     _, index, counts = np.unique(cells[:, 1] * 65536 + cells[:, 0], return_inverse=True, return_counts=True)
     tukey = np.clip(1 - (residual / cut_px) ** 2, 0, None) ** 2
     weight = tukey / counts[index]
+    if visible is not None:
+        weight = weight * (bilinear(visible, uv) > 0.9)
     jacobian = np.einsum("ni,nij->nj", normal, _pixel_jacobian(view, T_world_obj, points_obj[rim]))
     weighted = jacobian * weight[:, None]
     return weighted.T @ jacobian, weighted.T @ residual, float(weight @ residual**2), float(weight.sum())
