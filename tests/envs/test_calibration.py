@@ -45,7 +45,9 @@ def test_projection_hits_the_coloured_pixels(make_env, camera):
         if not inside:
             continue
         angles = np.linspace(0, 2 * np.pi, 360, endpoint=False)
-        xy = np.stack([scene.BURNER_X + scene.BURNER_RADIUS * np.cos(angles), scene.BURNER_RADIUS * np.sin(angles)])
+        xy = np.stack(
+            [scene.BURNER_X + scene.BURNER_RADIUS * np.cos(angles), scene.BURNER_RADIUS * np.sin(angles)]
+        )
         edge = np.vstack([xy, np.full(360, scene.BURNER_TOP), np.ones(360)])
         points = (env.object_poses()["stove"] @ edge).T[:, :3]
         outline = project(camera_calibration(camera), _world_from_camera(env, camera), points)

@@ -23,7 +23,9 @@ def test_collects_a_dataset_that_can_be_opened_again(tmp_path, capsys):
     dataset = LeRobotDataset("local/openspm_tabletop", root=root)
     assert (dataset.num_episodes, dataset.num_frames, dataset.fps) == (2, summary["frames"], 20)
     records = json.loads((root / "meta/openspm_collect.json").read_text())["episodes"]
-    assert [r["seed"] for r in records] == [DEMO_SEED_START + 10_000 * TASK_NAMES.index("turn_on_stove") + i for i in (0, 1)]
+    assert [r["seed"] for r in records] == [
+        DEMO_SEED_START + 10_000 * TASK_NAMES.index("turn_on_stove") + i for i in (0, 1)
+    ]
     episode = record_episode("turn_on_stove", records[0]["seed"], 128, 128)
     frame = dataset[5]
     assert frame["task"] == "turn on the stove"
@@ -37,7 +39,8 @@ def test_collects_a_dataset_that_can_be_opened_again(tmp_path, capsys):
     before = (root / "meta/info.json").stat().st_mtime_ns
     main([*ARGUMENTS, f"--root={root}"])
     lines = capsys.readouterr().out.splitlines()
-    assert "left alone" in lines[-2] and json.loads(lines[-1]) == summary
+    assert "left alone" in lines[-2]
+    assert json.loads(lines[-1]) == summary
     assert (root / "meta/info.json").stat().st_mtime_ns == before
 
 

@@ -1,10 +1,10 @@
 import numpy as np
 import pytest
+from tests.envs.helpers import run_expert
 
 from lerobot_openspm.envs.experts import expert_actions
 from lerobot_openspm.envs.seeds import TUNING_SEED_START
 from lerobot_openspm.envs.tasks import TASK_NAMES
-from tests.envs.helpers import run_expert
 
 QUICK = ("turn_on_stove", "bowl_on_plate")
 MARKED = [name if name in QUICK else pytest.param(name, marks=pytest.mark.slow) for name in TASK_NAMES]
@@ -36,4 +36,6 @@ def test_demonstrations_differ(make_env):
 def test_expert_is_reliable(make_env, task):
     env = make_env(task)
     solved = [run_expert(env, TUNING_SEED_START + i)[0]["is_success"] for i in range(20)]
-    assert sum(solved) >= 19, f"{task}: failed seeds {[TUNING_SEED_START + i for i, ok in enumerate(solved) if not ok]}"
+    assert sum(solved) >= 19, (
+        f"{task}: failed seeds {[TUNING_SEED_START + i for i, ok in enumerate(solved) if not ok]}"
+    )

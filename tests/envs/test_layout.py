@@ -15,7 +15,8 @@ def test_every_object_stays_within_its_range():
         for name, at in layout.items():
             reach = layouts.FIXTURE_RANGE if name in layouts.FIXTURES else layouts.OBJECT_RANGE
             nominal = layouts.NOMINAL_XY[name]
-            assert abs(at.x - nominal[0]) <= reach and abs(at.y - nominal[1]) <= reach
+            assert abs(at.x - nominal[0]) <= reach
+            assert abs(at.y - nominal[1]) <= reach
             if name in layouts.FIXTURES:
                 assert abs(at.yaw) <= layouts.FIXTURE_YAW_RANGE
 
@@ -23,7 +24,8 @@ def test_every_object_stays_within_its_range():
 def test_starts_cover_their_range():
     for name in scene.MOVABLE_NAMES:
         xs, ys = (np.array([getattr(layout[name], axis) for layout in LAYOUTS]) for axis in "xy")
-        assert np.ptp(xs) > 0.16 and np.ptp(ys) > 0.16
+        assert np.ptp(xs) > 0.16
+        assert np.ptp(ys) > 0.16
 
 
 def test_footprints_keep_a_gap():

@@ -17,12 +17,22 @@ def test_ranges_never_overlap():
         for b in ranges[i + 1 :]:
             assert max(a.start, b.start) >= min(a.stop, b.stop)
     assert EVALUATION_SEEDS.start == 0
-    assert (DEMO_SEEDS.start, TUNING_SEEDS.start) == (DEMO_SEED_START, TUNING_SEED_START) == (1_000_000, 2_000_000)
+    assert (
+        (DEMO_SEEDS.start, TUNING_SEEDS.start)
+        == (DEMO_SEED_START, TUNING_SEED_START)
+        == (1_000_000, 2_000_000)
+    )
 
 
 @pytest.mark.parametrize(
     ("seed", "purpose"),
-    [(0, "evaluation"), (999_999, "evaluation"), (1_000_000, "demonstration"), (1_999_999, "demonstration"), (2_000_000, "tuning")],
+    [
+        (0, "evaluation"),
+        (999_999, "evaluation"),
+        (1_000_000, "demonstration"),
+        (1_999_999, "demonstration"),
+        (2_000_000, "tuning"),
+    ],
 )
 def test_purpose_at_the_borders(seed, purpose):
     assert seed_purpose(seed) == purpose

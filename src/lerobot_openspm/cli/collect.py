@@ -6,7 +6,7 @@ import multiprocessing
 import shutil
 import time
 from collections import deque
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterator, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
@@ -43,7 +43,9 @@ class CollectConfig:
     height: int = 256
     width: int = 256
     vcodec: str = "h264"
-    pix_fmt: str = "yuv444p"  # full colour resolution; yuv420p plays in every browser but smears colours at edges
+    pix_fmt: str = (
+        "yuv444p"  # full colour resolution; yuv420p plays in every browser but smears colours at edges
+    )
     crf: int = 16  # lower keeps colours better
     workers: int = 2  # processes that simulate; 0 simulates in this one
     overwrite: bool = False  # replace an existing dataset at `root`
@@ -107,7 +109,10 @@ def _keep_existing(root: Path) -> dict[str, Any]:
     if not summary_file.is_file():
         raise FileExistsError(f"{root} exists and was not written by openspm collect; choose another --root")
     summary = json.loads(summary_file.read_text(encoding="utf-8"))["summary"]
-    print(f"{root} already holds {summary['episodes']} episodes; left alone (pass --overwrite=true to record again)")
+    print(
+        f"{root} already holds {summary['episodes']} episodes; left alone "
+        "(pass --overwrite=true to record again)"
+    )
     return {**summary, "root": str(root)}
 
 
@@ -118,7 +123,11 @@ def _features(config: CollectConfig) -> dict[str, dict]:
     def vector(names: Sequence[str]) -> dict:
         return {"dtype": "float32", "shape": (len(names),), "names": list(names)}
 
-    video = {"dtype": "video", "shape": (config.height, config.width, 3), "names": ["height", "width", "channels"]}
+    video = {
+        "dtype": "video",
+        "shape": (config.height, config.width, 3),
+        "names": ["height", "width", "channels"],
+    }
     return {
         **{f"observation.images.{name}": dict(video) for name in CAMERA_NAMES},
         "observation.state": vector(STATE_NAMES),
@@ -153,9 +162,9 @@ def _create_dataset(config: CollectConfig, root: Path) -> "LeRobotDataset":
 
 
 @contextlib.contextmanager
-def _quiet_libraries() -> Iterator[None]:
+def _quiet_libraries() -> Generator[None]:
     """Keep the encoder's and the table writer's messages per episode away from the progress bar."""
-    import av
+    import av.logging
     import datasets
 
     level, bars = av.logging.get_level(), datasets.are_progress_bars_disabled()
@@ -170,11 +179,11 @@ def _quiet_libraries() -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def _sampled_image_statistics() -> Iterator[None]:
+def _sampled_image_statistics() -> Generator[None]:
     """Take image statistics from every tenth frame while recording.
 
-    LeRobot samples frames when it encodes afterwards, but when it encodes while recording it puts every pixel of every
-    frame into a histogram, which costs more than simulating, rendering and encoding together.
+    LeRobot samples frames when it encodes afterwards, but when it encodes while recording it puts every
+    pixel of every frame into a histogram, which costs more than simulating, rendering and encoding together.
     """
     from lerobot.datasets import compute_stats
 
@@ -217,7 +226,7 @@ def _record_all(config: CollectConfig, dataset: "LeRobotDataset") -> tuple[list[
 
 
 def _episodes(config: CollectConfig, tasks: list[str]) -> Iterator["RecordedEpisode"]:
-    """Yield episodes task by task in the order of their seeds, failed ones too; a failed one is made up for at once."""
+    """Yield episodes task by task in the order of their seeds; a failed one is made up for at once."""
     with _Recorder(config) as submit:
         for task in tasks:
             seeds = iter(range(_first_seed(config, task), _first_seed(config, task) + SEEDS_PER_TASK))
@@ -282,7 +291,8 @@ class _Recorder:
         self._failures[task] = self._failures.get(task, 0) + 1
         if self._failures[task] > 3 + MAX_DISCARDED_SHARE * self._config.episodes:
             raise RuntimeError(
-                f"the expert failed {self._failures[task]} times on {task} ({self._config.episodes} episodes wanted); "
+                f"the expert failed {self._failures[task]} times on {task}, "
+                f"where {self._config.episodes} episodes were wanted; "
                 "nothing was kept"
             )
 
@@ -309,7 +319,7 @@ def _write_meta(config: CollectConfig, root: Path, document: dict) -> None:
 
 
 def main(args: Sequence[str] | None = None) -> None:
-    """Parse the arguments (default: the command line's), collect, and print one JSON object as the last line."""
+    """Parse the arguments (default: the command line's), collect, print one JSON object last."""
     import draccus
 
     config = draccus.parse(config_class=CollectConfig, args=None if args is None else list(args))

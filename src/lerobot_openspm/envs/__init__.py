@@ -1,1 +1,1 @@
-"""The embedded MuJoCo tabletop: scene, ten tasks, scripted experts. Importing this package does not import mujoco."""
+"""The embedded MuJoCo tabletop: scene, ten tasks, scripted experts. Importing this does not import mujoco."""

@@ -27,7 +27,7 @@ def camera_calibration(camera: str, height: int = 256, width: int = 256) -> dict
         width: Image width in pixels.
 
     Returns:
-        width, height, fx, fy, cx, cy (pixels), mount ("world" or "ee") and T_mount_cam as nested lists (4, 4).
+        width, height, fx, fy, cx, cy (pixels), mount ("world" or "ee"), T_mount_cam (nested lists, 4 x 4).
     """
     model = compiled_model()
     index = model.camera(camera).id

@@ -61,7 +61,9 @@ class TabletopEnvConfig(EnvConfig):
             "object_poses": self.object_poses,
         }
 
-    def create_envs(self, n_envs: int, use_async_envs: bool = False) -> dict[str, dict[int, gym.vector.VectorEnv]]:
+    def create_envs(
+        self, n_envs: int, use_async_envs: bool = False
+    ) -> dict[str, dict[int, gym.vector.VectorEnv]]:
         """Make one vector environment per selected task; the task id is its place among `TASK_NAMES`.
 
         Finished rows are frozen until the next rollout, with and without worker processes.

@@ -1,4 +1,4 @@
-"""Scripted experts for the ten tasks: they read the simulator's true poses and act through the same 7-D actions."""
+"""Scripted experts for the ten tasks: they read the true poses and act by the same 7-D actions."""
 
 import math
 from collections.abc import Callable
@@ -6,7 +6,14 @@ from collections.abc import Callable
 import numpy as np
 
 from lerobot_openspm.envs import scene
-from lerobot_openspm.envs.motions import LEVEL_ROTATION, Actions, ScriptedHand, pointing_down, pose, yaw_matrix
+from lerobot_openspm.envs.motions import (
+    LEVEL_ROTATION,
+    Actions,
+    ScriptedHand,
+    pointing_down,
+    pose,
+    yaw_matrix,
+)
 from lerobot_openspm.envs.simulator import TabletopSimulator
 from lerobot_openspm.envs.tasks import TASKS
 
@@ -16,7 +23,7 @@ BOWL_GRASP = np.array([0.0, scene.BOWL_RADIUS - scene.BOWL_WALL / 2, 0.040])
 BOX_GRASP_Z = 0.020
 BOTTLE_GRASP_Z = 0.140
 RELEASE_GAP = 0.003
-# How high the underside of a carried object crosses the table: above the bottle, or above the bowl and the rack.
+# How high the underside of a carried object crosses the table: above the bottle, or above bowl and rack.
 TRANSIT_Z = {"bowl": 0.175, "box": 0.175, "bottle": 0.095}
 DRAWER_PULL = {"drawer_middle": 0.135, "drawer_top": 0.152}
 KNOB_TURN = math.radians(98)
@@ -66,9 +73,9 @@ def _pick(hand: ScriptedHand, grasp: np.ndarray, yaw: float, carry_z: float) -> 
 
 def _place(hand: ScriptedHand, name: str, goal: np.ndarray) -> Actions:
     """Put the grasped object's origin at a world point (3,), let go and retreat upwards."""
-    release = goal + hand.grasp_noise()[0] + (0.0, 0.0, RELEASE_GAP)
+    release = goal + hand.grasp_noise()[0] + np.array([0.0, 0.0, RELEASE_GAP])
     approach = max(0.05, TRANSIT_Z[name] - release[2])
-    yield from hand.travel(_carried(hand, name, release + (0.0, 0.0, approach)))
+    yield from hand.travel(_carried(hand, name, release + np.array([0.0, 0.0, approach])))
     yield from hand.advance(_carried(hand, name, release))
     yield from hand.grip(closing=False)
     yield from _retreat(hand)
@@ -96,7 +103,9 @@ def _pick_bowl(hand: ScriptedHand, carry_z: float = CARRY_Z) -> Actions:
 
 def _bowl_on_plate(hand: ScriptedHand) -> Actions:
     yield from _pick_bowl(hand)
-    yield from _place(hand, "bowl", _in_frame(hand.simulator.object_poses()["plate"], 0, 0, scene.PLATE_FLOOR))
+    yield from _place(
+        hand, "bowl", _in_frame(hand.simulator.object_poses()["plate"], 0, 0, scene.PLATE_FLOOR)
+    )
 
 
 def _bowl_on_stove(hand: ScriptedHand) -> Actions:
@@ -175,7 +184,7 @@ def _bowl_in_top_drawer(hand: ScriptedHand) -> Actions:
 
 
 def _push_plate(hand: ScriptedHand) -> Actions:
-    """Lower the closed fingers into the plate and carry it along by its inner rim, which centres itself behind them."""
+    """Lower the closed fingers into the plate and drag it by its inner rim; it centres itself behind them."""
     poses = hand.simulator.object_poses()
     goal = _in_frame(poses["stove"], scene.PLATE_GOAL_X, 0, 0)[:2]
     plate = poses["plate"][:2, 3]

@@ -1,4 +1,4 @@
-"""Chooses MuJoCo's rendering backend before mujoco is imported, and says what is missing when it cannot render."""
+"""Chooses MuJoCo's rendering backend before mujoco is imported, and says what is missing for it."""
 
 import os
 import sys

@@ -1,4 +1,4 @@
-"""Where everything stands at the start of an episode: uniform draws, rejected when footprints come too close."""
+"""Where everything stands at the start of an episode: uniform draws, rejected when they come too close."""
 
 import math
 from dataclasses import dataclass
@@ -29,8 +29,8 @@ HAND_GAP = 0.01
 HAND_RADIUS = 0.055
 MAX_TRIES = 20_000
 PLATE_MIN_WAY = 0.08
-# Before the cabinet (x, half y, its frame): the bottle is taller than a drawer's underside, and a bowl under an open
-# drawer could not be taken from above.
+# Before the cabinet (x, half y, its frame): the bottle is taller than a drawer's underside, and a bowl under
+# an open drawer could not be taken from above.
 DRAWERS_WAY = {"bottle": (0.50, 0.09), "bowl": (0.37, 0.19)}
 
 
@@ -118,7 +118,7 @@ def footprint_discs(name: str, at: Placement) -> list[tuple[float, float, float]
 
 
 def _hand_discs(layout: dict[str, Placement], name: str) -> list[tuple[float, float, float]]:
-    """What the hand covers while it grasps: the bowl is taken by its rim on the +y side, the box in its middle."""
+    """What the hand covers while it grasps: the bowl's rim on the +y side, the middle of the box."""
     at = layout[name]
     if name == "bowl":
         return [(at.x, at.y + scene.BOWL_RADIUS, HAND_RADIUS)]
@@ -126,7 +126,9 @@ def _hand_discs(layout: dict[str, Placement], name: str) -> list[tuple[float, fl
 
 
 def _hand_blocked(layout: dict[str, Placement], discs: dict, a: str, b: str) -> bool:
-    return _too_close(_hand_discs(layout, a), discs[b], HAND_GAP) or _too_close(_hand_discs(layout, b), discs[a], HAND_GAP)
+    return _too_close(_hand_discs(layout, a), discs[b], HAND_GAP) or _too_close(
+        _hand_discs(layout, b), discs[a], HAND_GAP
+    )
 
 
 def _too_close(a: list, b: list, gap: float) -> bool:
@@ -134,7 +136,12 @@ def _too_close(a: list, b: list, gap: float) -> bool:
 
 
 def _on_table(x: float, y: float, radius: float) -> bool:
-    return TABLE_X[0] < x - radius and x + radius < TABLE_X[1] and TABLE_Y[0] < y - radius and y + radius < TABLE_Y[1]
+    return (
+        TABLE_X[0] < x - radius
+        and x + radius < TABLE_X[1]
+        and TABLE_Y[0] < y - radius
+        and y + radius < TABLE_Y[1]
+    )
 
 
 def _rectangle_distance(fixture: str, at: Placement, x: float, y: float) -> float:
@@ -151,7 +158,7 @@ def plate_goal(stove: Placement) -> tuple[float, float]:
 
 
 def _ways_are_free(layout: dict[str, Placement], discs: dict) -> bool:
-    """Bottle and bowl stay out of the drawers' way, and nothing stands on the plate's way to the stove's front."""
+    """Bottle and bowl stay out of the drawers' way, and nothing between plate and stove."""
     cabinet, plate = layout["cabinet"], layout["plate"]
     for name, (way_x, way_y) in DRAWERS_WAY.items():
         local_x, local_y = cabinet.to_local(layout[name].x, layout[name].y)
@@ -162,7 +169,8 @@ def _ways_are_free(layout: dict[str, Placement], discs: dict) -> bool:
         return False
     others = [d for name in discs if name != "plate" for d in discs[name]]
     return all(
-        _segment_distance((plate.x, plate.y), goal, (x, y)) > scene.PLATE_RADIUS + r + HAND_GAP for x, y, r in others
+        _segment_distance((plate.x, plate.y), goal, (x, y)) > scene.PLATE_RADIUS + r + HAND_GAP
+        for x, y, r in others
     )
 
 

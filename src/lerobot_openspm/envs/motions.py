@@ -1,6 +1,7 @@
-"""Motion primitives of the scripted experts: proportional control through the 7-D actions, imperfect like a person's.
+"""Motion primitives of the scripted experts: proportional control by 7-D actions, imperfect like a person's.
 
-Every primitive is a generator: it yields one action, is resumed after the environment has stepped, and looks again.
+Every primitive is a generator: it yields one action, is resumed after the environment has stepped, and looks
+again.
 """
 
 import math
@@ -17,7 +18,7 @@ PAUSE_SEGMENTS = 8
 VIA_CHANCE = 0.6
 GRASP_NOISE_M = 0.0012
 GRASP_NOISE_RAD = math.radians(1.5)
-# Fingers pointing along the cabinet's -x with the camera above: the hand at home, turned by 90 degrees about y.
+# Fingers pointing along -x with the camera above: the hand at home, turned by 90 degrees about y.
 LEVEL_ROTATION = Rotation.from_euler("y", 90, degrees=True).as_matrix() @ HOME_ROTATION
 
 Actions = Iterator[np.ndarray]
@@ -61,7 +62,7 @@ class ScriptedHand:
         return np.clip(offset, -0.0025, 0.0025), float(self.rng.normal(0.0, GRASP_NOISE_RAD))
 
     def travel(self, goal: np.ndarray) -> Actions:
-        """Cross free space to T_world_ee `goal`, often not quite straight; ends near the goal, still moving."""
+        """Cross free space to T_world_ee `goal`, often not quite straight; ends near it, still moving."""
         yield from self._maybe_pause()
         start = self.simulator.ee_pose()
         if self.rng.random() < VIA_CHANCE and np.linalg.norm(goal[:3, 3] - start[:3, 3]) > 0.12:
@@ -95,7 +96,9 @@ class ScriptedHand:
         if self._segment - 1 in self._pause_at:
             yield from self.hold(int(self.rng.integers(3, 11)))
 
-    def _approach(self, goal: np.ndarray, tolerance_m: float, tolerance_rad: float, slowness: float = 1.0) -> Actions:
+    def _approach(
+        self, goal: np.ndarray, tolerance_m: float, tolerance_rad: float, slowness: float = 1.0
+    ) -> Actions:
         speed = float(self.rng.uniform(0.6, 1.0)) * slowness
         distance, angle = self._remaining(goal)
         limit = 25 + int((distance / MAX_STEP_M + angle / MAX_STEP_RAD) / speed)
@@ -111,7 +114,9 @@ class ScriptedHand:
 
     def _errors(self, goal: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         current = self.simulator.ee_pose()
-        return goal[:3, 3] - current[:3, 3], Rotation.from_matrix(goal[:3, :3] @ current[:3, :3].T).as_rotvec()
+        return goal[:3, 3] - current[:3, 3], Rotation.from_matrix(
+            goal[:3, :3] @ current[:3, :3].T
+        ).as_rotvec()
 
     def _towards(self, goal: np.ndarray, speed: float) -> np.ndarray:
         position, turn = self._errors(goal)

@@ -1,8 +1,9 @@
-"""The tabletop's geometry as MJCF: one hand, four movable objects, a rack, a cabinet and a stove, all primitives.
+"""The tabletop's geometry as MJCF: a hand, four movable objects, a rack, a cabinet, a stove; all primitives.
 
-World frame: z up, table top at z = 0. Every object frame has its origin at the centre of the footprint, on the
-support surface; the cabinet's and the stove's x axes point out of their fronts.
-The `ee` frame sits between the fingertips; its z axis points out of the hand (down at home), the fingers open along y.
+World frame: z up, table top at z = 0. Every object frame has its origin at the centre of the footprint, on
+the support surface; the cabinet's and the stove's x axes point out of their fronts.
+The `ee` frame sits between the fingertips; its z axis points out of the hand (down at home), the fingers
+open along its y axis.
 """
 
 import math
@@ -71,7 +72,7 @@ COLOURS = {
 
 
 def drawer_height(index: int) -> float:
-    """Height of the underside of drawer `index` (0 bottom, 2 top) above the cabinet's footprint, in metres."""
+    """Height of the underside of drawer `index` (0 bottom, 2 top) above the table, in metres."""
     return 0.008 + DRAWER_PITCH * index
 
 
@@ -121,12 +122,22 @@ def _inertial(mass: float, height: float, inertia: tuple) -> str:
 def _movables() -> str:
     bowl = (
         _feet(0.035, 0.003, 6, "bowl")
-        + _geom("cylinder", (BOWL_RADIUS - 0.002, (BOWL_FLOOR - 0.001) / 2), (0, 0, (BOWL_FLOOR + 0.001) / 2), "bowl")
+        + _geom(
+            "cylinder",
+            (BOWL_RADIUS - 0.002, (BOWL_FLOOR - 0.001) / 2),
+            (0, 0, (BOWL_FLOOR + 0.001) / 2),
+            "bowl",
+        )
         + _ring(BOWL_RADIUS, BOWL_WALL, 0.002, BOWL_HEIGHT, 20, "bowl")
     )
     plate = (
         _feet(0.060, 0.0025, 8, "plate")
-        + _geom("cylinder", (PLATE_RADIUS - 0.002, (PLATE_FLOOR - 0.001) / 2), (0, 0, (PLATE_FLOOR + 0.001) / 2), "plate")
+        + _geom(
+            "cylinder",
+            (PLATE_RADIUS - 0.002, (PLATE_FLOOR - 0.001) / 2),
+            (0, 0, (PLATE_FLOOR + 0.001) / 2),
+            "plate",
+        )
         + _ring(PLATE_RADIUS, PLATE_RIM_WIDTH, 0.001, PLATE_RIM_HEIGHT, 24, "plate")
     )
     box = _geom("box", BOX_HALF, (0, 0, BOX_HALF[2]), "box")
@@ -134,7 +145,10 @@ def _movables() -> str:
     bottle = (
         _feet(0.018, 0.003, 6, "bottle")
         + _geom(
-            "cylinder", (BOTTLE_RADIUS, (BOTTLE_BODY_HEIGHT - 0.002) / 2), (0, 0, (BOTTLE_BODY_HEIGHT + 0.002) / 2), "bottle"
+            "cylinder",
+            (BOTTLE_RADIUS, (BOTTLE_BODY_HEIGHT - 0.002) / 2),
+            (0, 0, (BOTTLE_BODY_HEIGHT + 0.002) / 2),
+            "bottle",
         )
         + _geom("cylinder", (BOTTLE_NECK_RADIUS, neck_half), (0, 0, BOTTLE_BODY_HEIGHT + neck_half), "bottle")
     )
@@ -149,9 +163,16 @@ def _movables() -> str:
 def _rack() -> str:
     hx, hy = RACK_HALF
     shelf = _geom("box", (hx, hy, 0.004), (0, 0, RACK_SHELF_HEIGHT - 0.004), "rack")
-    legs = "".join(_geom("box", (0.004, hy, 0.021), (sign * (hx - 0.004), 0, 0.021), "rack") for sign in (-1, 1))
+    legs = "".join(
+        _geom("box", (0.004, hy, 0.021), (sign * (hx - 0.004), 0, 0.021), "rack") for sign in (-1, 1)
+    )
     rails = "".join(
-        _geom("box", (hx, 0.004, RACK_RAIL_HEIGHT / 2), (0, s * (hy - 0.004), RACK_SHELF_HEIGHT + RACK_RAIL_HEIGHT / 2), "rack")
+        _geom(
+            "box",
+            (hx, 0.004, RACK_RAIL_HEIGHT / 2),
+            (0, s * (hy - 0.004), RACK_SHELF_HEIGHT + RACK_RAIL_HEIGHT / 2),
+            "rack",
+        )
         for s in (-1, 1)
     )
     return f'<body name="rack">{shelf}{legs}{rails}</body>'
@@ -169,14 +190,20 @@ def _drawer(index: int) -> str:
         + _geom("box", (0.005, CABINET_HALF[1] - 0.002, 0.031), (front - 0.005, 0, mid), "drawer")
         + _geom("box", (0.006, 0.006, 0.022), (bar_x, 0, mid), "handle")
         + "".join(
-            _geom("box", ((bar_x - front) / 2, 0.003, 0.003), ((bar_x + front) / 2, 0, mid + s * 0.019), "handle")
+            _geom(
+                "box",
+                ((bar_x - front) / 2, 0.003, 0.003),
+                ((bar_x + front) / 2, 0, mid + s * 0.019),
+                "handle",
+            )
             for s in (-1, 1)
         )
     )
     return (
         f'<body name="{name}" pos="0 0 {drawer_height(index):.4f}">'
         f'<joint name="{name}" type="slide" axis="1 0 0" range="0 {DRAWER_TRAVEL}" limited="true" '
-        f'damping="8" frictionloss="2" armature="0.1"/>{_inertial(0.5, 0.02, (2e-3, 2e-3, 4e-3))}{geoms}</body>'
+        f'damping="8" frictionloss="2" armature="0.1"/>'
+        f"{_inertial(0.5, 0.02, (2e-3, 2e-3, 4e-3))}{geoms}</body>"
     )
 
 
@@ -204,16 +231,25 @@ def _stove() -> str:
     return (
         f'<body name="stove">{body}<body name="knob" pos="{KNOB_X} 0 {STOVE_HEIGHT}">'
         f'<joint name="knob" type="hinge" axis="0 0 1" range="0 {KNOB_RANGE}" limited="true" damping="0.01" '
-        f'frictionloss="0.03" armature="0.001"/>{_inertial(0.05, 0.015, (1e-5, 1e-5, 1e-5))}{knob}</body></body>'
+        f'frictionloss="0.03" armature="0.001"/>'
+        f"{_inertial(0.05, 0.015, (1e-5, 1e-5, 1e-5))}{knob}</body></body>"
     )
 
 
 def _finger(name: str, sign: int) -> str:
     low, high = sorted((-0.001 * sign, (FINGER_TRAVEL + 0.001) * sign))
     return (
-        f'<body name="{name}" gravcomp="1"><joint name="{name}" type="slide" axis="0 1 0" range="{low} {high}" limited="true" '
-        f'damping="70" armature="0.05" solreflimit="0.006 1" solimplimit="0.95 0.99 0.0005"/>{_inertial(0.05, -0.02, (1e-5, 1e-5, 1e-5))}'
-        + _geom("box", (0.010, 0.004, 0.030), (0, sign * 0.004, FINGERTIP_BEYOND_EE - 0.030), "finger", 'class="finger"')
+        f'<body name="{name}" gravcomp="1">'
+        f'<joint name="{name}" type="slide" axis="0 1 0" range="{low} {high}" limited="true" '
+        f'damping="70" armature="0.05" solreflimit="0.006 1" solimplimit="0.95 0.99 0.0005"/>'
+        + _inertial(0.05, -0.02, (1e-5, 1e-5, 1e-5))
+        + _geom(
+            "box",
+            (0.010, 0.004, 0.030),
+            (0, sign * 0.004, FINGERTIP_BEYOND_EE - 0.030),
+            "finger",
+            'class="finger"',
+        )
         + "</body>"
     )
 
@@ -243,9 +279,12 @@ def build_mjcf() -> str:
     """Return the scene as an MJCF string; object poses are set at reset, not here."""
     table = _geom("box", (0.46, 0.49, 0.02), (0.03, 0, -0.0201), "table", 'contype="0" conaffinity="0"')
     floor = _geom("box", (4, 4, 0.01), (0, 0, -0.71), "floor", 'contype="0" conaffinity="0"')
+    # What lies beyond the floor looks like the floor, also when the level hand's camera sees the horizon.
+    sky = " ".join(f"{c:g}" for c in COLOURS["floor"])
     return f"""<mujoco model="openspm_tabletop">
   <compiler angle="radian"/>
-  <option timestep="{TIMESTEP_S}" integrator="implicitfast" cone="elliptic" impratio="10" noslip_iterations="3"/>
+  <option timestep="{TIMESTEP_S}" integrator="implicitfast" cone="elliptic" impratio="10"
+    noslip_iterations="3"/>
   <size memory="16M"/>
   <statistic extent="1" center="0 0 0"/>
   <visual>
@@ -254,12 +293,16 @@ def build_mjcf() -> str:
     <map znear="0.01" zfar="10"/>
     <quality offsamples="4" numslices="20" numstacks="6" numquads="1"/>
   </visual>
+  <asset><texture type="skybox" builtin="flat" rgb1="{sky}" rgb2="{sky}" width="8" height="48"/></asset>
   <default>
     <geom friction="0.6 0.005 0.0001" condim="4"/>
-    <default class="finger"><geom friction="1.5 0.05 0.0002" condim="4" priority="1" solref="0.008 1" solimp="0.95 0.99 0.0005"/></default>
+    <default class="finger">
+      <geom friction="1.5 0.05 0.0002" condim="4" priority="1" solref="0.008 1" solimp="0.95 0.99 0.0005"/>
+    </default>
   </default>
   <worldbody>
-    <light directional="true" pos="0 0 2" dir="-0.25 0.2 -1" diffuse="0.45 0.45 0.45" specular="0 0 0" castshadow="false"/>
+    <light directional="true" pos="0 0 2" dir="-0.25 0.2 -1"
+      diffuse="0.45 0.45 0.45" specular="0 0 0" castshadow="false"/>
     <camera name="front" pos="0.945 0 1.280" xyaxes="0 1 0 -0.788 0 0.616" fovy="35"/>
     <camera name="side" pos="0.060 -0.905 1.230" xyaxes="1 0 0 0 0.788 0.616" fovy="35"/>
     <geom name="table" type="plane" size="1 1 0.1" rgba="0 0 0 0" group="4"/>

@@ -19,7 +19,11 @@ def seed_purpose(seed: int) -> str:
     Raises:
         ValueError: The seed belongs to none of the three ranges.
     """
-    for name, seeds in (("evaluation", EVALUATION_SEEDS), ("demonstration", DEMO_SEEDS), ("tuning", TUNING_SEEDS)):
+    for name, seeds in (
+        ("evaluation", EVALUATION_SEEDS),
+        ("demonstration", DEMO_SEEDS),
+        ("tuning", TUNING_SEEDS),
+    ):
         if seed in seeds:
             return name
     raise ValueError(f"seed {seed} belongs to no range; expected 0 <= seed < {SEED_END}")
@@ -34,7 +38,8 @@ def require_demo_seeds(first: int, count: int) -> range:
     seeds = range(first, first + count)
     if first not in DEMO_SEEDS or first + count > DEMO_SEEDS.stop:
         raise ValueError(
-            f"demonstration seeds must lie in [{DEMO_SEEDS.start}, {DEMO_SEEDS.stop}), got {first} to {first + count - 1}; "
+            f"demonstration seeds must lie in [{DEMO_SEEDS.start}, {DEMO_SEEDS.stop}), "
+            f"got {first} to {first + count - 1}; "
             f"pass --seed={DEMO_SEED_START} or more, since lower seeds are kept for evaluation"
         )
     return seeds

@@ -1,5 +1,8 @@
 """The MuJoCo side of the tabletop: physics, the hand's bounded drive, contacts, true poses and rendering."""
 
+# mujoco ships no stubs for its compiled part.
+# pyright: reportAttributeAccessIssue=false
+
 import atexit
 import copy
 import functools
@@ -16,7 +19,11 @@ from lerobot_openspm.envs.layout import Placement
 
 set_default_gl_backend()
 
-import mujoco  # noqa: E402  (the backend has to be chosen first)
+# After the choice of the backend: mujoco loads it on import, and fails there when its libraries are missing.
+try:
+    import mujoco
+except (ImportError, AttributeError, OSError, RuntimeError) as error:
+    raise rendering_error(error) from error
 
 CONTROL_PERIOD_S = 0.05
 # The target moves in this many equal parts per control step, so that the hand is pulled smoothly.
@@ -31,7 +38,11 @@ WORKSPACE_LOW = np.array([-0.40, -0.46, 0.010])
 WORKSPACE_HIGH = np.array([0.50, 0.46, 0.58])
 SETTLE_STEPS = 120
 HOME_ROTATION = np.diag([1.0, -1.0, -1.0])
-WARNINGS = (mujoco.mjtWarning.mjWARN_BADQPOS, mujoco.mjtWarning.mjWARN_BADQVEL, mujoco.mjtWarning.mjWARN_BADQACC)
+WARNINGS = (
+    mujoco.mjtWarning.mjWARN_BADQPOS,
+    mujoco.mjtWarning.mjWARN_BADQVEL,
+    mujoco.mjtWarning.mjWARN_BADQACC,
+)
 FINGER_OPEN_M = scene.FINGER_TRAVEL
 # Beyond closed, so that the position drive keeps pressing on whatever is between the fingers.
 FINGER_CLOSED_M = -0.02
@@ -50,7 +61,7 @@ def _bounded(vector: np.ndarray, limit: float) -> np.ndarray:
 
 
 class TabletopSimulator:
-    """One tabletop. Nothing is shared between instances but the immutable compiled model they are copied from."""
+    """One tabletop. Instances share nothing but the compiled model, of which each has its own copy."""
 
     def __init__(self) -> None:
         self.model: mujoco.MjModel = copy.copy(compiled_model())
@@ -90,8 +101,8 @@ class TabletopSimulator:
         """Advance one control step (0.05 s).
 
         Args:
-            action: (7,) in [-1, 1]: world-frame position increment in units of 0.02 m, world-frame rotation vector
-                in units of 0.15 rad (left-multiplied), gripper (positive closes, else opens).
+            action: (7,) in [-1, 1]: world-frame position increment in units of 0.02 m, world-frame rotation
+                vector in units of 0.15 rad (left-multiplied), gripper (positive closes, else opens).
         """
         before = self._target_position, Rotation.from_matrix(self._target_rotation)
         self._integrate_target(np.asarray(action, dtype=np.float64))
@@ -111,7 +122,9 @@ class TabletopSimulator:
         position = ee[:3, 3] + _bounded(position - ee[:3, 3], MAX_LEAD_M)
         self._target_position = np.clip(position, WORKSPACE_LOW, WORKSPACE_HIGH)
         actual = Rotation.from_matrix(ee[:3, :3])
-        wanted = Rotation.from_rotvec(action[3:6] * MAX_STEP_RAD) * Rotation.from_matrix(self._target_rotation)
+        wanted = Rotation.from_rotvec(action[3:6] * MAX_STEP_RAD) * Rotation.from_matrix(
+            self._target_rotation
+        )
         lead = _bounded((wanted * actual.inv()).as_rotvec(), MAX_LEAD_RAD)
         self._target_rotation = (Rotation.from_rotvec(lead) * actual).as_matrix()
 
@@ -140,7 +153,9 @@ class TabletopSimulator:
 
     def finger_positions(self) -> np.ndarray:
         """(2,) metres: left is positive, right negative, as in LIBERO; (0.04, -0.04) is open."""
-        return np.array([self.data.qpos[self._qpos["finger_left"]], self.data.qpos[self._qpos["finger_right"]]])
+        return np.array(
+            [self.data.qpos[self._qpos["finger_left"]], self.data.qpos[self._qpos["finger_right"]]]
+        )
 
     def joint_position(self, name: str) -> float:
         """Metres a drawer is pulled out, or radians the knob is turned."""
@@ -155,7 +170,7 @@ class TabletopSimulator:
         return bool(np.linalg.norm(velocity[:3]) < linear and np.linalg.norm(velocity[3:]) < angular)
 
     def touching(self, name: str) -> set[str]:
-        """Names of the bodies in contact with body `name`; "hand" stands for palm and fingers, "world" for the table."""
+        """Names of the bodies in contact with body `name`; "hand" is palm or fingers, "world" the table."""
         own = {self._body[name]}
         touched = set()
         for contact in self.data.contact:

@@ -22,14 +22,16 @@ ACTION_NAMES = (
     "delta_axis_angle_z",
     "gripper",
 )
-OBJECT_POSE_NAMES = tuple(f"{n}.{c}" for n in scene.OBJECT_NAMES for c in ("x", "y", "z", "qw", "qx", "qy", "qz"))
+OBJECT_POSE_NAMES = tuple(
+    f"{n}.{c}" for n in scene.OBJECT_NAMES for c in ("x", "y", "z", "qw", "qx", "qy", "qz")
+)
 SUCCESS_HOLD_STEPS = 5
 MIN_IMAGE_SIZE, MAX_IMAGE_SIZE = 128, 256
 RENDER_SIZE = 256
 
 
 def axis_angle(rotation: np.ndarray) -> np.ndarray:
-    """Axis-angle of a rotation as LIBERO writes it: near (pi, 0, 0) for a hand that points down, growing past pi.
+    """Axis-angle of a rotation as LIBERO writes it: near (pi, 0, 0) for a hand pointing down, past pi too.
 
     The quaternion's x is kept positive, so that the vector does not jump while the hand points down or level.
 
@@ -51,12 +53,12 @@ def axis_angle(rotation: np.ndarray) -> np.ndarray:
 class TabletopEnv(gym.Env):
     """One task on the tabletop.
 
-    Observation: "pixels" (front, side, wrist: upright uint8 RGB), "agent_pos" (8,) float32 as in `STATE_NAMES` and,
-    if asked for, "object_poses" (49,) float32, the simulator's true poses, for oracle ablations only.
+    Observation: "pixels" (front, side, wrist: upright uint8 RGB), "agent_pos" (8,) float32 as `STATE_NAMES`
+    and, if asked for, "object_poses" (49,) float32, the simulator's true poses, for oracle ablations only.
     Action: (7,) in [-1, 1], as in `TabletopSimulator.apply`; 20 actions a second.
     """
 
-    metadata = {"render_modes": ["rgb_array"], "render_fps": 20}
+    metadata: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": 20}  # noqa: RUF012 (Gymnasium's)
 
     def __init__(
         self,
@@ -68,7 +70,10 @@ class TabletopEnv(gym.Env):
         render_mode: str = "rgb_array",
     ) -> None:
         super().__init__()
-        for label, size in (("observation_height", observation_height), ("observation_width", observation_width)):
+        for label, size in (
+            ("observation_height", observation_height),
+            ("observation_width", observation_width),
+        ):
             if not MIN_IMAGE_SIZE <= size <= MAX_IMAGE_SIZE:
                 raise ValueError(f"{label} must lie in [{MIN_IMAGE_SIZE}, {MAX_IMAGE_SIZE}], got {size}")
         if episode_length <= 0:
@@ -84,7 +89,7 @@ class TabletopEnv(gym.Env):
         self._held = 0
         image = spaces.Box(0, 255, (*self._size, 3), np.uint8)
         entries: dict[str, spaces.Space] = {
-            "pixels": spaces.Dict({name: image for name in scene.CAMERA_NAMES}),
+            "pixels": spaces.Dict(dict.fromkeys(scene.CAMERA_NAMES, image)),
             "agent_pos": spaces.Box(-np.inf, np.inf, (len(STATE_NAMES),), np.float32),
         }
         if object_poses:
@@ -114,7 +119,9 @@ class TabletopEnv(gym.Env):
         """
         action = np.asarray(action, dtype=np.float64)
         if action.shape != (len(ACTION_NAMES),) or not np.isfinite(action).all():
-            raise ValueError(f"action must be {len(ACTION_NAMES)} finite numbers, got shape {action.shape}: {action}")
+            raise ValueError(
+                f"action must be {len(ACTION_NAMES)} finite numbers, got shape {action.shape}: {action}"
+            )
         self.simulator.apply(np.clip(action, -1.0, 1.0))
         self._steps += 1
         if self.simulator.is_unstable():
@@ -140,7 +147,9 @@ class TabletopEnv(gym.Env):
     def state(self) -> np.ndarray:
         """(8,) float32, as in `STATE_NAMES`: ee position (m), ee axis-angle (rad), finger positions (m)."""
         pose = self.simulator.ee_pose()
-        return np.concatenate([pose[:3, 3], axis_angle(pose[:3, :3]), self.simulator.finger_positions()]).astype(np.float32)
+        return np.concatenate(
+            [pose[:3, 3], axis_angle(pose[:3, :3]), self.simulator.finger_positions()]
+        ).astype(np.float32)
 
     def object_poses(self) -> dict[str, np.ndarray]:
         """T_world_obj, (4, 4), per object name: the simulator's truth."""

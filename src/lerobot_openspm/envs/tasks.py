@@ -34,7 +34,9 @@ def _is_left_on(simulator: "TabletopSimulator", name: str, support: str) -> bool
     return support in touched and "hand" not in touched and simulator.is_at_rest(name)
 
 
-def _rests_near(name: str, support: str, radius: float, centre_x: float = 0.0) -> Callable[["TabletopSimulator"], bool]:
+def _rests_near(
+    name: str, support: str, radius: float, centre_x: float = 0.0
+) -> Callable[["TabletopSimulator"], bool]:
     def done(simulator: "TabletopSimulator") -> bool:
         offset = _local(simulator, name, support)
         near = math.hypot(offset[0] - centre_x, offset[1]) < radius
@@ -43,7 +45,9 @@ def _rests_near(name: str, support: str, radius: float, centre_x: float = 0.0) -
     return done
 
 
-def _rests_within(name: str, support: str, half: tuple[float, float], height: float) -> Callable[["TabletopSimulator"], bool]:
+def _rests_within(
+    name: str, support: str, half: tuple[float, float], height: float
+) -> Callable[["TabletopSimulator"], bool]:
     def done(simulator: "TabletopSimulator") -> bool:
         offset = _local(simulator, name, support)
         inside = abs(offset[0]) < half[0] and abs(offset[1]) < half[1] and abs(offset[2] - height) < 0.01
@@ -54,7 +58,9 @@ def _rests_within(name: str, support: str, half: tuple[float, float], height: fl
 
 def _box_in_bowl(simulator: "TabletopSimulator") -> bool:
     offset = _local(simulator, "box", "bowl")
-    inside = math.hypot(offset[0], offset[1]) < scene.BOWL_RADIUS - 0.01 and offset[2] < scene.BOWL_HEIGHT - 0.005
+    inside = (
+        math.hypot(offset[0], offset[1]) < scene.BOWL_RADIUS - 0.01 and offset[2] < scene.BOWL_HEIGHT - 0.005
+    )
     return inside and _is_upright(simulator, "bowl") and _is_left_on(simulator, "box", "bowl")
 
 
@@ -99,11 +105,23 @@ TASKS: dict[str, Task] = {
     task.name: task
     for task in (
         Task("bowl_on_plate", "put the bowl on the plate", _rests_near("bowl", "plate", 0.035)),
-        Task("bowl_on_stove", "put the bowl on the stove", _rests_near("bowl", "stove", 0.05, scene.BURNER_X)),
-        Task("bowl_on_cabinet", "put the bowl on top of the cabinet", _rests_within("bowl", "cabinet", *_CABINET_TOP)),
+        Task(
+            "bowl_on_stove", "put the bowl on the stove", _rests_near("bowl", "stove", 0.05, scene.BURNER_X)
+        ),
+        Task(
+            "bowl_on_cabinet",
+            "put the bowl on top of the cabinet",
+            _rests_within("bowl", "cabinet", *_CABINET_TOP),
+        ),
         Task("box_in_bowl", "put the cream cheese box in the bowl", _box_in_bowl),
-        Task("bottle_on_cabinet", "put the wine bottle on top of the cabinet", _rests_within("bottle", "cabinet", *_CABINET_TOP)),
-        Task("bottle_on_rack", "put the wine bottle on the rack", _rests_within("bottle", "rack", *_RACK_SHELF)),
+        Task(
+            "bottle_on_cabinet",
+            "put the wine bottle on top of the cabinet",
+            _rests_within("bottle", "cabinet", *_CABINET_TOP),
+        ),
+        Task(
+            "bottle_on_rack", "put the wine bottle on the rack", _rests_within("bottle", "rack", *_RACK_SHELF)
+        ),
         Task("open_middle_drawer", "open the middle drawer of the cabinet", _middle_drawer_open),
         Task("bowl_in_top_drawer", "open the top drawer and put the bowl inside", _bowl_in_top_drawer),
         Task("push_plate", "push the plate to the front of the stove", _plate_before_stove),
@@ -125,6 +143,7 @@ def select_tasks(spec: str) -> list[str]:
     unknown = [name for name in names if name not in TASKS]
     if unknown or not names:
         raise ValueError(
-            f"unknown openspm_tabletop task {', '.join(unknown) or repr(spec)}; expected 'all' or a comma list of: {', '.join(TASK_NAMES)}"
+            f"unknown openspm_tabletop task {', '.join(unknown) or repr(spec)}; "
+            f"expected 'all' or a comma list of: {', '.join(TASK_NAMES)}"
         )
     return names
