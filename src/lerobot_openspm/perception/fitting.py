@@ -30,11 +30,13 @@ class Evidence:
         probability: Values ``(H, W)`` from 0 to 1, float32.
         visible: 0 where something is known to hide whatever lies behind, else 1, ``(H, W)`` float32; None for
             nothing known.
+        camera: Name of the camera.
     """
 
     view: View
     probability: silhouette.Float32
     visible: silhouette.Float32 | None = None
+    camera: str = ""
 
     @cached_property
     def distance(self) -> silhouette.Float32:
@@ -114,9 +116,7 @@ def fit(
         if weights < 8:
             break
         scale = CORRELATED_PX * max(squares / weights, MIN_RESIDUAL_PX**2)
-        step = np.linalg.solve(
-            hessian / scale + np.diag(prior + 1e-3), -gradient / scale - prior * offset
-        )
+        step = np.linalg.solve(hessian / scale + np.diag(prior + 1e-3), -gradient / scale - prior * offset)
         step = np.clip(step, [-0.04, -0.04, -0.04, -0.5], [0.04, 0.04, 0.04, 0.5])
         offset += step
         T = se3.from_yaw(T[:3, 3] + step[:3], se3.yaw_of(T) + step[3])

@@ -16,7 +16,17 @@ from lerobot_openspm.geometry.camera import intersect_plane
 from lerobot_openspm.geometry.se3 import Array
 from lerobot_openspm.perception import colour, seeding, shape
 from lerobot_openspm.perception.blobs import Blob, triangulate
-from lerobot_openspm.perception.fitting import COARSE_PX, FINE_PX, Cloud, Evidence, Fit, Freedom, fit, measure, score
+from lerobot_openspm.perception.fitting import (
+    COARSE_PX,
+    FINE_PX,
+    Cloud,
+    Evidence,
+    Fit,
+    Freedom,
+    fit,
+    measure,
+    score,
+)
 from lerobot_openspm.perception.localise import COARSE_CUTS_PX, FINE_CUTS_PX, prepare
 from lerobot_openspm.perception.model import ObjectModel
 from lerobot_openspm.perception.seeding import Picture
@@ -26,11 +36,11 @@ from lerobot_openspm.perception.types import Scene, View
 log = logging.getLogger(__name__)
 
 MAX_SCENES = 30
-REFERENCES = 3
-JUDGES = 8
+REFERENCES = 2
+JUDGES = 6
 ROUNDS = 3
 SYMMETRY_ROUNDS = 2
-THRESHOLDS = (0.6, 0.7, 0.8, 0.9)
+THRESHOLDS = (0.5, 0.6, 0.7, 0.8, 0.9, 0.97)
 # Two rays that are to meet in an object may miss each other by this much, metres.
 MAX_RAY_GAP = 0.05
 # A more symmetric shape is preferred if it explains the masks as well as this.
@@ -57,7 +67,9 @@ def learn_objects(scenes: Sequence[Scene], rng: Generator) -> dict[str, ObjectMo
     """
     names = sorted({hint.name for scene in scenes for hint in scene.hints})
     if not names:
-        raise DatasetError("no demonstration shows a grasp, contact or release; perception has nothing to learn from")
+        raise DatasetError(
+            "no demonstration shows a grasp, contact or release; perception has nothing to learn from"
+        )
     floor = min(float(hint.point_world[2]) for scene in scenes for hint in scene.hints) - 0.02
     models = {}
     for name in names:
@@ -104,7 +116,7 @@ def _first_poses(pictures: Sequence[Picture], log_odds: NDArray[np.float32]) -> 
     groups: dict[int, list[tuple[Evidence, Blob | None]]] = {}
     for picture in pictures:
         probability = colour.foreground(picture.bins, log_odds)
-        evidence = Evidence(picture.view, probability, visible.get(picture.camera))
+        evidence = Evidence(picture.view, probability, visible.get(picture.camera), picture.camera)
         groups.setdefault(picture.scene, []).append((evidence, seeding.hinted_blob(picture, log_odds)))
     places: dict[int, Array] = {}
     singles: dict[int, tuple[View, Blob]] = {}
@@ -141,7 +153,9 @@ def _reach(view: View, blob: Blob, point_world: Array) -> float:
 
 def _bootstrap(posed: list[Posed], half_size: float) -> tuple[Cloud, list[Posed]] | None:
     """A first common shape: that of the scene whose own hull, turned and moved, explains the others best."""
-    order = sorted(range(len(posed)), key=lambda i: -sum(bool((e.probability > 0.5).any()) for e in posed[i].evidence))
+    order = sorted(
+        range(len(posed)), key=lambda i: -sum(bool((e.probability > 0.5).any()) for e in posed[i].evidence)
+    )
     yaws = np.arange(8) * np.pi / 4
     judges = [posed[i] for i in order[:JUDGES]]
     best: tuple[float, Cloud] | None = None
@@ -181,7 +195,9 @@ def _symmetrise(
     posed: list[Posed], half_size: float, cloud: Cloud, limits: tuple[float, float]
 ) -> tuple[Cloud, list[Posed], float]:
     """The most symmetric shape that explains the masks nearly as well as the free one, its poses and yaw period."""
-    free = float(np.mean([one.score for one in (_refit(scene, cloud, 2 * np.pi) for scene in _reliable(posed, cloud))]))
+    free = float(
+        np.mean([one.score for one in (_refit(scene, cloud, 2 * np.pi) for scene in _reliable(posed, cloud))])
+    )
     for order in (BODY_OF_REVOLUTION, 4, 2):
         period = 0.0 if order == BODY_OF_REVOLUTION else 2 * np.pi / order
         turned, moved = cloud, posed
@@ -190,8 +206,14 @@ def _symmetrise(
             votes = shape.vote(reliable, half_size, shape.around(turned, half_size)).turned(order)
             turned, _ = _best_cloud(reliable, votes, limits, turned)
             moved = _moved(moved, [_refit(scene, turned, period) for scene in moved])
-        worth = float(np.mean([score(measure(s.evidence, turned, s.T_world_obj, FINE_PX)) for s in _reliable(moved, turned)]))
-        log.debug("perception: symmetry of order %d explains %.3f of the masks, none %.3f", order, worth, free)
+        worth = float(
+            np.mean(
+                [score(measure(s.evidence, turned, s.T_world_obj, FINE_PX)) for s in _reliable(moved, turned)]
+            )
+        )
+        log.debug(
+            "perception: symmetry of order %d explains %.3f of the masks, none %.3f", order, worth, free
+        )
         if worth > free - SYMMETRY_LOSS:
             return turned, moved, period
     return cloud, posed, 2 * np.pi
@@ -271,7 +293,10 @@ def _reliable(posed: Sequence[Posed], cloud: Cloud) -> list[Posed]:
 
 def _fit_yaws(scene: Posed, cloud: Cloud, yaws: Array) -> Fit:
     place = scene.T_world_obj[:3, 3]
-    fits = [fit(scene.evidence, cloud, se3.from_yaw(place, yaw), Freedom(), COARSE_CUTS_PX, COARSE_PX) for yaw in yaws]
+    fits = [
+        fit(scene.evidence, cloud, se3.from_yaw(place, yaw), Freedom(), COARSE_CUTS_PX, COARSE_PX)
+        for yaw in yaws
+    ]
     return max(fits, key=lambda one: one.score)
 
 
@@ -288,7 +313,9 @@ def _model(
     turn = 0.0 if period == 0 else turn
     T_old_new = se3.from_yaw([*centre, bottom], turn)
     points = se3.apply(se3.inverse(T_old_new), cloud.points)
-    yaws = np.array([se3.yaw_of(scene.T_world_obj) for scene in posed])[scores > 0.8 * np.median(scores)] + turn
+    yaws = (
+        np.array([se3.yaw_of(scene.T_world_obj) for scene in posed])[scores > 0.8 * np.median(scores)] + turn
+    )
     yaw_centre, halfwidth = _yaw_range(yaws, period)
     height = float(np.median([scene.T_world_obj[2, 3] for scene in posed])) + bottom
     return ObjectModel(

@@ -56,7 +56,9 @@ def prepare(view: View) -> Prepared:
     return Prepared(view)
 
 
-def localise(views: Mapping[str, View | Prepared], model: ObjectModel, freedom: Freedom | None = None) -> PoseEstimate:
+def localise(
+    views: Mapping[str, View | Prepared], model: ObjectModel, freedom: Freedom | None = None
+) -> PoseEstimate:
     """Find an object in the views of one moment.
 
     Args:
@@ -121,7 +123,9 @@ def candidates(evidence: Sequence[Evidence], model: ObjectModel) -> list[Array]:
     places: list[Array] = []
     strength: list[float] = []
     for point, weight in sorted(votes, key=lambda vote: -vote[1]):
-        near = [i for i, place in enumerate(places) if np.linalg.norm(place[:2] - point[:2]) < 0.6 * model.radius]
+        near = [
+            i for i, place in enumerate(places) if np.linalg.norm(place[:2] - point[:2]) < 0.6 * model.radius
+        ]
         if near:
             i = near[0]
             places[i] = (places[i] * strength[i] + point * weight) / (strength[i] + weight)

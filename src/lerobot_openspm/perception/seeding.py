@@ -95,7 +95,11 @@ def learn_colours(pictures: Sequence[Picture]) -> NDArray[np.float32]:
         regions, outsides = [], []
         for picture in pictures:
             blob = hinted_blob(picture, log_odds)
-            region = np.zeros(picture.bins.shape, bool) if blob is None else grow(blob.mask, 1 + 0.2 * blob.area**0.5)
+            region = (
+                np.zeros(picture.bins.shape, bool)
+                if blob is None
+                else grow(blob.mask, 1 + 0.2 * blob.area**0.5)
+            )
             regions.append(region)
             outsides.append(~grow(region, 2) if region.any() else region)
         log_odds = _evidence(pictures, regions, outsides)
@@ -112,7 +116,9 @@ def hinted_blob(picture: Picture, log_odds: NDArray[np.float32]) -> Blob | None:
     return blob if count >= 4 else None
 
 
-def hiding_pixels(pictures: Sequence[Picture], log_odds: NDArray[np.float32]) -> dict[str, NDArray[np.float32]]:
+def hiding_pixels(
+    pictures: Sequence[Picture], log_odds: NDArray[np.float32]
+) -> dict[str, NDArray[np.float32]]:
     """Per camera, 0 where the hand or the like always hides the object and 1 elsewhere, ``(H, W)``.
 
     At the start of every episode the hand is at the same place. Pixels that lie within the convex hull of the

@@ -79,6 +79,10 @@ def surface(solid: NDArray[np.bool_], spacing: float) -> Cloud | None:
 def vote(scenes: Sequence[Posed], half_size: float, worth: NDArray[np.bool_] | None = None) -> Votes:
     """Let every picture vote on every voxel of a cube around the object.
 
+    A voxel's share is half the mean over the cameras and half that of the camera least convinced of it: the object
+    lies within the silhouettes of every camera, however few scenes that camera sees it in; but what often stands
+    in front of it must not carve it away.
+
     Args:
         scenes: Evidence and poses.
         half_size: Half the cube's edge, metres.
@@ -89,7 +93,8 @@ def vote(scenes: Sequence[Posed], half_size: float, worth: NDArray[np.bool_] | N
     axis = (np.arange(n) - (n - 1) / 2) * spacing
     asked = np.argwhere(np.ones((n, n, n), bool) if worth is None else worth)
     centres = axis[asked]
-    votes, seen = np.zeros(len(asked), np.float32), np.zeros(len(asked), np.float32)
+    cameras = sorted({one.camera for scene in scenes for one in scene.evidence})
+    votes, seen = np.zeros((2, len(cameras), len(asked)), np.float32)
     for scene in scenes:
         points_world = se3.apply(scene.T_world_obj, centres)
         for one in scene.evidence:
@@ -101,11 +106,15 @@ def vote(scenes: Sequence[Posed], half_size: float, worth: NDArray[np.bool_] | N
             if one.visible is not None:
                 inside &= bilinear(one.visible, uv) > 0.9
             value = bilinear(one.probability, uv)
-            votes += np.where(inside, np.clip((value - 0.25) * 2, 0, 1), 0)
-            seen += inside
+            camera = cameras.index(one.camera)
+            votes[camera] += np.where(inside, np.clip((value - 0.25) * 2, 0, 1), 0)
+            seen[camera] += inside
     share = np.zeros((n, n, n), np.float32)
+    # A camera that saw a voxel once or twice may have seen something in front of it.
+    per_camera = np.where(seen >= min(4, len(scenes)), votes / np.maximum(seen, 1), 1)
     # A voxel that hardly any picture shows is no part of the object that pictures could confirm.
-    share[tuple(asked.T)] = np.where(seen >= 0.3 * seen.max(initial=1), votes / np.maximum(seen, 1), 0)
+    known = seen.sum(0) >= 0.3 * seen.sum(0).max(initial=1)
+    share[tuple(asked.T)] = np.where(known, (per_camera.min(0) + per_camera.mean(0)) / 2, 0)
     return Votes(share, spacing)
 
 

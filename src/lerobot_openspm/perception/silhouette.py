@@ -72,7 +72,9 @@ def observed_distance(probability: Float32, limit_px: float) -> Float32:
     return np.clip(signed_distance((large > 0.5).astype(np.uint8)) / 2, -limit_px, limit_px)
 
 
-def draw(points_obj: Array, spacing: float, T_world_obj: Array, view: View, detail_px: float) -> Drawing | None:
+def draw(
+    points_obj: Array, spacing: float, T_world_obj: Array, view: View, detail_px: float
+) -> Drawing | None:
     """Draw surface points ``(n, 3)`` of a model, ``spacing`` metres apart; None where it is out of sight.
 
     The drawing's longer side takes at most ``detail_px`` crop pixels: fewer are faster, more are exacter.
@@ -94,7 +96,9 @@ def draw(points_obj: Array, spacing: float, T_world_obj: Array, view: View, deta
     mask[cells[:, 1], cells[:, 0]] = 1
     spacing_px = spacing * view.camera.fx / float(depth.mean())
     kernel = 2 * int(np.ceil(spacing_px * scale)) + 1
-    mask = cv2.morphologyEx(mask, cv2.MORPH_CLOSE, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (kernel, kernel)))
+    mask = cv2.morphologyEx(
+        mask, cv2.MORPH_CLOSE, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (kernel, kernel))
+    )
     # The points are centres of voxels: the surface is half a voxel further out.
     distance = signed_distance(mask) / scale + spacing_px / 2
     return Drawing(uv, distance.astype(np.float32), corner, scale)
