@@ -54,11 +54,10 @@ def transfer(
     targets: list[Target] = []
     before = T_world_ee
     for i, pose in enumerate(entry.key_poses):
-        if pose.anchor not in chosen:
-            choices = se3.yaw_equivalents(layout[pose.anchor], yaw_periods.get(pose.anchor, 2 * np.pi))
-            turns = [float(se3.distances(before, transfer_pose(T, pose.T_obj_ee))[1]) for T in choices]
-            chosen[pose.anchor] = choices[int(np.argmin(turns))]
-        before = transfer_pose(chosen[pose.anchor], pose.T_obj_ee)
+        for name in pose.anchor.objects:
+            if name not in chosen:
+                chosen[name] = _nearest_equivalent(name, pose, {**layout, **chosen}, yaw_periods, before)
+        before = transfer_pose(pose.anchor.frame(chosen), pose.T_obj_ee)
         after = entry.key_poses[i + 1] if i + 1 < len(entry.key_poses) else None
         # The arrival before the fingers move is where a grasp or a release is decided.
         precise = pose.phase in PRECISE_PHASES or (
@@ -66,6 +65,16 @@ def transfer(
         )
         targets.append(Target(before, pose, precise))
     return tuple(targets)
+
+
+def _nearest_equivalent(
+    name: str, pose: MemoryKeyPose, layout: Mapping[str, Array], yaw_periods: Mapping[str, float], before: Array
+) -> Array:
+    """The pose of a symmetric object, among those that look alike, from which the hand has to turn least."""
+    choices = se3.yaw_equivalents(layout[name], yaw_periods.get(name, 2 * np.pi))
+    after = [transfer_pose(pose.anchor.frame({**layout, name: T}), pose.T_obj_ee) for T in choices]
+    turns = [float(se3.distances(before, T)[1]) for T in after]
+    return choices[int(np.argmin(turns))]
 
 
 @dataclass(frozen=True)
@@ -97,7 +106,7 @@ def check_transfer(
     low, high = robot.workspace
     before = T_world_ee
     for i, target in enumerate(targets):
-        where = f"key pose {i} ({target.memory.phase} at {target.memory.anchor})"
+        where = f"key pose {i} ({target.memory.phase} at {target.memory.anchor.place})"
         p = target.T_world_ee[:3, 3]
         outside = np.maximum(np.maximum(low - p, p - high), 0.0)
         if (beyond := float(np.linalg.norm(outside[:2]))) > limits.reach_margin_m or (

@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 
+import numpy as np
+
+from lerobot_openspm.geometry import se3
 from lerobot_openspm.geometry.se3 import Array
 
 PHASES = (
@@ -42,13 +46,43 @@ class RetrievalKey:
     phases: tuple[str, ...]
 
 
+WORLD = "world"
+
+
+@dataclass(frozen=True)
+class Anchor:
+    """The frame a key pose is kept in: the place of one object, with the axes of that or another one.
+
+    The paper's anchors are those with ``axes == place``. But a bottle is set down on a rack however the rack
+    is turned, and a box is let go over a bowl as it was taken: there the world's axes, or those of the object
+    in the hand, are what the demonstrations have in common.
+
+    Attributes:
+        place: Object whose position is the origin.
+        axes: Object whose orientation gives the axes, or :data:`WORLD`.
+    """
+
+    place: str
+    axes: str
+
+    @property
+    def objects(self) -> tuple[str, ...]:
+        """The objects whose poses are needed."""
+        return (self.place,) if self.axes in (self.place, WORLD) else (self.place, self.axes)
+
+    def frame(self, layout: Mapping[str, Array]) -> Array:
+        """The anchor's pose ``T_world_anchor`` ``(4, 4)``, given the objects' poses ``T_world_obj``."""
+        rotation = np.eye(3) if self.axes == WORLD else layout[self.axes][:3, :3]
+        return se3.transform(rotation, layout[self.place][:3, 3])
+
+
 @dataclass(frozen=True)
 class MemoryKeyPose:
     """Where the hand was relative to the object that mattered, at one phase boundary.
 
     Attributes:
-        anchor: Name of the object whose frame the pose is kept in.
-        T_obj_ee: Pose ``(4, 4)`` of the hand in the anchor's frame, the paper's ``Delta T_j``.
+        anchor: The frame the pose is kept in.
+        T_obj_ee: Pose ``(4, 4)`` of the hand in that frame, the paper's ``Delta T_j``.
         phase: The phase that ends here, one of :data:`PHASES`.
         confidence: The paper's ``gamma``, 0 to 1.
         closed: Whether the gripper is closed (or closing) on the way to this pose.
@@ -57,7 +91,7 @@ class MemoryKeyPose:
         dwell: Whether the hand stands still on the way here while the gripper opens or closes.
     """
 
-    anchor: str
+    anchor: Anchor
     T_obj_ee: Array
     phase: str
     confidence: float
@@ -90,6 +124,6 @@ class MemoryEntry:
     layout: dict[str, Array] = field(default_factory=dict[str, Array])
 
     @property
-    def anchors(self) -> tuple[str, ...]:
+    def objects(self) -> tuple[str, ...]:
         """The objects the entry needs a pose of, each once, in the order of their first use."""
-        return tuple(dict.fromkeys(pose.anchor for pose in self.key_poses))
+        return tuple(dict.fromkeys(name for pose in self.key_poses for name in pose.anchor.objects))

@@ -118,7 +118,7 @@ def retrieve(
     """
     ranked = []
     for entry, semantic in candidates:
-        usable = all(name in layout for name in entry.anchors) and feasible(entry)
+        usable = all(name in layout for name in entry.objects) and feasible(entry)
         geometric = 0.5 + 0.5 * layout_similarity(layout, entry.layout) if usable else 0.0
         total = weights.semantic * semantic + weights.geometric * geometric + weights.quality * entry.quality
         ranked.append(Scored(entry, semantic, geometric, entry.quality, total))

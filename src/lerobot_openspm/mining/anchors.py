@@ -10,12 +10,14 @@ import numpy as np
 
 from lerobot_openspm.geometry import se3
 from lerobot_openspm.geometry.se3 import Array
-from lerobot_openspm.memory.entry import SubTask
+from lerobot_openspm.memory.entry import WORLD, Anchor, SubTask
 from lerobot_openspm.mining.key_poses import KeyPose
 
 # An anchor other than the one the instruction suggests must explain the demonstrations better by this much,
 # shared among them: with one demonstration the instruction decides, with many the evidence does.
 PRIOR_M = 0.05
+# Likewise for axes other than the anchor's own.
+AXES_PRIOR_M = 0.03
 # Key poses at contacts decide; the deviation of a good demonstration there is of this order.
 QUALITY_SCALE_M = 0.02
 
@@ -63,32 +65,36 @@ def suggested_anchor(pose: KeyPose, sub_tasks: Sequence[SubTask]) -> str:
     return sub_task.landmark if arriving and sub_task.landmark else sub_task.target
 
 
-def consensus(demonstrations: Sequence[Demonstration], sub_tasks: Sequence[SubTask]) -> dict[Role, str]:
+def consensus(demonstrations: Sequence[Demonstration], sub_tasks: Sequence[SubTask]) -> dict[Role, Anchor]:
     """Choose an anchor for every role of one task.
 
-    Candidates are the objects of the instruction that were found in every demonstration showing the role;
-    an object not named in it is never an anchor, because nothing would look for it at run time.
+    Candidates are built of the objects that the instruction names and that were found in a demonstration; an
+    object that it does not name is never an anchor, because nothing would look for it at run time.
     """
-    named = [name for sub_task in sub_tasks for name in sub_task.objects]
+    names = list(dict.fromkeys(name for sub_task in sub_tasks for name in sub_task.objects))
+    candidates = [Anchor(place, axes) for place in names for axes in (place, WORLD, *names)]
     gathered: dict[Role, list[tuple[KeyPose, Mapping[str, Array]]]] = defaultdict(list)
     for demonstration in demonstrations:
         for role, pose in zip(roles(demonstration.key_poses), demonstration.key_poses, strict=True):
             gathered[role].append((pose, demonstration.layout))
-    anchors: dict[Role, str] = {}
+    anchors: dict[Role, Anchor] = {}
     for role, members in gathered.items():
         suggested = suggested_anchor(members[0][0], sub_tasks)
-        costs = {}
-        for name in dict.fromkeys(named):
-            T_obj_ee = [
-                se3.inverse(layout[name]) @ pose.T_world_ee for pose, layout in members if name in layout
-            ]
-            if T_obj_ee:
-                prior = 0.0 if name == suggested else PRIOR_M / len(T_obj_ee)
-                missing = PRIOR_M * (1 - len(T_obj_ee) / len(members))
-                costs[name] = spread(np.stack(T_obj_ee)) + prior + missing
-        if costs:
-            anchors[role] = min(costs, key=lambda name: costs[name])
+        costs = {anchor: _cost(anchor, members, suggested) for anchor in dict.fromkeys(candidates)}
+        best = min(costs, key=lambda anchor: costs[anchor])
+        if np.isfinite(costs[best]):
+            anchors[role] = best
     return anchors
+
+
+def _cost(anchor: Anchor, members: Sequence[tuple[KeyPose, Mapping[str, Array]]], suggested: str) -> float:
+    """How much key poses of one role vary in an anchor's frame, plus what speaks against it beforehand."""
+    found = [(pose, layout) for pose, layout in members if all(name in layout for name in anchor.objects)]
+    if not found:
+        return np.inf
+    poses = np.stack([se3.inverse(anchor.frame(layout)) @ pose.T_world_ee for pose, layout in found])
+    prior = (PRIOR_M * (anchor.place != suggested) + AXES_PRIOR_M * (anchor.axes != anchor.place)) / len(found)
+    return spread(poses) + prior + PRIOR_M * (1 - len(found) / len(members))
 
 
 def spread(T_obj_ee: Array) -> float:
@@ -129,14 +135,14 @@ def align_symmetric(
     return aligned
 
 
-def qualities(demonstrations: Sequence[Demonstration], anchors: Mapping[Role, str]) -> list[float]:
+def qualities(demonstrations: Sequence[Demonstration], anchors: Mapping[Role, Anchor]) -> list[float]:
     """The paper's ``r`` of each demonstration: 1 where it agrees with the others at its contacts."""
     gathered: dict[Role, list[tuple[int, Array]]] = defaultdict(list)
     for i, demonstration in enumerate(demonstrations):
         for role, pose in zip(roles(demonstration.key_poses), demonstration.key_poses, strict=True):
-            name = anchors.get(role)
-            if pose.phase in CONTACT_PHASES and name in demonstration.layout:
-                gathered[role].append((i, se3.inverse(demonstration.layout[name]) @ pose.T_world_ee))
+            anchor = anchors.get(role)
+            if pose.phase in CONTACT_PHASES and anchor and all(n in demonstration.layout for n in anchor.objects):
+                gathered[role].append((i, se3.inverse(anchor.frame(demonstration.layout)) @ pose.T_world_ee))
     worst = np.zeros(len(demonstrations))
     for members in gathered.values():
         distances = deviations(np.stack([T for _, T in members]))

@@ -29,8 +29,6 @@ SETTLED_FRACTION = 0.01
 # A hand slower than this fraction of its usual speed stands still.
 STILL_FRACTION = 0.12
 MAX_DWELL_STEPS = 30
-# The fingers hold something when they stay open by more than this fraction of their range.
-HOLDING_FRACTION = 0.03
 # Closed fingers that hold something and rise by this much carry it; otherwise they pull or turn it.
 LIFTED_M = 0.03
 TURNED_RAD = np.deg2rad(35)
@@ -91,35 +89,40 @@ def find_key_poses(episode: Episode, robot: RobotModel) -> list[KeyPose]:
     marks: list[_Mark] = []
     for contact, (start, end) in enumerate(zip(starts, ends, strict=True)):
         event_end = events[contact][1] if contact < len(events) else None
-        holding = bool(closed[start] and _holds(episode, robot, start))
-        marks += _span_marks(episode, start, end, event_end, bool(closed[start]), holding, contact)
+        after = ends[contact + 1] if contact < len(events) else None
+        marks += _span_marks(episode, start, end, event_end, after, bool(closed[start]), contact)
     if all(mark.phase in ("approach", "retreat") for mark in marks):
         return []
     return _measure(episode, marks, moving)
 
 
 def _span_marks(
-    episode: Episode, start: int, end: int, event_end: int | None, closed: bool, holding: bool, contact: int
+    episode: Episode, start: int, end: int, event_end: int | None, next_end: int | None, closed: bool, contact: int
 ) -> list[_Mark]:
-    """The key poses of one span of motion between two gripper transitions, and of the transition after it."""
-    if closed and holding:
-        marks = _carry_marks(episode, start, end, contact)
+    """The key poses of one span of motion between two gripper transitions, and of the transition after it.
+
+    Args:
+        episode: The demonstration.
+        start: First frame of the span.
+        end: Last frame, at which the transition after it begins.
+        event_end: Frame at which that transition has settled; None if the episode ends before.
+        next_end: Last frame of the span after it, or None.
+        closed: Whether the gripper is closed during the span.
+        contact: Ordinal of the span.
+    """
+    if closed and not _fist(episode, start, end):
         release = [] if event_end is None else [_Mark(event_end, "release", 1.0, False, True, contact)]
-        return marks + release
-    if closed or event_end is None and contact == 0:
-        marks = _push_marks(episode, start, end, closed, contact)
-        # Opening an empty hand is no contact: it is done on the way.
-        return marks
+        return _carry_marks(episode, start, end, contact) + release
+    if closed or (event_end is None and contact == 0):
+        return _push_marks(episode, start, end, closed, contact)
     if event_end is None:  # the hand leaves after the last release
         turns = _corner_marks(episode, start, end, "retreat", False, contact, contacts=[start])
         return [*turns, _Mark(end, "retreat", 0.8, False, False, contact)]
-    phases_after = "retreat" if contact > 0 else "approach"
     contacts = [start, end] if contact > 0 else [end]
     turns = _corner_marks(episode, start, end, "approach", False, contact, contacts)
     if turns and contact > 0:
-        turns[0] = _Mark(turns[0].frame, phases_after, turns[0].confidence, False, False, contact)
-    if not _holds_at(episode, event_end, end):
-        # The fingers closed on nothing: a fist is made, for pushing.
+        turns[0] = _Mark(turns[0].frame, "retreat", turns[0].confidence, False, False, contact)
+    if next_end is not None and _fist(episode, event_end, next_end):
         return turns
     arrival = _Mark(end, "approach", 1.0, False, False, contact)
     return [*turns, arrival, _Mark(event_end, "grasp", 1.0, True, True, contact)]
@@ -188,14 +191,16 @@ def _corner_confidence(points: Array, corner: int, reach: int = 4) -> float:
 
 def _measure(episode: Episode, marks: list[_Mark], moving: NDArray[np.bool_]) -> list[KeyPose]:
     key_poses: list[KeyPose] = []
-    before = 0
+    before = -1
     for mark in sorted(marks, key=lambda mark: mark.frame):
-        frames = slice(before, mark.frame)
+        if mark.frame <= before:
+            continue  # the episode ended with the mark before
+        frames = slice(max(before, 0), mark.frame)
         n_steps = mark.frame - before if mark.dwell else int(moving[frames].sum())
         key_poses.append(
             KeyPose(
-                mark.frame, episode.T_world_ee[mark.frame], mark.phase, mark.confidence, mark.closed,
-                float(episode.opening[mark.frame]), max(n_steps, 1), mark.dwell, mark.contact,
+                int(mark.frame), episode.T_world_ee[mark.frame], mark.phase, mark.confidence, mark.closed,
+                float(episode.opening[mark.frame]), int(max(n_steps, 1)), mark.dwell, mark.contact,
             )
         )  # fmt: skip
         before = mark.frame
@@ -223,12 +228,15 @@ def _settled(episode: Episode, robot: RobotModel, start: int, moving: NDArray[np
     return min(start + max(rest, leave), last)
 
 
-def _holds(episode: Episode, robot: RobotModel, frame: int) -> bool:
-    return bool(episode.opening[frame] > HOLDING_FRACTION * robot.open_width)
+def _fist(episode: Episode, start: int, end: int) -> bool:
+    """Whether fingers that closed before a span hold nothing, by where they go.
 
-
-def _holds_at(episode: Episode, frame: int, before: int) -> bool:
-    return bool(episode.opening[frame] > HOLDING_FRACTION * max(float(episode.opening[before]), 1e-9))
+    What is held was taken where it stood: the hand first rises with it, or stays level to pull or turn it. A
+    hand that first goes down was closed in the air, to push.
+    """
+    height = episode.T_world_ee[start : end + 1, 2, 3] - episode.T_world_ee[start, 2, 3]
+    away = np.flatnonzero(np.abs(height) > LIFTED_M)
+    return bool(len(away) and height[away[0]] < 0)
 
 
 def _speed(episode: Episode) -> Array:

@@ -15,12 +15,13 @@ from lerobot_openspm.errors import DatasetError, InstructionError
 from lerobot_openspm.geometry import se3
 from lerobot_openspm.geometry.camera import Camera
 from lerobot_openspm.geometry.se3 import Array
-from lerobot_openspm.memory.entry import MemoryEntry, MemoryKeyPose, RetrievalKey, SubTask
+from lerobot_openspm.memory.entry import Anchor, MemoryEntry, MemoryKeyPose, RetrievalKey, SubTask
 from lerobot_openspm.memory.instruction import parse_instruction
 from lerobot_openspm.memory.robot import RobotModel
 from lerobot_openspm.mining.anchors import (
     CONTACT_PHASES,
     Demonstration,
+    Role,
     align_symmetric,
     consensus,
     qualities,
@@ -95,33 +96,80 @@ def mine_key_poses(demonstrations: Demonstrations, indices: Sequence[int] | None
     return MinedKeyPoses(robot, tuple(mined), skipped)
 
 
-def learn_from_images(
-    demonstrations: Demonstrations,
-    mined: Sequence[MinedEpisode],
-    cameras: Mapping[str, Camera],
-    rng: np.random.Generator,
-) -> tuple[dict[str, ObjectModel], list[dict[str, Array]]]:
-    """Learn the objects from two frames an episode, and find them in the first frame of each.
-
-    Returns:
-        Models by name, and per episode the poses ``T_world_obj`` of the objects that were found.
-    """
+def learn_scenes(
+    demonstrations: Demonstrations, mined: Sequence[MinedEpisode], cameras: Mapping[str, Camera]
+) -> list[Scene]:
+    """What perception may learn from: two frames of every episode, and where the hand touched what."""
     scenes = []
-    for item in tqdm(mined, desc="Reading images", unit="episode", leave=False):
+    for item in tqdm(mined, desc="Reading images", unit="episode"):
         later = _carried_off(item.key_poses)
         views = demonstrations.views(item.episode, 0, cameras)
         later_views = None if later is None else demonstrations.views(item.episode, later, cameras)
         scenes.append(Scene(views, hints(item), later_views))
-    models = learn_objects(scenes, rng)
-    named = sorted({name for item in mined for sub_task in item.sub_tasks for name in sub_task.objects})
-    if missing := [name for name in named if name not in models]:
-        logger.warning("could not learn what %s looks like; key poses will not be anchored there", missing)
+    return scenes
+
+
+@dataclass(frozen=True)
+class LearnedObjects:
+    """Object models by name, and per scene the poses ``T_world_obj`` of the objects found in it."""
+
+    models: dict[str, ObjectModel]
+    layouts: list[dict[str, Array]]
+
+
+def layouts_in_scenes(
+    scenes: Sequence[Scene], known: Mapping[str, ObjectModel], rng: np.random.Generator
+) -> LearnedObjects:
+    """Learn the objects that are not known yet, and find all of them in the scenes."""
+    named = sorted({hint.name for scene in scenes for hint in scene.hints} - set(known))
+    models = dict(known)
+    if named:
+        logger.info("learning what these look like: %s", ", ".join(named))
+        learned = learn_objects(scenes, rng)
+        models |= {name: learned[name] for name in named if name in learned}
+        if missing := [name for name in named if name not in learned]:
+            logger.warning("could not learn what %s looks like; no key pose will be anchored there", missing)
     layouts = []
-    for scene in tqdm(scenes, desc="Finding objects", unit="episode", leave=False):
+    for scene in tqdm(scenes, desc="Finding objects", unit="episode"):
         prepared = {key: prepare(view) for key, view in scene.views.items()}
         estimates = {name: localise(prepared, model) for name, model in models.items()}
         layouts.append({name: e.T_world_obj for name, e in estimates.items() if e.status == "found"})
-    return models, layouts
+    return LearnedObjects(models, layouts)
+
+
+def oracle_layouts(
+    demonstrations: Demonstrations, mined: Sequence[MinedEpisode], models: Mapping[str, ObjectModel]
+) -> tuple[list[dict[str, Array]], tuple[str, ...]]:
+    """The simulator's poses of the named objects instead of perception's (oracle ablation only).
+
+    Returns:
+        Poses per episode, and the simulator's object names in the order of its pose vector.
+    """
+    layouts, names = [], ()
+    for item in mined:
+        poses = demonstrations.simulator_poses(item.episode, 0)
+        names = tuple(poses)
+        nouns = sorted({name for sub_task in item.sub_tasks for name in sub_task.objects})
+        layouts.append(name_simulator_poses(poses, nouns, models))
+    return layouts, names
+
+
+def name_simulator_poses(
+    poses: Mapping[str, Array], nouns: Sequence[str], models: Mapping[str, ObjectModel]
+) -> dict[str, Array]:
+    """Simulator poses under the nouns of the instructions: "bottle" is the "wine bottle".
+
+    The yaw of a body of revolution is dropped, as perception, which cannot see it, does.
+    """
+    named = {}
+    for noun in nouns:
+        match = next((name for name in poses if name in noun.split()), None)
+        if match is None:
+            continue
+        T = poses[match]
+        turns = noun not in models or models[noun].yaw_period > 0
+        named[noun] = T if turns else se3.transform(np.eye(3), T[:3, 3])
+    return named
 
 
 def hints(item: MinedEpisode) -> tuple[Hint, ...]:
@@ -181,27 +229,20 @@ def build_entries(
 
 
 def _remember(
-    demonstration: Demonstration, anchors: Mapping[tuple[int, str, int], str]
+    demonstration: Demonstration, anchors: Mapping[Role, Anchor]
 ) -> tuple[MemoryKeyPose, ...] | None:
     """Express key poses in their anchors' frames; None if a contact's anchor was not found."""
     kept = []
     for role, pose in zip(roles(demonstration.key_poses), demonstration.key_poses, strict=True):
         anchor = anchors.get(role)
-        if anchor not in demonstration.layout:
+        if anchor is None or any(name not in demonstration.layout for name in anchor.objects):
             if pose.phase in CONTACT_PHASES:
                 return None
             continue
-        T_obj_ee = se3.inverse(demonstration.layout[anchor]) @ pose.T_world_ee
+        T_obj_ee = se3.inverse(anchor.frame(demonstration.layout)) @ pose.T_world_ee
         kept.append(
             MemoryKeyPose(
-                anchor,
-                T_obj_ee,
-                pose.phase,
-                pose.confidence,
-                pose.closed,
-                pose.opening,
-                pose.n_steps,
-                pose.dwell,
+                anchor, T_obj_ee, pose.phase, pose.confidence, pose.closed, pose.opening, pose.n_steps, pose.dwell
             )
         )
     return tuple(kept)

@@ -45,11 +45,9 @@ def observe_robot(episodes: Sequence[Episode]) -> RobotModel:
     commands = np.concatenate([episode.actions[:, 6] for episode in episodes])
     low, high = np.percentile(commands, [2, 98]) if len(commands) else (-1.0, 1.0)
     middle = (low + high) / 2
-    # Under the command that closes, the opening shrinks over the following steps.
+    # Under the command that closes, the opening shrinks from one step to the next.
     trend = sum(
-        float(((episode.actions[:-5, 6] - middle) * (episode.opening[5:] - episode.opening[:-5])).sum())
-        for episode in episodes
-        if len(episode) > 5
+        float(((episode.actions[:-1, 6] - middle) * np.diff(episode.opening)).sum()) for episode in episodes
     )
     close, open_ = (high, low) if trend <= 0 else (low, high)
     opening = np.concatenate([episode.opening for episode in episodes])

@@ -1,0 +1,36 @@
+"""``openspm COMMAND ...``: finds the command and hands it the rest of the line."""
+
+from __future__ import annotations
+
+import importlib
+import logging
+import sys
+
+from lerobot_openspm.errors import OpenSPMError
+
+# Command -> module with `main(args)`, and what it is for. Modules are imported when they are asked for.
+COMMANDS = {
+    "collect": ("lerobot_openspm.cli.collect", "record scripted demonstrations on the tabletop"),
+    "mine": ("lerobot_openspm.cli.mine", "mine a dataset's key poses into a memory"),
+    "inspect": ("lerobot_openspm.cli.inspect", "show the memory of a checkpoint"),
+    "demo": ("lerobot_openspm.cli.demo", "collect, train, evaluate and write one page about it"),
+    "figures": ("lerobot_openspm.cli.figures", "measure the published figures of the tabletop"),
+}
+
+
+def main() -> None:
+    """Run one command; a mistake in the input is one line on stderr and exit code 2."""
+    command, *args = sys.argv[1:] or ["--help"]
+    if command in ("-h", "--help"):
+        print("usage: openspm COMMAND [--option=value ...]\n\ncommands:")
+        print("\n".join(f"  {name:8s} {what}" for name, (_, what) in COMMANDS.items()))
+        print("\n`openspm COMMAND --help` lists the options of one.")
+        return
+    if command not in COMMANDS:
+        sys.exit(f"openspm: unknown command {command!r}; expected one of {', '.join(COMMANDS)}")
+    logging.basicConfig(level=logging.INFO, format="%(levelname)s %(message)s", stream=sys.stderr)
+    try:
+        importlib.import_module(COMMANDS[command][0]).main(args)
+    except (OpenSPMError, FileExistsError, FileNotFoundError) as error:
+        print(f"openspm {command}: {error}", file=sys.stderr)
+        sys.exit(2)

@@ -1,0 +1,51 @@
+"""`openspm mine`: mine a dataset into a memory, without training, and say what was found."""
+
+from __future__ import annotations
+
+import json
+import time
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import draccus
+
+from lerobot_openspm.configuration_openspm import OpenSPMConfig
+from lerobot_openspm.experience import save_experience
+from lerobot_openspm.training import mine_experience
+
+
+@dataclass
+class MineConfig:
+    """Mine the key poses of a LeRobotDataset into a memory.
+
+    Args:
+        repo_id: Dataset on the Hub, or the name of a local one.
+        root: Folder of the dataset; LeRobot's cache if not given.
+        output: Folder to write the memory to.
+        policy: Options of the policy that say how to mine, e.g. ``--policy.cameras=FILE``.
+    """
+
+    repo_id: str = "local/openspm_tabletop"
+    root: str | None = None
+    output: str = "outputs/memory"
+    policy: OpenSPMConfig = field(default_factory=lambda: OpenSPMConfig(device="cpu", push_to_hub=False))
+
+
+def main(args: list[str]) -> None:
+    """Mine, save, and print one JSON object."""
+    from lerobot.datasets import LeRobotDatasetMetadata
+
+    config = draccus.parse(MineConfig, args=args)
+    start_s = time.monotonic()
+    meta = LeRobotDatasetMetadata(config.repo_id, root=config.root)
+    experience = mine_experience(meta, config.policy)
+    save_experience(experience, Path(config.output))
+    summary = {
+        "entries": len(experience.entries),
+        "episodes": int(meta.total_episodes),
+        "key_poses": sum(len(entry.key_poses) for entry in experience.entries),
+        "objects": sorted(experience.objects),
+        "output": config.output,
+        "seconds": round(time.monotonic() - start_s, 1),
+    }
+    print(json.dumps(summary))

@@ -1,0 +1,225 @@
+"""The policy's configuration: every option of ``--policy.*``, documented one by one."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any, get_args
+
+from lerobot.configs import NormalizationMode, PreTrainedConfig
+from lerobot.optim import AdamWConfig, CosineDecayWithWarmupSchedulerConfig
+from lerobot.utils.constants import ACTION, OBS_STATE
+
+from lerobot_openspm.control.executor import ControlSettings, Execution
+from lerobot_openspm.control.transfer import TransferLimits
+from lerobot_openspm.flow.condition import Conditioning
+from lerobot_openspm.geometry.layout import ROTATION_KINDS, VectorLayout, parse_layout
+from lerobot_openspm.memory.retrieval import ScoreWeights
+
+PERCEPTIONS = ("demonstrations", "oracle")
+MEMORY_UPDATES = ("keep", "append", "rebuild")
+
+
+@PreTrainedConfig.register_subclass("openspm")
+@dataclass
+class OpenSPMConfig(PreTrainedConfig):
+    """Configuration of OpenSPM.
+
+    The defaults are those measured on the bundled tabletop. What must be given for a new robot is the
+    calibration of its cameras, and the layouts of state and action where the dataset's feature names do not
+    tell them.
+
+    Args:
+        cameras: Calibration file of the cameras to look through (see ``configs/cameras``). Needed for
+            training; a checkpoint carries its own, which this replaces when given.
+        state_layout: Name of every number of ``observation.state``; read from the dataset if not given. See
+            `lerobot_openspm.geometry.layout` for the names.
+        action_layout: Name of every number of ``action``; read from the dataset if not given.
+        state_rotation: How the state writes the rotation, where its names are wrong about it: "axis_angle",
+            "quat", "euler" or "none".
+        action_rotation: Likewise for the action.
+        perception: "demonstrations" finds objects in the images, by what the demonstrations showed of them.
+            "oracle" takes their poses from the simulator, for ablations only.
+        memory_episodes: Episodes that may enter the memory and the training samples; all if not given. Name
+            them when some are held out: the policy is shown the whole dataset otherwise.
+        memory_update: What happens to a checkpoint's memory when training goes on from it: "keep" it,
+            "append" the dataset's episodes, or "rebuild" it from them.
+        chunk_size: Actions per chunk, the paper's H.
+        n_action_steps: Actions executed before the next chunk.
+        conditioning: "equivariant" tells the flow model the relative pose in the frame of the target key
+            pose; "paper" tells it the poses in the world.
+        hidden_dim: Width of the flow model; the default gives about 240 K parameters.
+        num_inference_steps: Euler steps from noise to a chunk.
+        samples_per_frame: (frame, noise, time) samples drawn for each frame that the loader brings. The
+            loader takes longer for one frame than the model for a hundred.
+        perturbation_m: Spread of the displacements added to training samples.
+        perturbation_rad: Spread of the rotations added to training samples.
+        execution: "open_loop", "closed_loop", or "closed_loop_trc" with terminal residual correction.
+        residual_m: A contact key pose is met within this distance, the paper's epsilon_r.
+        residual_rad: ... and this angle.
+        passing_m: A key pose in free space is passed within this distance.
+        passing_rad: ... and this angle.
+        max_corrections: Corrective chunks per key pose before it counts as not met.
+        max_attempts: How often a missed grasp or an unmet key pose is tried again in an episode.
+        weight_semantic: The paper's lambda_s, weight of the instruction in retrieval.
+        weight_geometric: The paper's lambda_g, weight of the scene.
+        weight_quality: The paper's lambda_r, weight of the entry's quality.
+        reach_margin_m: How far outside the demonstrated workspace a key pose may lie.
+        max_jump_m: Longest way between consecutive key poses.
+        max_jump_rad: Largest turn between consecutive key poses.
+        min_clearance_m: How far below the lowest demonstrated hand position a key pose may lie.
+        noise_seed: Seed of the flow model's noise, which is drawn per (seed, episode, chunk).
+    """
+
+    normalization_mapping: dict[str, NormalizationMode] = field(
+        default_factory=lambda: dict.fromkeys(("VISUAL", "STATE", "ACTION"), NormalizationMode.IDENTITY)
+    )
+
+    # Robot and cameras.
+    cameras: str | None = None
+    state_layout: list[str] | None = None
+    action_layout: list[str] | None = None
+    state_rotation: str | None = None
+    action_rotation: str | None = None
+
+    # Memory and perception.
+    perception: str = "demonstrations"
+    memory_episodes: list[int] | None = None
+    memory_update: str = "keep"
+    weight_semantic: float = 1.0
+    weight_geometric: float = 0.5
+    weight_quality: float = 0.5
+
+    # Flow model.
+    chunk_size: int = 5
+    n_action_steps: int = 5
+    conditioning: str = "equivariant"
+    hidden_dim: int = 268
+    num_inference_steps: int = 8
+    samples_per_frame: int = 128
+    perturbation_m: float = 0.006
+    perturbation_rad: float = 0.04
+    noise_seed: int = 0
+
+    # Control.
+    execution: str = "closed_loop_trc"
+    residual_m: float = 0.004
+    residual_rad: float = 0.06
+    passing_m: float = 0.015
+    passing_rad: float = 0.15
+    max_corrections: int = 8
+    max_attempts: int = 3
+    reach_margin_m: float = 0.10
+    max_jump_m: float = 0.8
+    max_jump_rad: float = 2.8
+    min_clearance_m: float = 0.01
+
+    # Training.
+    optimizer_lr: float = 2e-3
+    optimizer_weight_decay: float = 1e-4
+    scheduler_warmup_steps: int = 50
+    scheduler_decay_steps: int = 2000
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        _require_choice("perception", self.perception, PERCEPTIONS)
+        _require_choice("memory_update", self.memory_update, MEMORY_UPDATES)
+        _require_choice("conditioning", self.conditioning, get_args(Conditioning))
+        _require_choice("execution", self.execution, get_args(Execution))
+        for name in ("state_rotation", "action_rotation"):
+            if getattr(self, name) is not None:
+                _require_choice(name, getattr(self, name), ROTATION_KINDS)
+        if not 1 <= self.n_action_steps <= self.chunk_size:
+            raise ValueError(
+                f"n_action_steps is {self.n_action_steps}, expected 1 to chunk_size ({self.chunk_size})"
+            )
+        positive = (
+            "hidden_dim", "num_inference_steps", "samples_per_frame", "residual_m", "residual_rad", "passing_m",
+            "passing_rad", "max_jump_m", "max_jump_rad", "optimizer_lr", "scheduler_decay_steps",
+        )  # fmt: skip
+        for name in positive:
+            if getattr(self, name) <= 0:
+                raise ValueError(f"{name} is {getattr(self, name)}, expected more than 0")
+        not_negative = (
+            "perturbation_m", "perturbation_rad", "max_corrections", "max_attempts", "reach_margin_m",
+            "min_clearance_m", "weight_semantic", "weight_geometric", "weight_quality",
+        )  # fmt: skip
+        for name in not_negative:
+            if getattr(self, name) < 0:
+                raise ValueError(f"{name} is {getattr(self, name)}, expected 0 or more")
+
+    def set_dataset_feature_metadata(self, features: Mapping[str, Any]) -> None:
+        """Take the layouts from the dataset's feature names where they were not given. Called by LeRobot."""
+        self.state_layout = self.state_layout or _flat_names(features.get(OBS_STATE, {}).get("names"))
+        self.action_layout = self.action_layout or _flat_names(features.get(ACTION, {}).get("names"))
+
+    def layouts(self) -> tuple[VectorLayout, VectorLayout]:
+        """Layouts of state and action. Raises LayoutError when names are missing or make no sense."""
+        state = parse_layout(self.state_layout or [], "state", self.state_rotation)  # type: ignore[arg-type]
+        action = parse_layout(self.action_layout or [], "action", self.action_rotation)  # type: ignore[arg-type]
+        return state, action
+
+    @property
+    def control_settings(self) -> ControlSettings:
+        return ControlSettings(**{name: getattr(self, name) for name in ControlSettings.__dataclass_fields__})
+
+    @property
+    def transfer_limits(self) -> TransferLimits:
+        return TransferLimits(**{name: getattr(self, name) for name in TransferLimits.__dataclass_fields__})
+
+    @property
+    def score_weights(self) -> ScoreWeights:
+        return ScoreWeights(self.weight_semantic, self.weight_geometric, self.weight_quality)
+
+    def validate_features(self) -> None:
+        """Check that there are images, a state and an action, of the sizes that the layouts name."""
+        if not self.image_features:
+            raise ValueError(
+                f"OpenSPM needs at least one camera, got input features {sorted(self.input_features or {})}"
+            )
+        for name, feature, layout in (
+            (OBS_STATE, self.robot_state_feature, self.state_layout),
+            (ACTION, self.action_feature, self.action_layout),
+        ):
+            if feature is None:
+                raise ValueError(f"OpenSPM needs {name!r}, got features {sorted(self.input_features or {})}")
+            if layout is not None and len(layout) != feature.shape[0]:
+                raise ValueError(
+                    f"{name} has {feature.shape[0]} numbers, but its layout names {len(layout)}: {layout}"
+                )
+
+    def get_optimizer_preset(self) -> AdamWConfig:
+        return AdamWConfig(lr=self.optimizer_lr, weight_decay=self.optimizer_weight_decay, grad_clip_norm=1.0)
+
+    def get_scheduler_preset(self) -> CosineDecayWithWarmupSchedulerConfig:
+        return CosineDecayWithWarmupSchedulerConfig(
+            peak_lr=self.optimizer_lr,
+            decay_lr=self.optimizer_lr / 50,
+            num_warmup_steps=self.scheduler_warmup_steps,
+            num_decay_steps=self.scheduler_decay_steps,
+        )
+
+    @property
+    def observation_delta_indices(self) -> None:
+        return None
+
+    @property
+    def action_delta_indices(self) -> None:
+        # Chunks come from the mined segments, which end at key poses; the loader's would run across them.
+        return None
+
+    @property
+    def reward_delta_indices(self) -> None:
+        return None
+
+
+def _require_choice(name: str, got: str, expected: tuple[str, ...]) -> None:
+    if got not in expected:
+        raise ValueError(f"{name} is {got!r}, expected one of {', '.join(expected)}")
+
+
+def _flat_names(names: Any) -> list[str] | None:
+    """Feature names as a list; LeRobot datasets also write them as ``{"motors": [...]}``."""
+    if isinstance(names, Mapping):
+        names = [name for group in names.values() for name in group]
+    return [str(name) for name in names] if names else None

@@ -1,0 +1,183 @@
+"""Everything a policy has learned besides its weights: entries, objects, robot, cameras. Saved and loaded whole.
+
+Three files lie beside a checkpoint's weights: ``memory.json`` (what a person reads), ``memory.safetensors``
+(the arrays it refers to, by checksum) and ``cameras.json`` (the calibration).
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from safetensors import SafetensorError
+from safetensors.numpy import load as load_arrays
+from safetensors.numpy import save as save_arrays
+
+from lerobot_openspm.errors import MemoryFormatError
+from lerobot_openspm.geometry.camera import Camera, cameras_to_dict, load_cameras
+from lerobot_openspm.memory.entry import MemoryEntry
+from lerobot_openspm.memory.robot import RobotModel
+from lerobot_openspm.memory.store import entries_from_parts, entries_to_parts, robot_from_dict, robot_to_dict
+from lerobot_openspm.perception.model import ObjectModel
+from lerobot_openspm.perception.store import from_parts as object_from_parts
+from lerobot_openspm.perception.store import to_parts as object_to_parts
+
+FORMAT, VERSION = "openspm-memory", 1
+MEMORY_JSON, MEMORY_ARRAYS, CAMERAS_JSON = "memory.json", "memory.safetensors", "cameras.json"
+FILES = (MEMORY_JSON, MEMORY_ARRAYS, CAMERAS_JSON)
+MAX_JSON_BYTES, MAX_ARRAY_BYTES = 512_000_000, 4_000_000_000
+
+
+@dataclass(frozen=True)
+class Experience:
+    """What was mined from demonstrations.
+
+    Attributes:
+        entries: The memory bank.
+        objects: Models of the objects by name.
+        robot: The robot that gave the demonstrations.
+        cameras: Calibration by camera key.
+        perception: Whose object frames the entries are in: "demonstrations" or "oracle".
+        simulator_objects: Objects in the order of the simulator's pose vector (oracle ablation only).
+    """
+
+    entries: tuple[MemoryEntry, ...]
+    objects: dict[str, ObjectModel]
+    robot: RobotModel
+    cameras: dict[str, Camera]
+    perception: str
+    simulator_objects: tuple[str, ...] = ()
+
+    @property
+    def yaw_periods(self) -> dict[str, float]:
+        """Angle by object that turns it into itself, radians; 0 for a body of revolution."""
+        return {name: model.yaw_period for name, model in self.objects.items()}
+
+    def appended(self, newer: Experience) -> Experience:
+        """This experience with the entries of another one added.
+
+        Objects that both know keep the newer model only if no entry of ours is anchored to the older one,
+        because a key pose means nothing in another model's frame.
+        """
+        sources = {entry.source for entry in newer.entries}
+        kept = tuple(entry for entry in self.entries if entry.source not in sources)
+        return replace(self, entries=kept + newer.entries, objects={**newer.objects, **self.objects})
+
+
+def save_experience(experience: Experience, directory: Path) -> None:
+    """Write the three files, each beside its place and then renamed, so that none is ever half-written."""
+    rows, arrays = entries_to_parts(experience.entries)
+    objects = []
+    for model in experience.objects.values():
+        fields, model_arrays = object_to_parts(model)
+        objects.append(fields)
+        arrays |= {f"objects.{model.name}.{key}": value for key, value in model_arrays.items()}
+    blob = save_arrays({key: np.ascontiguousarray(value) for key, value in arrays.items()})
+    memory = {
+        "format": FORMAT,
+        "version": VERSION,
+        "arrays": {"file": MEMORY_ARRAYS, "sha256": hashlib.sha256(blob).hexdigest()},
+        "perception": experience.perception,
+        "simulator_objects": list(experience.simulator_objects),
+        "robot": robot_to_dict(experience.robot),
+        "objects": objects,
+        "entries": rows,
+    }
+    directory.mkdir(parents=True, exist_ok=True)
+    _write(directory / MEMORY_ARRAYS, blob)
+    _write(directory / CAMERAS_JSON, _json(cameras_to_dict(experience.cameras)))
+    # Last, because it vouches for the others.
+    _write(directory / MEMORY_JSON, _json(memory))
+
+
+def load_experience(directory: Path) -> Experience:
+    """Read the three files.
+
+    Raises:
+        MemoryFormatError: A file is missing, truncated, malformed, too large, or of a newer version.
+        CalibrationError: The calibration is malformed.
+    """
+    where = str(directory / MEMORY_JSON)
+    memory = _read_json(directory / MEMORY_JSON)
+    if memory.get("format") != FORMAT:
+        raise MemoryFormatError(f"{where}: got format {memory.get('format')!r}, expected {FORMAT!r}")
+    version = memory.get("version")
+    if not isinstance(version, int) or version > VERSION or version < 1:
+        raise MemoryFormatError(
+            f"{where}: got version {version!r}, this release reads up to {VERSION}; upgrade lerobot_policy_openspm"
+        )
+    try:
+        checksum, rows, objects = memory["arrays"]["sha256"], memory["entries"], memory["objects"]
+        robot, perception = robot_from_dict(memory["robot"], where), str(memory["perception"])
+        simulator_objects = tuple(str(name) for name in memory["simulator_objects"])
+    except (KeyError, TypeError) as error:
+        raise MemoryFormatError(f"{where}: field {error} is missing or malformed; train or pull it again") from error
+    if not isinstance(rows, list) or not isinstance(objects, list):
+        raise MemoryFormatError(f"{where}: 'entries' and 'objects' must be lists")
+    arrays = _read_arrays(directory / MEMORY_ARRAYS, checksum)
+    models = {}
+    for fields in objects:
+        if not isinstance(fields, Mapping):
+            raise MemoryFormatError(f"{where}: 'objects' must hold JSON objects, got {type(fields).__name__}")
+        name = str(fields.get("name"))
+        prefix = f"objects.{name}."
+        own = {key.removeprefix(prefix): value for key, value in arrays.items() if key.startswith(prefix)}
+        models[name] = object_from_parts(fields, own, where)
+    entries = entries_from_parts(rows, arrays, where)
+    cameras = load_cameras(directory / CAMERAS_JSON)
+    return Experience(entries, models, robot, cameras, perception, simulator_objects)
+
+
+def _read_json(path: Path) -> dict[str, Any]:
+    try:
+        data = json.loads(_read(path, MAX_JSON_BYTES))
+    except (ValueError, RecursionError) as error:
+        if isinstance(error, MemoryFormatError):
+            raise
+        raise MemoryFormatError(f"{path}: truncated or not JSON ({error}); train or pull it again") from error
+    if not isinstance(data, dict):
+        raise MemoryFormatError(f"{path}: expected a JSON object, got {type(data).__name__}")
+    return data
+
+
+def _read_arrays(path: Path, checksum: object) -> dict[str, np.ndarray]:
+    blob = _read(path, MAX_ARRAY_BYTES)
+    if hashlib.sha256(blob).hexdigest() != checksum:
+        raise MemoryFormatError(
+            f"{path}: its checksum is not the one in {MEMORY_JSON}: truncated, changed, or from another "
+            "checkpoint; train or pull it again"
+        )
+    try:
+        return load_arrays(blob)
+    except SafetensorError as error:
+        raise MemoryFormatError(f"{path}: not safetensors ({error}); train or pull it again") from error
+
+
+def _read(path: Path, limit: int) -> bytes:
+    if not path.is_file():
+        raise MemoryFormatError(
+            f"no memory at {path}: a checkpoint of this policy holds {', '.join(FILES)}; train with "
+            "lerobot-train --policy.type=openspm, or pull the whole checkpoint"
+        )
+    if path.stat().st_size > limit:
+        raise MemoryFormatError(f"{path}: {path.stat().st_size} bytes, more than the {limit} this release reads")
+    return path.read_bytes()
+
+
+def _json(data: object) -> bytes:
+    return json.dumps(data, indent=1, allow_nan=False).encode()
+
+
+def _write(path: Path, blob: bytes) -> None:
+    beside = path.with_name(f".{path.name}.partial")
+    with beside.open("wb") as file:
+        file.write(blob)
+        file.flush()
+        os.fsync(file.fileno())
+    beside.replace(path)

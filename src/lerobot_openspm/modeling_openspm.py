@@ -1,0 +1,230 @@
+"""The policy: mines its memory when it is made for training, learns the flow model, acts by both."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from huggingface_hub import snapshot_download
+from huggingface_hub.constants import CONFIG_NAME, SAFETENSORS_SINGLE_FILE
+from lerobot.configs import PreTrainedConfig
+from lerobot.policies import PreTrainedPolicy
+from torch import Tensor
+
+from lerobot_openspm.configuration_openspm import OpenSPMConfig
+from lerobot_openspm.control.row import Knowledge, Row
+from lerobot_openspm.errors import DatasetError, MemoryFormatError
+from lerobot_openspm.experience import FILES, Experience, load_experience, save_experience
+from lerobot_openspm.flow.condition import CONDITION_DIM, Query, encode, to_world_frame
+from lerobot_openspm.flow.network import VelocityField
+from lerobot_openspm.geometry.camera import load_cameras
+from lerobot_openspm.observation import Observation, split_batch
+from lerobot_openspm.perceive import find_objects
+from lerobot_openspm.training import TrainingSet, mine_experience, training_set
+
+logger = logging.getLogger(__name__)
+
+
+class OpenSPMPolicy(PreTrainedPolicy):
+    """OpenSPM: a memory of key poses, carried over to the scene, and a flow model between them."""
+
+    config_class = OpenSPMConfig
+    name = "openspm"
+
+    def __init__(
+        self,
+        config: OpenSPMConfig,
+        dataset_stats: dict[str, dict[str, Tensor]] | None = None,
+        dataset_meta: Any | None = None,
+        **kwargs: Any,
+    ):
+        """
+        Args:
+            config: The configuration.
+            dataset_stats: Not used: poses are not normalised.
+            dataset_meta: Metadata of the dataset to mine and to learn from; None for a policy that is about
+                to be loaded.
+            kwargs: What else LeRobot passes to every policy.
+        """
+        super().__init__(config)
+        config.validate_features()
+        self.config: OpenSPMConfig = config
+        self.flow = VelocityField(CONDITION_DIM[config.conditioning], config.chunk_size, 7, config.hidden_dim)
+        self.experience: Experience | None = None
+        self._training_set: TrainingSet | None = None
+        if dataset_meta is not None:
+            self.experience = mine_experience(dataset_meta, config)
+            self._training_set = training_set(dataset_meta, config)
+            self.flow.action_scale.copy_(self._training_set.action_scale)
+        self.reset()
+
+    # Acting. `select_action` reads top to bottom: observe, ask for chunks where needed, act.
+
+    def reset(self) -> None:
+        """Forget the running episodes."""
+        self._rows: list[Row] = []
+
+    @torch.no_grad()
+    def select_action(self, batch: dict[str, Tensor], **kwargs: Any) -> Tensor:
+        """Choose one action ``(b, action_dim)`` for every environment of a batch of observations."""
+        self.eval()
+        state_layout, action_layout = self.config.layouts()
+        observations = split_batch(batch, state_layout)
+        actions = []
+        for row, observation in zip(self._rows_of(observations), observations, strict=True):
+            row.observe(observation.hand, lambda names, seen=observation: self._find(names, seen))
+            action = row.next_action()
+            if action is None:
+                row.executor.push_chunk(self._chunk(row, row.query(observation.hand))[: self.config.n_action_steps])
+                action = row.next_action()
+            actions.append(action)
+        vectors = action_layout.encode_actions(np.stack(actions))
+        return torch.as_tensor(vectors, dtype=torch.float32, device=self.config.device)
+
+    @torch.no_grad()
+    def predict_action_chunk(self, batch: dict[str, Tensor], **kwargs: Any) -> Tensor:
+        """Generate a chunk ``(b, chunk_size, action_dim)`` for every environment, queueing none of it."""
+        self.eval()
+        state_layout, action_layout = self.config.layouts()
+        observations = split_batch(batch, state_layout)
+        chunks = []
+        for row, observation in zip(self._rows_of(observations), observations, strict=True):
+            row.observe(observation.hand, lambda names, seen=observation: self._find(names, seen))
+            moving = row.executor.target is not None
+            hold = np.tile(row.executor.hold(), (self.config.chunk_size, 1))
+            chunks.append(self._chunk(row, row.query(observation.hand)) if moving else hold)
+        vectors = action_layout.encode_actions(np.stack(chunks))
+        return torch.as_tensor(vectors, dtype=torch.float32, device=self.config.device)
+
+    def _rows_of(self, observations: Sequence[Observation]) -> list[Row]:
+        """The state of each environment; a new one where the episode or its instruction is new."""
+        if len(self._rows) != len(observations):
+            self._rows = [self._new_row(observation) for observation in observations]
+        for i, observation in enumerate(observations):
+            if self._rows[i].instruction != observation.instruction:
+                self._rows[i] = self._new_row(observation)
+        return self._rows
+
+    def _new_row(self, observation: Observation) -> Row:
+        experience = self._require_experience()
+        config = self.config
+        knowledge = Knowledge(
+            experience.entries, experience.yaw_periods, experience.robot, config.score_weights,
+            config.transfer_limits, config.control_settings,
+        )  # fmt: skip
+        return Row(knowledge, observation.instruction, observation.state, config.noise_seed)
+
+    def _find(self, names: Sequence[str], observation: Observation) -> Mapping[str, np.ndarray]:
+        return find_objects(names, observation, self._require_experience())
+
+    def _chunk(self, row: Row, query: Query) -> np.ndarray:
+        """Generate one chunk ``(chunk_size, 7)`` in the world. Rows go one by one, so batches act alike."""
+        condition = encode(query, self.config.conditioning)
+        noise = row.noise((1, self.config.chunk_size, 7))
+        device = self.flow.action_scale.device
+        tensors = [torch.as_tensor(x, dtype=torch.float32, device=device) for x in (condition[None], noise)]
+        chunk = self.flow.sample(*tensors, self.config.num_inference_steps)[0].cpu().numpy().astype(float)
+        actions = to_world_frame(chunk, query.T_world_target, self.config.conditioning)
+        # The fingers do what the key pose says; the flow model's last number only says it less surely.
+        actions[:, 6] = self._require_experience().robot.command(bool(query.closed))
+        return actions
+
+    # Learning.
+
+    def forward(self, batch: dict[str, Tensor], reduction: str = "mean") -> tuple[Tensor, dict[str, float]]:
+        """Flow-matching loss of the batch's frames, and of others drawn beside them while training.
+
+        Args:
+            batch: Needs ``index`` alone; conditions and chunks were kept from mining.
+            reduction: "mean", or "none" for one loss per frame of the batch ``(b,)``.
+        """
+        if self._training_set is None:
+            raise DatasetError(
+                "this policy was made without a dataset and cannot be trained; pass dataset_meta, as "
+                "lerobot-train does"
+            )
+        draws = self.config.samples_per_frame if self.training else 1
+        condition, actions = self._training_set.draw(batch["index"], draws, self.training)
+        condition, actions = condition.to(self.flow.action_scale), actions.to(self.flow.action_scale)
+        noise = torch.randn_like(actions)
+        time = torch.rand(len(actions), device=actions.device)
+        losses = self.flow.loss(condition, actions, noise, time).view(len(batch["index"]), -1).mean(dim=1)
+        loss = losses if reduction == "none" else losses.mean()
+        return loss, {"flow_loss": float(losses.mean().detach())}
+
+    def get_optim_params(self) -> Any:
+        return self.parameters()
+
+    # Persistence: the memory travels with the weights.
+
+    def _save_pretrained(self, save_directory: Path, state_dict: dict[str, Tensor] | None = None) -> None:
+        super()._save_pretrained(save_directory, state_dict=state_dict)
+        save_experience(self._require_experience(), Path(save_directory))
+
+    @classmethod
+    def from_pretrained(
+        cls,
+        pretrained_name_or_path: str | Path,
+        *,
+        config: PreTrainedConfig | None = None,
+        dataset_stats: dict[str, dict[str, Tensor]] | None = None,
+        dataset_meta: Any | None = None,
+        strict: bool = True,
+        force_download: bool = False,
+        token: str | bool | None = None,
+        cache_dir: str | Path | None = None,
+        local_files_only: bool = False,
+        revision: str | None = None,
+        **kwargs: Any,
+    ) -> OpenSPMPolicy:
+        """Load weights, memory and calibration from a directory or from the Hub.
+
+        With `dataset_meta`, training goes on: the memory is kept, appended to or rebuilt, as
+        ``config.memory_update`` says.
+
+        Raises:
+            MemoryFormatError: The checkpoint has no memory, or a damaged or newer one.
+        """
+        directory = Path(pretrained_name_or_path)
+        if not directory.is_dir():
+            files = [CONFIG_NAME, SAFETENSORS_SINGLE_FILE, *FILES]
+            directory = Path(
+                snapshot_download(
+                    str(pretrained_name_or_path), allow_patterns=files, force_download=force_download, token=token,
+                    cache_dir=cache_dir, local_files_only=local_files_only, revision=revision,
+                )
+            )  # fmt: skip
+        policy = super().from_pretrained(directory, config=config, strict=strict, **kwargs)
+        policy._attach(directory, dataset_meta)
+        return policy
+
+    def _attach(self, directory: Path, dataset_meta: Any | None) -> None:
+        """Give a freshly loaded policy its memory, and its training set when training goes on."""
+        self.experience = load_experience(directory)
+        if self.config.cameras is not None:
+            cameras = load_cameras(Path(self.config.cameras))
+            self.experience = Experience(**{**vars(self.experience), "cameras": cameras})
+        if dataset_meta is not None:
+            if self.config.memory_update != "keep":
+                known = self.experience if self.config.memory_update == "append" else None
+                self.experience = mine_experience(dataset_meta, self.config, known)
+            logger.info("memory_update=%s: %d entries", self.config.memory_update, len(self.experience.entries))
+            self._training_set = training_set(dataset_meta, self.config)
+        if self.experience.perception != self.config.perception:
+            raise MemoryFormatError(
+                f"the memory in {directory} holds key poses in the frames of perception="
+                f"{self.experience.perception}, got --policy.perception={self.config.perception}; the two "
+                "cannot be mixed, train with the one you evaluate"
+            )
+
+    def _require_experience(self) -> Experience:
+        if self.experience is None:
+            raise MemoryFormatError(
+                "this policy has no memory; train it with lerobot-train --policy.type=openspm, or load a "
+                "checkpoint with --policy.path"
+            )
+        return self.experience

@@ -1,0 +1,114 @@
+"""One environment's observation, taken out of LeRobot's batch and checked."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from lerobot.utils.constants import OBS_STATE
+from numpy.typing import NDArray
+
+from lerobot_openspm.control.executor import Hand
+from lerobot_openspm.errors import ObservationError
+from lerobot_openspm.geometry import se3
+from lerobot_openspm.geometry.camera import Camera
+from lerobot_openspm.geometry.layout import VectorLayout
+from lerobot_openspm.geometry.se3 import Array
+from lerobot_openspm.perception.types import View
+
+# Named by the environment that gives them: position and quat_wxyz per object (oracle ablation only).
+OBJECT_POSES = "observation.object_poses"
+
+
+@dataclass(frozen=True)
+class Observation:
+    """What the policy sees of one environment at one step.
+
+    Attributes:
+        instruction: The task string.
+        state: State vector as it came.
+        hand: Hand pose and opening, read from it.
+        images: Images ``(3, H, W)`` by camera, still as tensors: few of them are ever looked at.
+        object_poses: Simulator poses ``(n * 7,)``, or None.
+    """
+
+    instruction: str
+    state: Array
+    hand: Hand
+    images: Mapping[str, torch.Tensor]
+    object_poses: Array | None
+
+    def views(self, cameras: Mapping[str, Camera]) -> dict[str, View]:
+        """Images of the calibrated cameras with the cameras' present poses.
+
+        Raises:
+            ObservationError: A calibrated camera is missing, or its image is no finite RGB picture.
+            CalibrationError: An image has another shape than the calibration.
+        """
+        views = {}
+        for key, camera in cameras.items():
+            if key not in self.images:
+                raise ObservationError(
+                    f"the observation has no camera {key!r} that the calibration names; it has "
+                    f"{sorted(self.images)}. Rename with --rename_map, or pass --policy.cameras=FILE"
+                )
+            image = _as_uint8(self.images[key], key)
+            scaled = camera.scaled(image.shape[1], image.shape[0])
+            views[key] = View(image, scaled, scaled.T_world_cam(self.hand.T_world_ee))
+        return views
+
+    def simulator_layout(self, names: Sequence[str]) -> dict[str, Array]:
+        """Simulator poses ``T_world_obj`` by name (oracle ablation only)."""
+        if self.object_poses is None:
+            raise ObservationError(
+                f"perception=oracle needs {OBJECT_POSES!r}, which this environment does not give; pass "
+                "--env.object_poses=true on the tabletop, or use --policy.perception=demonstrations"
+            )
+        rows = self.object_poses.reshape(len(names), 7)
+        T = se3.transform(se3.matrix_from_quat_xyzw(rows[:, [4, 5, 6, 3]]), rows[:, :3])
+        return dict(zip(names, T, strict=True))
+
+
+def split_batch(batch: Mapping[str, Any], state_layout: VectorLayout) -> list[Observation]:
+    """Take a batch apart into one observation per environment.
+
+    Raises:
+        ObservationError: There is no state or instruction, or the state is not finite.
+        LayoutError: The state has another size than its layout.
+    """
+    if OBS_STATE not in batch:
+        raise ObservationError(f"the observation has no {OBS_STATE!r}; it has {sorted(batch)}")
+    states = batch[OBS_STATE].detach().cpu().numpy().astype(float)
+    if not np.isfinite(states).all():
+        raise ObservationError(f"{OBS_STATE!r} is not finite: {states}")
+    tasks = batch.get("task")
+    if tasks is None:
+        raise ObservationError(f"the observation has no 'task', the instruction; it has {sorted(batch)}")
+    tasks = [tasks] * len(states) if isinstance(tasks, str) else list(tasks)
+    T_world_ee, openings = state_layout.poses(states), state_layout.openings(states)
+    images = {k: v for k, v in batch.items() if k.startswith("observation.image") and isinstance(v, torch.Tensor)}
+    poses = batch[OBJECT_POSES].detach().cpu().numpy().astype(float) if OBJECT_POSES in batch else None
+    return [
+        Observation(
+            instruction=tasks[i],
+            state=states[i],
+            hand=Hand(T_world_ee[i], float(openings[i])),
+            images={key: value[i] for key, value in images.items()},
+            object_poses=None if poses is None else poses[i],
+        )
+        for i in range(len(states))
+    ]
+
+
+def _as_uint8(image: torch.Tensor, key: str) -> NDArray[np.uint8]:
+    if image.ndim != 3 or image.shape[0] != 3:
+        raise ObservationError(f"camera {key!r} gave shape {tuple(image.shape)}, expected (3, height, width)")
+    array = image.detach().cpu().numpy().transpose(1, 2, 0)
+    if array.dtype == np.uint8:
+        return array
+    if not np.isfinite(array).all():
+        raise ObservationError(f"camera {key!r} gave an image with NaN or infinite values")
+    return np.round(np.clip(array, 0, 1) * 255).astype(np.uint8)
