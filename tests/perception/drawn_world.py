@@ -9,7 +9,7 @@ from lerobot_openspm.perception.types import Hint, Scene, View
 
 SIZE = 160
 TABLE = (196, 166, 128)
-# Half sizes (a cylinder has its radius twice), height, colours of the sides and of the top, whether it is round.
+# Half sizes (a cylinder has its radius twice), height, colours of sides and top, whether it is round.
 SHAPES = {
     "block": ((0.06, 0.03), 0.05, (150, 30, 20), (225, 60, 40), False),
     "cup": ((0.04, 0.04), 0.06, (15, 35, 130), (40, 80, 220), True),
@@ -32,7 +32,7 @@ def cameras() -> dict[str, tuple[Camera, np.ndarray]]:
 
 
 def render(objects: list[tuple[tuple, np.ndarray]]) -> dict[str, View]:
-    """Draw shapes at poses ``T_world_obj``, the furthest first; antialiased by drawing at four times the size."""
+    """Draw shapes at poses ``T_world_obj``, the furthest first, antialiased."""
     views = {}
     for name, (camera, T_world_cam) in cameras().items():
         image = np.full((4 * SIZE, 4 * SIZE, 3), TABLE, np.uint8)
@@ -75,7 +75,8 @@ def demonstration(rng: np.random.Generator, wrong: bool = False) -> Scene:
     grasp = se3.apply(poses["cup"], np.array([[0.03, 0.0, 0.05]]))[0] + rng.normal(0, 0.004, 3)
     release = poses["block"][:3, 3] + [0, 0, 0.12] + rng.normal(0, 0.01, 3)
     if wrong:
-        grasp, release = release + [0.2, 0, 0], grasp - [0.2, 0, 0]
+        aside = np.array([0.2, 0.0, 0.0])
+        grasp, release = release + aside, grasp - aside
     later = poses | {"cup": se3.from_yaw(poses["block"][:3, 3] + [0, 0, 0.05], 0.0)}
     hints = (Hint("cup", grasp, "grasp"), Hint("block", release, "release"))
     return Scene(views_of(poses), hints, views_of(later))

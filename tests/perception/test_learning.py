@@ -28,12 +28,17 @@ def unseen():
 
 
 def errors(model, name, scenes):
-    """Position errors in metres and yaw errors modulo the period, after one constant offset over all scenes."""
+    """Position errors in metres, and yaw errors modulo the period after one constant offset."""
     estimates = [localise(views_of(poses), model) for poses in scenes]
     assert all(one.status == "found" for one in estimates)
-    places = np.stack([one.T_world_obj[:3, 3] - poses[name][:3, 3] for one, poses in zip(estimates, scenes)])
+    places = np.stack(
+        [one.T_world_obj[:3, 3] - poses[name][:3, 3] for one, poses in zip(estimates, scenes, strict=True)]
+    )
     turns = np.array(
-        [se3.yaw_of(one.T_world_obj) - se3.yaw_of(poses[name]) for one, poses in zip(estimates, scenes)]
+        [
+            se3.yaw_of(one.T_world_obj) - se3.yaw_of(poses[name])
+            for one, poses in zip(estimates, scenes, strict=True)
+        ]
     )
     period = model.yaw_period or 2 * np.pi
     turns = se3.wrap_angle(turns - turns[0], period)

@@ -53,16 +53,18 @@ def find_blobs(probability: Float32, min_area: float, limit: int) -> list[Blob]:
 
 
 def triangulate(views: Sequence[View], centres: Sequence[Array]) -> tuple[Array, float]:
-    """Point ``(3,)`` nearest to the rays through one pixel ``(2,)`` per view, and the largest distance to a ray."""
+    """Point ``(3,)`` nearest to the rays through a pixel ``(2,)`` per view; its largest distance to one."""
     origins = np.stack([view.T_world_cam[:3, 3] for view in views])
-    rays = np.stack([ray_directions(view.camera, view.T_world_cam, uv) for view, uv in zip(views, centres)])
+    rays = np.stack(
+        [ray_directions(view.camera, view.T_world_cam, uv) for view, uv in zip(views, centres, strict=True)]
+    )
     across = np.eye(3) - rays[:, :, None] * rays[:, None, :]
     point = np.linalg.lstsq(across.sum(0), np.einsum("nij,nj->i", across, origins), rcond=None)[0]
     return point, float(np.linalg.norm(np.einsum("nij,nj->ni", across, point - origins), axis=1).max())
 
 
 def disc(view: View, point_world: Array, radius: float) -> Mask:
-    """Pixels ``(H, W)`` within ``radius`` metres of a point, measured at the point's depth; empty if behind."""
+    """Pixels ``(H, W)`` within ``radius`` metres of a point, at the point's depth; empty if behind."""
     p_cam = view.T_world_cam[:3, :3].T @ (point_world - view.T_world_cam[:3, 3])
     mask = np.zeros(view.image.shape[:2], np.uint8)
     if p_cam[2] > 0.01:

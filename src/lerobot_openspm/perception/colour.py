@@ -50,8 +50,8 @@ def foreground(bins: Bins, log_odds: NDArray[np.float32]) -> NDArray[np.float32]
 def evidence(inside: list[Array], outside: Array, min_presence: float) -> NDArray[np.float32]:
     """Log-odds per colour from pixels near an object and pixels elsewhere.
 
-    A colour belongs to the object when it is denser near it than elsewhere, and near it in most pictures: what
-    merely stood next to it once is present in few.
+    A colour belongs to the object when it is denser near it than elsewhere, and near it in most pictures:
+    what merely stood next to it once is present in few.
 
     Args:
         inside: One histogram ``(N_BINS,)`` per picture, of the pixels near the object.

@@ -54,7 +54,7 @@ class Cloud:
 
 @dataclass(frozen=True)
 class Freedom:
-    """Standard deviations of the prior around the start pose; 0 holds a coordinate, infinity leaves it free."""
+    """Standard deviations of the prior around the start pose: 0 holds a coordinate, infinity frees it."""
 
     position: float = np.inf
     height: float = 0.0

@@ -38,7 +38,7 @@ log = logging.getLogger(__name__)
 MAX_SCENES = 30
 REFERENCES = 2
 JUDGES = 6
-ROUNDS = 3
+ROUNDS = 4
 SYMMETRY_ROUNDS = 2
 THRESHOLDS = (0.5, 0.6, 0.7, 0.8, 0.9, 0.97)
 # Two rays that are to meet in an object may miss each other by this much, metres.
@@ -47,7 +47,9 @@ MAX_RAY_GAP = 0.05
 SYMMETRY_LOSS = 0.006
 BODY_OF_REVOLUTION = 24
 # What may be lost for a shape without the cones above and below that no camera sees.
-TRIM_LOSS = 0.002
+TRIM_LOSS = 0.0007
+NEAR_YAWS = np.deg2rad([-30.0, -10.0, 10.0, 30.0])
+TURN_GAIN = 0.008
 YAW_MARGIN = np.deg2rad(20)
 
 
@@ -59,8 +61,8 @@ def learn_objects(scenes: Sequence[Scene], rng: Generator) -> dict[str, ObjectMo
         rng: Chooses among the demonstrations of an object where there are more than needed.
 
     Returns:
-        Models by name. An object that cannot be learned (never visible, no consistent colour) is left out, and
-        the log says so.
+        Models by name. An object that cannot be learned (never visible, no consistent colour) is left out,
+        and the log says so.
 
     Raises:
         DatasetError: No scene has a hint.
@@ -111,7 +113,7 @@ def _pictures(index: int, name: str, scene: Scene, floor: float) -> list[Picture
 
 
 def _first_poses(pictures: Sequence[Picture], log_odds: NDArray[np.float32]) -> tuple[list[Posed], float]:
-    """Places from the patches' centres, all at one height and yaw 0, and half the size of a cube around the object."""
+    """Places from the patches' centres, at one height and yaw 0, and half the size of a cube around them."""
     visible = seeding.hiding_pixels(pictures, log_odds)
     groups: dict[int, list[tuple[Evidence, Blob | None]]] = {}
     for picture in pictures:
@@ -123,7 +125,7 @@ def _first_poses(pictures: Sequence[Picture], log_odds: NDArray[np.float32]) -> 
     sizes: list[float] = []
     for index, group in groups.items():
         seen = [(one.view, blob) for one, blob in group if blob is not None]
-        # Patches cut off by the image's border have their centre in the wrong place: only if nothing else is left.
+        # Patches cut off by the image's border have a wrong centre: only if nothing else is left.
         seen = [(view, blob) for view, blob in seen if blob.whole] or seen
         if len(seen) >= 2:
             point, gap = triangulate([view for view, _ in seen], [blob.centre for _, blob in seen])
@@ -168,7 +170,13 @@ def _bootstrap(posed: list[Posed], half_size: float) -> tuple[Cloud, list[Posed]
             best = (total, cloud)
     if best is None:
         return None
-    return best[1], _moved(posed, [_fit_yaws(scene, best[1], yaws) for scene in posed])
+    cloud = best[1]
+    anyhow = [_fit_yaws(scene, cloud, yaws) for scene in posed]
+    # What keeps to about one direction in every scene must not be turned for a trifle: a fixture that looks
+    # alike from two sides would end up with either.
+    alike = [_fit_yaws(scene, cloud, NEAR_YAWS) for scene in posed]
+    lost = float(np.mean([one.score - other.score for one, other in zip(anyhow, alike, strict=True)]))
+    return cloud, _moved(posed, alike if lost < TURN_GAIN else anyhow)
 
 
 def _finish(posed: list[Posed], half_size: float, cloud: Cloud) -> tuple[Cloud, list[Posed], float, Array]:
@@ -194,12 +202,16 @@ def _finish(posed: list[Posed], half_size: float, cloud: Cloud) -> tuple[Cloud, 
 def _symmetrise(
     posed: list[Posed], half_size: float, cloud: Cloud, limits: tuple[float, float]
 ) -> tuple[Cloud, list[Posed], float]:
-    """The most symmetric shape that explains the masks nearly as well as the free one, its poses and yaw period."""
+    """The most symmetric shape that explains the masks as well as the free one, poses and yaw period."""
+    _, halfwidth = _yaw_range(np.array([se3.yaw_of(scene.T_world_obj) for scene in posed]), 2 * np.pi)
     free = float(
         np.mean([one.score for one in (_refit(scene, cloud, 2 * np.pi) for scene in _reliable(posed, cloud))])
     )
     for order in (BODY_OF_REVOLUTION, 4, 2):
         period = 0.0 if order == BODY_OF_REVOLUTION else 2 * np.pi / order
+        # Where the yaws keep to a part of the circle nothing shows the symmetry, and nothing needs it.
+        if period > 0 and halfwidth < period / 2:
+            continue
         turned, moved = cloud, posed
         for _ in range(SYMMETRY_ROUNDS):
             reliable = _reliable(moved, turned)
@@ -237,23 +249,22 @@ def _best_cloud(
 def _trimmed(posed: Sequence[Posed], votes: Votes, threshold: float) -> tuple[float, float]:
     """Limits in z between which the hull explains the masks as well as the whole hull.
 
-    Cameras that all look down leave a hull with a cone below the object and a roof above it, which no view can
-    tell from the object. The least body that will do is taken instead, so that its bottom is the support plane.
+    Cameras that all look down leave a hull with a cone below the object and a roof above, which no view can tell
+    from it. They are cut off as far as that costs nothing: there is the support plane.
     """
     full = votes.cloud(threshold)
     if full is None:
         return -np.inf, np.inf
-    limits = [float(full.points[:, 2].min()), float(full.points[:, 2].max())]
+    limits = (float(full.points[:, 2].min()), float(full.points[:, 2].max()))
     judges = posed[:: max(1, len(posed) // JUDGES)]
     worth, half = _worth(judges, full), 0.51 * votes.spacing
-    for end, sign in ((0, 1), (1, -1)):
+    for end in (0, 1):
         step = 4 * votes.spacing
         while step > 0.9 * votes.spacing:
-            tried = list(limits)
-            tried[end] += sign * step
-            cloud = votes.cloud(threshold, (tried[0] - half, tried[1] + half))
+            low, high = (limits[0] + step, limits[1]) if end == 0 else (limits[0], limits[1] - step)
+            cloud = votes.cloud(threshold, (low - half, high + half))
             if cloud is not None and _worth(judges, cloud) > worth - TRIM_LOSS:
-                limits = tried
+                limits = (low, high)
             else:
                 step /= 2
     return limits[0] - half, limits[1] + half
@@ -280,12 +291,12 @@ def _refit(scene: Posed, cloud: Cloud, period: float) -> Fit:
 
 
 def _reliable(posed: Sequence[Posed], cloud: Cloud) -> list[Posed]:
-    """The scenes, without the views in which the object is hidden and without those that fit badly as a whole."""
+    """The scenes that fit well, without the views in which the object is hidden."""
     kept = []
     for scene in posed:
         overlaps = measure(scene.evidence, cloud, scene.T_world_obj)
         best = np.nanmax(overlaps, initial=0.0)
-        good = [one for one, value in zip(scene.evidence, overlaps) if value > 0.6 * best]
+        good = [one for one, value in zip(scene.evidence, overlaps, strict=True) if value > 0.6 * best]
         kept.append((best, Posed(tuple(good), scene.T_world_obj)))
     level = 0.8 * float(np.median([best for best, _ in kept]))
     return [scene for best, scene in kept if best >= level and scene.evidence]
@@ -301,13 +312,13 @@ def _fit_yaws(scene: Posed, cloud: Cloud, yaws: Array) -> Fit:
 
 
 def _moved(posed: Sequence[Posed], fits: Sequence[Fit]) -> list[Posed]:
-    return [replace(scene, T_world_obj=one.T_world_obj) for scene, one in zip(posed, fits)]
+    return [replace(scene, T_world_obj=one.T_world_obj) for scene, one in zip(posed, fits, strict=True)]
 
 
 def _model(
     name: str, log_odds: NDArray[np.float32], cloud: Cloud, posed: list[Posed], period: float, scores: Array
 ) -> ObjectModel:
-    """Put the frame at the footprint's centre, x along its long side, and summarise the demonstrations' yaws."""
+    """Put the frame at the footprint's centre, x along its long side; summarise the demonstrations."""
     centre, turn = shape.footprint(cloud.points)
     bottom = float(cloud.points[:, 2].min()) - cloud.spacing / 2
     turn = 0.0 if period == 0 else turn
@@ -325,7 +336,7 @@ def _model(
 
 
 def _yaw_range(yaws: Array, period: float) -> tuple[float, float]:
-    """Middle and half width of the yaws to search: all of the period unless the demonstrations kept to a part."""
+    """Middle and half width of the yaws to search: the period, or the part the demonstrations kept to."""
     if period == 0:
         return 0.0, 0.0
     ordered = np.sort(np.mod(yaws, period))

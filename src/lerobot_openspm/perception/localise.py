@@ -1,4 +1,4 @@
-"""Finding a learned object in new images: candidates from colour, poses by aligning silhouettes, one answer."""
+"""Finding a learned object in new images: candidates from colour, poses by aligning silhouettes."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from lerobot_openspm.perception.fitting import COARSE_PX, Cloud, Evidence, Fit, 
 from lerobot_openspm.perception.model import ObjectModel
 from lerobot_openspm.perception.types import UNKNOWN_YAW_STD, PoseEstimate, View
 
-COARSE_CUTS_PX = (30.0, 20.0, 12.0)
+COARSE_CUTS_PX = (30.0, 30.0, 20.0, 12.0)
 FINE_CUTS_PX = (6.0, 4.0, 3.0, 3.0)
 BLOBS_PER_VIEW = 3
 MAX_CANDIDATES = 3
@@ -74,7 +74,7 @@ def localise(
         raise ObservationError("no camera views to look for an object in; pass at least one")
     prepared = [view if isinstance(view, Prepared) else prepare(view) for view in views.values()]
     evidence = [Evidence(one.view, colour.foreground(one.bins, model.log_odds)) for one in prepared]
-    masks = {name: one.probability > 0.5 for name, one in zip(views, evidence)}
+    masks = {name: one.probability > 0.5 for name, one in zip(views, evidence, strict=True)}
     fits = search(evidence, model, freedom or Freedom())
     if not fits:
         return PoseEstimate("not_found", np.eye(4), _ignorance(), 0.0, masks)

@@ -1,4 +1,4 @@
-"""What is known of one object after learning: its colours, its shape, how it stands and how it may be turned."""
+"""What is known of one object after learning: its colours, its shape, how it stands and is turned."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ class ObjectModel:
     Attributes:
         name: The noun phrase.
         log_odds: Foreground log-odds ``(N_BINS,)`` per colour, float32.
-        points: Surface points ``(n, 3)`` in the object's frame, metres, float32. The frame is upright, its origin
-            at the footprint's centre on the support plane.
+        points: Surface points ``(n, 3)`` in the object's frame, metres, float32. The frame is upright, its
+            origin at the footprint's centre on the support plane.
         spacing: Distance between neighbouring points, metres.
         height: World z of the support plane the object stood on, metres.
         yaw_period: Turning by this angle (radians) leaves the object unchanged; 0 for a body of revolution.

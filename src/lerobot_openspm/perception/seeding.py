@@ -1,8 +1,8 @@
 """From hints to colours: which pixels of the first frames are the object's, agreed over all demonstrations.
 
 Mining says where the hand touched an object, not what the object looks like. Pixels near those places, if
-possible those that changed when the object was carried off, start a colour model; its patches, grown a little,
-replace the places, and so on, until the model covers whatever consistently belongs together.
+possible those that changed when the object was carried off, start a colour model; its patches, grown a
+little, replace the places, and so on, until the model covers whatever consistently belongs together.
 """
 
 from __future__ import annotations
@@ -89,7 +89,7 @@ def changed_pixels(first: View, later: View) -> Mask | None:
 def learn_colours(pictures: Sequence[Picture]) -> NDArray[np.float32]:
     """Log-odds ``(N_BINS,)`` per colour of the object that the pictures' hints touch."""
     regions = [picture.seed() for picture in pictures]
-    outsides = [~(picture.neutral() | region) for picture, region in zip(pictures, regions)]
+    outsides = [~(picture.neutral() | region) for picture, region in zip(pictures, regions, strict=True)]
     log_odds = _evidence(pictures, regions, outsides)
     for _ in range(ROUNDS):
         regions, outsides = [], []
@@ -107,7 +107,7 @@ def learn_colours(pictures: Sequence[Picture]) -> NDArray[np.float32]:
 
 
 def hinted_blob(picture: Picture, log_odds: NDArray[np.float32]) -> Blob | None:
-    """The patch of the object's colours that the hints of a picture point at; None if there is none near them."""
+    """The patch of the object's colours that a picture's hints point at; None if there is none."""
     blobs = find_blobs(colour.foreground(picture.bins, log_odds), 8, 6)
     seed = picture.seed()
     near = grow(seed, 4) if seed.any() else seed
@@ -146,8 +146,12 @@ def hiding_pixels(
 def _evidence(
     pictures: Sequence[Picture], regions: Sequence[Mask], outsides: Sequence[Mask]
 ) -> NDArray[np.float32]:
-    inside = [colour.histogram(p.bins[region]) for p, region in zip(pictures, regions) if region.sum() >= 6]
-    outside = sum(colour.histogram(p.bins[mask]) for p, mask in zip(pictures, outsides))
+    inside = [
+        colour.histogram(p.bins[region])
+        for p, region in zip(pictures, regions, strict=True)
+        if region.sum() >= 6
+    ]
+    outside = sum(colour.histogram(p.bins[mask]) for p, mask in zip(pictures, outsides, strict=True))
     if not inside:
         return np.full(colour.N_BINS, -colour.MAX_LOG_ODDS, np.float32)
     return colour.evidence(inside, np.asarray(outside), PRESENCE)

@@ -1,4 +1,4 @@
-"""The shape of an object from its masks: a voxel hull by vote over scenes and views, its symmetry, its frame."""
+"""The shape of an object from its masks: a voxel hull by vote over scenes and views."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ class Votes:
     spacing: float
 
     def cloud(self, threshold: float, limits: tuple[float, float] = (-np.inf, np.inf)) -> Cloud | None:
-        """Surface of the largest connected body with votes above a threshold and z within limits; None if empty."""
+        """Surface of the largest body with votes above a threshold and z within limits; None if empty."""
         z = self.axis
         allowed = (z >= limits[0]) & (z <= limits[1])
         return surface(_largest_body((self.share >= threshold) & allowed), self.spacing)
@@ -79,9 +79,9 @@ def surface(solid: NDArray[np.bool_], spacing: float) -> Cloud | None:
 def vote(scenes: Sequence[Posed], half_size: float, worth: NDArray[np.bool_] | None = None) -> Votes:
     """Let every picture vote on every voxel of a cube around the object.
 
-    A voxel's share is half the mean over the cameras and half that of the camera least convinced of it: the object
-    lies within the silhouettes of every camera, however few scenes that camera sees it in; but what often stands
-    in front of it must not carve it away.
+    A voxel's share is half the mean over the cameras and half that of the camera least convinced of it: the
+    object lies within the silhouettes of every camera, however few scenes that camera sees it in; but what
+    often stands in front of it must not carve it away.
 
     Args:
         scenes: Evidence and poses.
@@ -119,7 +119,7 @@ def vote(scenes: Sequence[Posed], half_size: float, worth: NDArray[np.bool_] | N
 
 
 def footprint(points: Array) -> tuple[Array, float]:
-    """Centre ``(2,)`` and long axis (radians) of the smallest rectangle around points ``(n, 3)`` from above."""
+    """Centre ``(2,)`` and long axis (radians) of the smallest rectangle around points ``(n, 3)``."""
     (x, y), (width, depth), angle = cv2.minAreaRect(points[:, :2].astype(np.float32) * 1000)
     long_axis = np.deg2rad(angle) + (0.0 if width >= depth else np.pi / 2)
     return np.array([x, y]) / 1000, float(se3.wrap_angle(long_axis, np.pi))

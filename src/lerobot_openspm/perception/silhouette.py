@@ -2,7 +2,7 @@
 
 A model is a cloud of surface points with a known spacing. Drawn in a view it gives a mask and, around it, a
 signed distance (positive inside, in pixels). Alignment compares that distance with the observed mask's along
-the model's rim and moves the model until both agree: Gauss-Newton over x, y, z and yaw, over all views at once.
+the model's rim and moves the model until both agree: Gauss-Newton over x, y, z, yaw, all views at once.
 """
 
 from __future__ import annotations
@@ -105,7 +105,7 @@ def draw(
 
 
 def overlap(drawing: Drawing, probability: Float32, visible: Float32 | None) -> tuple[float, float, float]:
-    """Areas, in image pixels, of drawing and mask in common, of the drawing, and of the mask near the drawing.
+    """Areas, in image pixels: drawing and mask in common, the drawing, the mask near the drawing.
 
     Only what lies in the image and is not known to be hidden counts.
     """
@@ -143,7 +143,7 @@ def normal_equations(
         cut_px: Residuals beyond this many pixels are outliers (occlusion) and count nothing.
 
     Returns:
-        Hessian ``(4, 4)``, gradient ``(4,)``, sum of weighted squared residuals, sum of weights, all in pixels.
+        Hessian ``(4, 4)``, gradient ``(4,)``, sum of weighted squared residuals, sum of weights; pixels.
     """
     size = np.array([view.camera.width, view.camera.height])
     u, v = drawing.uv[:, 0], drawing.uv[:, 1]
@@ -171,7 +171,7 @@ def normal_equations(
 
 
 def _pixel_jacobian(view: View, T_world_obj: Array, points_obj: Array) -> Array:
-    """Derivatives ``(n, 2, 4)`` of image coordinates with respect to the object's x, y, z (m) and yaw (rad)."""
+    """Derivatives ``(n, 2, 4)`` of image coordinates by the object's x, y, z (m) and yaw (rad)."""
     arm = points_obj @ T_world_obj[:3, :3].T
     R_cam_world = view.T_world_cam[:3, :3].T
     p = (arm + T_world_obj[:3, 3] - view.T_world_cam[:3, 3]) @ R_cam_world.T

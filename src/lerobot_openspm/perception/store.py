@@ -36,7 +36,7 @@ def from_parts(data: Mapping[str, Any], arrays: Mapping[str, NDArray[Any]], wher
     """Put a model together again; ``where`` names its origin in errors.
 
     Raises:
-        MemoryFormatError: A field or an array is missing, of the wrong type or shape, not finite or out of range.
+        MemoryFormatError: A field or array is missing, of a wrong type or shape, not finite, or out of range.
     """
     version = data.get("version")
     if version != VERSION:
@@ -74,7 +74,7 @@ def _array(
     )
     if array.dtype != np.float32 or not fits:
         raise MemoryFormatError(
-            f"{where}: array {key!r} is {array.dtype} of shape {array.shape}, expected float32 of {shape} (-1 any)"
+            f"{where}: array {key!r} is {array.dtype} of {array.shape}, expected float32 of {shape} (-1: any)"
         )
     if not np.isfinite(array).all():
         raise MemoryFormatError(f"{where}: array {key!r} holds values that are not finite")

@@ -68,8 +68,8 @@ class PoseEstimate:
     """Where an object is.
 
     Attributes:
-        status: ``"ambiguous"`` when two places explain the images equally well; the pose is then the better one.
-        T_world_obj: Upright pose ``(4, 4)``: origin at the footprint's centre on the support plane, yaw about z.
+        status: ``"ambiguous"`` when two places explain the images equally well; the pose is the better one.
+        T_world_obj: Upright pose ``(4, 4)``: origin at the footprint's centre on the support plane.
         covariance: ``(4, 4)`` over x, y, z in metres and yaw in radians.
         confidence: From 0 to 1; 1 is how well the object is typically found in its demonstrations.
         masks: Foreground mask ``(H, W)`` by camera name.
