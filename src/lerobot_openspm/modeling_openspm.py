@@ -11,6 +11,7 @@ import numpy as np
 import torch
 from huggingface_hub import snapshot_download
 from huggingface_hub.constants import CONFIG_NAME, SAFETENSORS_SINGLE_FILE
+from huggingface_hub.errors import HFValidationError
 from lerobot.configs import PreTrainedConfig
 from lerobot.policies import PreTrainedPolicy
 from torch import Tensor
@@ -192,12 +193,16 @@ class OpenSPMPolicy(PreTrainedPolicy):
         directory = Path(pretrained_name_or_path)
         if not directory.is_dir():
             files = [CONFIG_NAME, SAFETENSORS_SINGLE_FILE, *FILES]
-            directory = Path(
-                snapshot_download(
+            try:
+                snapshot = snapshot_download(
                     str(pretrained_name_or_path), allow_patterns=files, force_download=force_download, token=token,
                     cache_dir=cache_dir, local_files_only=local_files_only, revision=revision,
-                )
-            )  # fmt: skip
+                )  # fmt: skip
+            except HFValidationError as error:
+                raise FileNotFoundError(
+                    f"no checkpoint folder at {pretrained_name_or_path}, and it is no name on the Hub (user/name)"
+                ) from error
+            directory = Path(snapshot)
         policy = super().from_pretrained(directory, config=config, strict=strict, **kwargs)
         policy._attach(directory, dataset_meta)
         return policy

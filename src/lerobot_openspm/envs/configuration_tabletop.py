@@ -32,6 +32,8 @@ class TabletopEnvConfig(EnvConfig):
     observation_width: int = 256
     # True poses as observation.object_poses: for oracle ablations, never for a policy's reported figure.
     object_poses: bool = False
+    # File that every environment appends one JSON line per finished episode to: task, seed, steps, success, status.
+    episode_log: str | None = None
     features: dict[str, PolicyFeature] = field(
         default_factory=lambda: {ACTION: PolicyFeature(type=FeatureType.ACTION, shape=(ACTION_SIZE,))}
     )
@@ -59,6 +61,7 @@ class TabletopEnvConfig(EnvConfig):
             "observation_height": self.observation_height,
             "observation_width": self.observation_width,
             "object_poses": self.object_poses,
+            "episode_log": self.episode_log,
         }
 
     def create_envs(

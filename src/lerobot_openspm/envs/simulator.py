@@ -152,10 +152,12 @@ class TabletopSimulator:
         return pose
 
     def finger_positions(self) -> np.ndarray:
-        """(2,) metres: left is positive, right negative, as in LIBERO; (0.04, -0.04) is open."""
-        return np.array(
-            [self.data.qpos[self._qpos["finger_left"]], self.data.qpos[self._qpos["finger_right"]]]
-        )
+        """(2,) metres: left is positive, right negative, as in LIBERO; (0.04, -0.04) is open.
+
+        The joints' stops are soft: fingers that press on nothing go a little beyond closed, which reads as closed.
+        """
+        left, right = (float(self.data.qpos[self._qpos[name]]) for name in ("finger_left", "finger_right"))
+        return np.array([max(left, 0.0), min(right, 0.0)])
 
     def joint_position(self, name: str) -> float:
         """Metres a drawer is pulled out, or radians the knob is turned."""

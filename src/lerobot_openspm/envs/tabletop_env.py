@@ -1,5 +1,6 @@
 """The tabletop as a Gymnasium environment, observed and acted on like LeRobot's LIBERO."""
 
+import json
 from typing import Any
 
 import gymnasium as gym
@@ -67,6 +68,7 @@ class TabletopEnv(gym.Env):
         observation_height: int = 256,
         observation_width: int = 256,
         object_poses: bool = False,
+        episode_log: str | None = None,
         render_mode: str = "rgb_array",
     ) -> None:
         super().__init__()
@@ -84,6 +86,8 @@ class TabletopEnv(gym.Env):
         self.render_mode = render_mode
         self._size = (observation_height, observation_width)
         self._with_object_poses = object_poses
+        self._episode_log = episode_log
+        self._seed: int | None = None
         self._simulator: TabletopSimulator | None = None
         self._steps = 0
         self._held = 0
@@ -107,6 +111,7 @@ class TabletopEnv(gym.Env):
     def reset(self, *, seed: int | None = None, options: dict | None = None) -> tuple[dict, dict[str, Any]]:
         """Draw a new layout from the seed; the options are those of Gymnasium and are not used."""
         super().reset(seed=seed)
+        self._seed = seed
         self.simulator.reset(sample_layout(self.np_random))
         self._steps = self._held = 0
         return self._observe(), self._info("running")
@@ -133,7 +138,16 @@ class TabletopEnv(gym.Env):
         return self._observe(), 0.0, False, truncated, self._info("time_limit" if truncated else "running")
 
     def _info(self, status: str) -> dict[str, Any]:
+        if status != "running" and self._episode_log is not None:
+            self._append_to_log(status)
         return {"is_success": status == "success", "status": status, "unstable": status == "unstable"}
+
+    def _append_to_log(self, status: str) -> None:
+        """One JSON object a line: lerobot-eval keeps success alone, not how long an episode took or how it ended."""
+        line = {"task": self.task, "seed": self._seed, "steps": self._steps, "success": status == "success", "status": status}
+        # A single write in append mode, so that the lines of several processes never mix.
+        with open(self._episode_log, "ab", buffering=0) as log:  # type: ignore[arg-type]
+            log.write((json.dumps(line) + "\n").encode())
 
     def _observe(self) -> dict[str, Any]:
         observation: dict[str, Any] = {

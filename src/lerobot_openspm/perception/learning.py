@@ -38,6 +38,8 @@ log = logging.getLogger(__name__)
 MAX_SCENES = 30
 REFERENCES = 2
 JUDGES = 6
+AXIS_JUDGES = 12
+NARROW_YAW = np.deg2rad(60)
 ROUNDS = 4
 SYMMETRY_ROUNDS = 2
 THRESHOLDS = (0.5, 0.6, 0.7, 0.8, 0.9, 0.97)
@@ -186,7 +188,9 @@ def _finish(posed: list[Posed], half_size: float, cloud: Cloud) -> tuple[Cloud, 
         The shape, the poses, the yaw period (0 for a body of revolution), and the score of every scene.
     """
     limits = (-np.inf, np.inf)
-    for _ in range(ROUNDS):
+    for round_index in range(ROUNDS):
+        if round_index == 2:
+            posed = _aligned_axis(posed, half_size, cloud, limits)
         votes = shape.vote(_reliable(posed, cloud), half_size, shape.around(cloud, half_size))
         reliable = _reliable(posed, cloud)
         cloud, threshold = _best_cloud(reliable, votes, limits, cloud)
@@ -197,6 +201,38 @@ def _finish(posed: list[Posed], half_size: float, cloud: Cloud) -> tuple[Cloud, 
     cloud, posed, period = _symmetrise(posed, half_size, cloud, limits)
     fits = [_refit(scene, cloud, period) for scene in posed]
     return cloud, _moved(posed, fits), period, np.array([one.score for one in fits])
+
+
+def _aligned_axis(posed: list[Posed], half_size: float, cloud: Cloud, limits: tuple[float, float]) -> list[Posed]:
+    """All poses moved by the one world displacement that makes the hull explain the masks best.
+
+    Where the object hardly turns between scenes, places that are all off by the same few millimetres yield
+    nearly as good a hull, and refitting corrects them too slowly; so the displacement is searched for.
+    """
+    _, halfwidth = _yaw_range(np.array([se3.yaw_of(scene.T_world_obj) for scene in posed]), 2 * np.pi)
+    if halfwidth > NARROW_YAW:
+        return posed
+    worth_asking = shape.around(cloud, half_size)
+
+    def shifted(scenes: Sequence[Posed], x: float, y: float) -> list[Posed]:
+        T_world_moved = se3.from_yaw([x, y, 0.0], 0.0)
+        return [replace(scene, T_world_obj=T_world_moved @ scene.T_world_obj) for scene in scenes]
+
+    def value(x: float, y: float) -> float:
+        moved = shifted(judges, x, y)
+        hull, _ = _best_cloud(moved, shape.vote(moved, half_size, worth_asking), limits, cloud)
+        return float(np.mean([score(measure(s.evidence, hull, s.T_world_obj, FINE_PX)) for s in moved]))
+
+    reliable = _reliable(posed, cloud)
+    judges = reliable[:: max(1, len(reliable) // AXIS_JUDGES)]
+    place, best = (0.0, 0.0), value(0.0, 0.0)
+    for step in (0.012, 0.006, 0.003):
+        for dx, dy in ((step, 0), (-step, 0), (0, step), (0, -step)):
+            tried = (place[0] + dx, place[1] + dy)
+            if (worth := value(*tried)) > best:
+                place, best = tried, worth
+    log.debug("perception: places moved by %.1f and %.1f mm", 1e3 * place[0], 1e3 * place[1])
+    return shifted(posed, *place)
 
 
 def _symmetrise(
@@ -249,8 +285,8 @@ def _best_cloud(
 def _trimmed(posed: Sequence[Posed], votes: Votes, threshold: float) -> tuple[float, float]:
     """Limits in z between which the hull explains the masks as well as the whole hull.
 
-    Cameras that all look down leave a hull with a cone below the object and a roof above, which no view can tell
-    from it. They are cut off as far as that costs nothing: there is the support plane.
+    Cameras that all look down leave a hull with a cone below the object and a roof above, which no view
+    can tell from it. They are cut off as far as that costs nothing: there is the support plane.
     """
     full = votes.cloud(threshold)
     if full is None:
