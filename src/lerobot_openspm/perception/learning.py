@@ -203,7 +203,9 @@ def _finish(posed: list[Posed], half_size: float, cloud: Cloud) -> tuple[Cloud, 
     return cloud, _moved(posed, fits), period, np.array([one.score for one in fits])
 
 
-def _aligned_axis(posed: list[Posed], half_size: float, cloud: Cloud, limits: tuple[float, float]) -> list[Posed]:
+def _aligned_axis(
+    posed: list[Posed], half_size: float, cloud: Cloud, limits: tuple[float, float]
+) -> list[Posed]:
     """All poses moved by the one world displacement that makes the hull explain the masks best.
 
     Where the object hardly turns between scenes, places that are all off by the same few millimetres yield
