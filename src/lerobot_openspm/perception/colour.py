@@ -44,7 +44,7 @@ def smooth(counts: Array) -> Array:
 def foreground(bins: Bins, log_odds: NDArray[np.float32]) -> NDArray[np.float32]:
     """Soft foreground probability ``(H, W)``: the colour evidence, averaged lightly over neighbours."""
     table = 1.0 / (1.0 + np.exp(-log_odds))
-    return cv2.GaussianBlur(table[bins].astype(np.float32), (3, 3), 0.6)
+    return np.asarray(cv2.GaussianBlur(table[bins].astype(np.float32), (3, 3), 0.6), np.float32)
 
 
 def evidence(inside: list[Array], outside: Array, min_presence: float) -> NDArray[np.float32]:
@@ -80,5 +80,5 @@ def _neighbourhood(counts: Array) -> Array:
     for axis in range(3):
         padded = np.pad(cube, [(1, 1) if i == axis else (0, 0) for i in range(3)])
         n = cube.shape[axis]
-        cube = sum(np.take(padded, range(k, k + n), axis=axis) for k in range(3))
+        cube = np.sum([np.take(padded, range(k, k + n), axis=axis) for k in range(3)], axis=0)
     return cube.ravel()

@@ -150,4 +150,4 @@ def score(overlaps: Array) -> float:
 def _covariance(information: Array, prior: Array) -> Array:
     """Covariance ``(4, 4)``, the yaw's bounded by that of an unknown yaw."""
     floor = np.array([0.25, 0.25, 0.25, 1 / UNKNOWN_YAW_STD**2])
-    return np.linalg.inv(information + np.diag(prior + floor))
+    return np.asarray(np.linalg.inv(information + np.diag(prior + floor)), float)

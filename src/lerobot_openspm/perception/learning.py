@@ -47,6 +47,8 @@ THRESHOLDS = (0.5, 0.6, 0.7, 0.8, 0.9, 0.97)
 MAX_RAY_GAP = 0.05
 # A more symmetric shape is preferred if it explains the masks as well as this.
 SYMMETRY_LOSS = 0.006
+# A yaw read into a round body does more harm than a body with corners taken for round, which costs far more.
+REVOLUTION_LOSS = 0.02
 BODY_OF_REVOLUTION = 24
 # What may be lost for a shape without the cones above and below that no camera sees.
 TRIM_LOSS = 0.0007
@@ -264,7 +266,7 @@ def _symmetrise(
         log.debug(
             "perception: symmetry of order %d explains %.3f of the masks, none %.3f", order, worth, free
         )
-        if worth > free - SYMMETRY_LOSS:
+        if worth > free - (REVOLUTION_LOSS if period == 0 else SYMMETRY_LOSS):
             return turned, moved, period
     return cloud, posed, 2 * np.pi
 

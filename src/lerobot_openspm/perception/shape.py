@@ -49,7 +49,7 @@ class Votes:
     def axis(self) -> Array:
         """Coordinates ``(n,)`` of the voxels' centres along each axis, metres."""
         n = self.share.shape[0]
-        return (np.arange(n) - (n - 1) / 2) * self.spacing
+        return np.asarray((np.arange(n) - (n - 1) / 2) * self.spacing, float)
 
     def turned(self, order: int) -> Votes:
         """Votes averaged over ``order`` equal turns about the z axis."""
@@ -61,7 +61,7 @@ class Votes:
             for start in range(0, n, 4):
                 part = np.ascontiguousarray(self.share[:, :, start : start + 4])
                 total[:, :, start : start + 4] += cv2.warpAffine(part, turn, (n, n)).reshape(part.shape)
-        return Votes(total / order, self.spacing)
+        return Votes((total / order).astype(np.float32), self.spacing)
 
 
 def surface(solid: NDArray[np.bool_], spacing: float) -> Cloud | None:

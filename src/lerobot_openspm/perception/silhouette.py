@@ -68,8 +68,10 @@ def observed_distance(probability: Float32, limit_px: float) -> Float32:
     The soft mask is enlarged before its edge is found: antialiased pixels tell where within them it runs.
     """
     height, width = probability.shape
-    large = cv2.resize(probability, (2 * width, 2 * height), interpolation=cv2.INTER_LINEAR)
-    return np.clip(signed_distance((large > 0.5).astype(np.uint8)) / 2, -limit_px, limit_px)
+    large = np.asarray(cv2.resize(probability, (2 * width, 2 * height), interpolation=cv2.INTER_LINEAR))
+    return np.clip(signed_distance((large > 0.5).astype(np.uint8)) / 2, -limit_px, limit_px).astype(
+        np.float32
+    )
 
 
 def draw(
@@ -100,7 +102,7 @@ def draw(
         mask, cv2.MORPH_CLOSE, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (kernel, kernel))
     )
     # The points are centres of voxels: the surface is half a voxel further out.
-    distance = signed_distance(mask) / scale + spacing_px / 2
+    distance = signed_distance(np.asarray(mask, np.uint8)) / scale + spacing_px / 2
     return Drawing(uv, distance.astype(np.float32), corner, scale)
 
 
@@ -155,7 +157,7 @@ def normal_equations(
     uv = drawing.uv[rim]
     residual = bilinear(observed, 2 * uv + 0.5) - own[rim]
     blurred = cv2.GaussianBlur(drawing.distance, (5, 5), 0)
-    gx, gy = cv2.Sobel(blurred, cv2.CV_32F, 1, 0), cv2.Sobel(blurred, cv2.CV_32F, 0, 1)
+    gx, gy = (np.asarray(cv2.Sobel(blurred, cv2.CV_32F, i, 1 - i), np.float32) for i in (1, 0))
     normal = np.stack([drawing.sample(gx, uv), drawing.sample(gy, uv)], axis=1).astype(float)
     normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-6)
     # Points that share a pixel share one vote: otherwise walls seen edge-on would outweigh everything.
