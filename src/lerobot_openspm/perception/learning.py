@@ -48,7 +48,7 @@ MAX_RAY_GAP = 0.05
 # A more symmetric shape is preferred if it explains the masks as well as this.
 SYMMETRY_LOSS = 0.006
 # A yaw read into a round body does more harm than a body with corners taken for round, which costs far more.
-REVOLUTION_LOSS = 0.02
+REVOLUTION_LOSS = 0.035
 BODY_OF_REVOLUTION = 24
 # What may be lost for a shape without the cones above and below that no camera sees.
 TRIM_LOSS = 0.0007
