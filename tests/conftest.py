@@ -1,9 +1,14 @@
-"""Fixtures for every test."""
+"""Fixtures for every test. The recorded and the trained ones are made once per run, whatever the number of workers."""
 
-from collections.abc import Iterator
+import os
+import shutil
+from collections.abc import Callable, Iterator
+from pathlib import Path
 
 import pytest
+from filelock import FileLock
 from tests.hub.loopback_hub import LoopbackHub
+from tests.policy.lerobot_commands import lerobot_train, pretrained, training_options
 
 
 @pytest.fixture
@@ -11,3 +16,52 @@ def loopback_hub() -> Iterator[LoopbackHub]:
     """An empty Hub on 127.0.0.1; what talks to it runs in a subprocess with `loopback_hub.env(tmp_path)`."""
     with LoopbackHub().running() as hub:
         yield hub
+
+
+@pytest.fixture(scope="session")
+def make_once(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., Path]:
+    """Make a folder once for all workers of a run; the others wait for it. Nobody may change what lies in it."""
+    base = tmp_path_factory.getbasetemp()
+    base = base.parent if "PYTEST_XDIST_WORKER" in os.environ else base
+
+    def make(name: str, maker: Callable[[Path], object]) -> Path:
+        folder, done = base / name, base / f"{name}.done"
+        with FileLock(base / f"{name}.lock"):
+            if not done.exists():
+                shutil.rmtree(folder, ignore_errors=True)
+                maker(folder)
+                done.touch()
+        return folder
+
+    return make
+
+
+def record(root: Path, task: str, episodes: int) -> None:
+    """Record demonstrations in small images."""
+    from lerobot_openspm.cli.collect import CollectConfig, collect
+
+    collect(CollectConfig(task=task, episodes=episodes, root=str(root), height=128, width=128, workers=0))
+
+
+@pytest.fixture(scope="session")
+def tiny_dataset(make_once: Callable[..., Path]) -> Path:
+    """Three demonstrations each of bowl_on_plate (episodes 0 to 2) and turn_on_stove (3 to 5), 128 px."""
+    return make_once("tiny_dataset", lambda root: record(root, "bowl_on_plate,turn_on_stove", 3))
+
+
+@pytest.fixture(scope="session")
+def other_dataset(make_once: Callable[..., Path]) -> Path:
+    """Two demonstrations of push_plate, whose object the tiny dataset shows too."""
+    return make_once("other_dataset", lambda root: record(root, "push_plate", 2))
+
+
+@pytest.fixture(scope="session")
+def training_run(make_once: Callable[..., Path], tiny_dataset: Path) -> Path:
+    """Output folder of lerobot-train on the tiny dataset. Copy it to go on training."""
+    return make_once("training_run", lambda output: lerobot_train(*training_options(tiny_dataset, output)))
+
+
+@pytest.fixture(scope="session")
+def checkpoint(training_run: Path) -> Path:
+    """A trained policy's checkpoint folder. Copy it to change it."""
+    return pretrained(training_run)
