@@ -10,7 +10,7 @@ import json
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, cast
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -97,7 +97,7 @@ def ray_directions(camera: Camera, T_world_cam: ArrayLike, uv: ArrayLike) -> Arr
 
 
 def intersect_plane(camera: Camera, T_world_cam: ArrayLike, uv: ArrayLike, height: ArrayLike) -> Array:
-    """Where the rays through pixels ``(..., 2)`` meet the horizontal plane ``z = height``: ``(..., 3)`` metres."""
+    """Points ``(..., 3)`` where rays through pixels ``(..., 2)`` meet the horizontal plane ``z = height``."""
     rays = ray_directions(camera, T_world_cam, uv)
     origin = np.asarray(T_world_cam, float)[:3, 3]
     along = (np.asarray(height, float) - origin[2]) / rays[..., 2]
@@ -119,7 +119,8 @@ def cameras_from_dict(data: Mapping[str, Any], where: str) -> dict[str, Camera]:
     if not isinstance(cameras, Mapping) or not cameras:
         raise CalibrationError(f"{where}: 'cameras' must be an object with at least one camera")
     return {
-        str(key): _camera_from_dict(fields, f"{where}: cameras[{key!r}]") for key, fields in cameras.items()
+        key: _camera_from_dict(fields, f"{where}: cameras[{key!r}]")
+        for key, fields in cast(Mapping[str, Mapping[str, Any]], cameras).items()
     }
 
 
@@ -128,11 +129,11 @@ def _camera_from_dict(fields: Mapping[str, Any], where: str) -> Camera:
         width, height = int(fields["width"]), int(fields["height"])
         fx, fy, cx, cy = (float(fields[name]) for name in ("fx", "fy", "cx", "cy"))
         mount, T_mount_cam = str(fields["mount"]), np.asarray(fields["T_mount_cam"], float)
-    except (KeyError, TypeError, ValueError) as error:
+    except (KeyError, TypeError, ValueError, OverflowError) as error:
         raise CalibrationError(f"{where}: missing or malformed field: {error}") from error
     if mount not in ("world", "ee"):
         raise CalibrationError(f"{where}: 'mount' is {mount!r}, expected 'world' or 'ee'")
-    if not se3.is_rigid(T_mount_cam):
+    if T_mount_cam.shape != (4, 4) or not se3.is_rigid(T_mount_cam):
         raise CalibrationError(f"{where}: 'T_mount_cam' is not a rigid (4, 4) transform")
     if not (np.isfinite([fx, fy, cx, cy]).all() and min(fx, fy, width, height) > 0):
         raise CalibrationError(f"{where}: sizes and focal lengths must be positive and finite")
@@ -169,4 +170,4 @@ def load_cameras(path: Path) -> dict[str, Camera]:
         raise CalibrationError(f"{path}: not JSON: {error}") from error
     if not isinstance(data, dict):
         raise CalibrationError(f"{path}: expected a JSON object, got {type(data).__name__}")
-    return cameras_from_dict(data, str(path))
+    return cameras_from_dict(cast(dict[str, Any], data), str(path))

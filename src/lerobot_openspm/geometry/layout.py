@@ -10,6 +10,8 @@ configuration. Aliases that robots use for the same thing are folded into one vo
 
 from __future__ import annotations
 
+# SciPy has no stubs.
+# pyright: reportMissingTypeStubs=false
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -33,10 +35,10 @@ _ROTATIONS: dict[RotationKind, tuple[str, ...]] = {
     "euler": ("roll", "pitch", "yaw"),
 }
 _ALIASES = {
-    **{f"{prefix}{axis}": axis for prefix in ("pos_", "p", "d", "ee_", "eef_", "ee_pos_", "eef_pos_") for axis in _POSITION},
-    **{f"{prefix}{axis}": f"axis_angle_{axis}" for prefix in ("r", "dr", "rot_", "rotvec_", "axisangle_") for axis in _POSITION},
-    **{f"q{axis}": f"quat_{axis}" for axis in "xyzw"},
-}  # fmt: skip
+    **{f"{p}{a}": a for p in ("pos_", "p", "d", "ee_", "eef_", "ee_pos_", "eef_pos_") for a in _POSITION},
+    **{f"{p}{a}": f"axis_angle_{a}" for p in ("r", "dr", "rot_", "rotvec_", "axisangle_") for a in _POSITION},
+    **{f"q{a}": f"quat_{a}" for a in "xyzw"},
+}
 
 
 @dataclass(frozen=True)
@@ -59,10 +61,11 @@ class VectorLayout:
 
     @property
     def size(self) -> int:
+        """How many numbers a vector has."""
         return len(self.names)
 
     def poses(self, vectors: ArrayLike) -> Array:
-        """Poses ``(..., 4, 4)`` of state vectors ``(..., size)``; the identity rotation when there is none."""
+        """Poses ``(..., 4, 4)`` of state vectors ``(..., size)``; not rotated where they hold no rotation."""
         vectors = self._checked(vectors)
         return se3.transform(self._matrices(vectors), vectors[..., list(self.position)])
 
@@ -72,7 +75,7 @@ class VectorLayout:
         return np.abs(vectors[..., list(self.gripper)]).sum(axis=-1)
 
     def decode_actions(self, vectors: ArrayLike) -> Array:
-        """Canonical actions ``(..., 7)``: position increment, rotation vector, gripper, in the vector's units."""
+        """Canonical actions ``(..., 7)``: position increment, rotation vector, gripper; units as they are."""
         vectors = self._checked(vectors)
         turn = se3.log_so3(self._matrices(vectors)) if self.rotation_kind != "axis_angle" else None
         rotvec = vectors[..., list(self.rotation)] if turn is None else turn
@@ -80,7 +83,7 @@ class VectorLayout:
         return np.concatenate([vectors[..., list(self.position)], rotvec, gripper], axis=-1)
 
     def encode_actions(self, actions: ArrayLike) -> Array:
-        """Inverse of :meth:`decode_actions`: vectors ``(..., size)``; what has no place in them is dropped."""
+        """Vectors ``(..., size)`` of canonical actions ``(..., 7)``; what has no place in them is dropped."""
         actions = np.asarray(actions, float)
         vectors = np.zeros((*actions.shape[:-1], self.size))
         vectors[..., list(self.position)] = actions[..., :3]
@@ -137,7 +140,9 @@ def parse_layout(
     hint = f"set --policy.{what}_layout to one name per dimension, e.g. [x, y, z, axis_angle_x, ..., gripper]"
     if missing := [axis for axis in _POSITION if axis not in folded]:
         raise LayoutError(f"{what} names {list(names)} lack {missing}; {hint}")
-    found = [kind for kind, parts in _ROTATIONS.items() if all(part in folded for part in parts)]
+    found: list[RotationKind] = [
+        kind for kind, parts in _ROTATIONS.items() if all(part in folded for part in parts)
+    ]
     if len(found) > 1:
         raise LayoutError(f"{what} names {list(names)} hold several rotations: {found}; {hint}")
     partial = any(part in folded for parts in _ROTATIONS.values() for part in parts)

@@ -7,6 +7,8 @@ are rotation vectors (axis times angle, radians).
 
 from __future__ import annotations
 
+# SciPy has no stubs, and T and R are the project's names for transforms and rotations, not constants.
+# pyright: reportMissingTypeStubs=false, reportConstantRedefinition=false
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
@@ -75,7 +77,7 @@ def wrap_angle(angle: ArrayLike, period: float = 2 * np.pi) -> Array:
 
 
 def yaw_equivalents(T_world_obj: Array, period: float) -> list[Array]:
-    """Poses ``(4, 4)`` in which an object looks as in the given one, if turning it by `period` changes nothing.
+    """Poses ``(4, 4)`` in which an object looks as in the given one, if a turn by `period` changes nothing.
 
     A body of revolution (period 0) has no yaw to choose: the given pose stands for all.
     """
@@ -126,6 +128,8 @@ def is_rigid(T: ArrayLike, tolerance: float = 1e-4) -> bool:
     if T.shape[-2:] != (4, 4) or not np.isfinite(T).all():
         return False
     R = T[..., :3, :3]
+    if np.abs(R).max(initial=0.0) > 1 + tolerance:  # products of huge numbers would overflow
+        return False
     orthonormal = np.abs(R @ np.swapaxes(R, -1, -2) - np.eye(3)).max(initial=0.0) < tolerance
     right_handed = bool((np.linalg.det(R) > 0).all())
     bottom = np.abs(T[..., 3, :] - np.array([0, 0, 0, 1.0])).max(initial=0.0) < tolerance
