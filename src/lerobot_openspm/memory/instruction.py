@@ -27,26 +27,33 @@ _RELATIONS = {
 # Parts that are named without the object they belong to.
 _PART_OF = {"drawer": "cabinet", "burner": "stove", "knob": "stove"}
 _ARTICLES = r"^(?:the|a|an|some|it|this|that)\b\s*"
-_SPLIT = re.compile(r"\s*(?:,\s*(?:and\s+)?(?:then\s+)?|\band then\b|\bthen\b|\band\b)\s*")
+# A mug may be "yellow and white": an "and" begins a clause only where a verb follows.
+_ANY_VERB = "|".join(sorted((v for verbs in _VERBS.values() for v in verbs), key=len, reverse=True))
+_AND = rf"\band\b(?=\s+(?:{_ANY_VERB}|turn|switch)\b)"
+_SPLIT = re.compile(rf"\s*(?:,\s*(?:and\s+)?(?:then\s+)?|\band then\b|\bthen\b|{_AND})\s*")
+# Where something is picked up, beside the prepositions above.
+_SOURCES = ("between", "from")
 
 
 def parse_instruction(instruction: str) -> tuple[SubTask, ...]:
     """Read what is to be done, in order.
 
     "open the top drawer and put the bowl inside" gives two sub-tasks, the second with the cabinet of the
-    first as its landmark. "pick up the bowl and put it on the plate" gives one.
+    first as its landmark. "pick up the bowl on the stove and put it on the plate" gives one: where a thing is
+    picked up is not where it goes.
 
     Raises:
         InstructionError: No verb of the grammar begins the instruction, or the verb has no object.
     """
     clauses = [clause for clause in _SPLIT.split(_normalise(instruction)) if clause]
     sub_tasks: list[SubTask] = []
+    picked_up = False
     for clause in clauses:
         sub_task = _parse_clause(clause, sub_tasks[-1] if sub_tasks else None, instruction)
-        picked_up = sub_tasks and sub_tasks[-1].operation == "put" and not sub_tasks[-1].landmark
-        if picked_up and sub_task.target == sub_tasks[-1].target:
+        if picked_up and (sub_task.operation, sub_task.target) == ("put", sub_tasks[-1].target):
             sub_tasks.pop()
         sub_tasks.append(sub_task)
+        picked_up = clause.startswith("pick")
     if not sub_tasks:
         raise InstructionError(
             f"got the instruction {instruction!r}, expected one like 'put the bowl on the plate'"
@@ -56,13 +63,18 @@ def parse_instruction(instruction: str) -> tuple[SubTask, ...]:
 
 def _parse_clause(clause: str, before: SubTask | None, instruction: str) -> SubTask:
     operation, rest = _split_verb(clause, instruction)
-    rest = re.sub(r"^up\b\s*", "", rest)
+    rest = re.sub(r"^up\b\s*|\s*\bup$", "", rest)
     relation, landmark_words = "", ""
-    if operation in ("put", "push"):
+    if clause.startswith("pick"):
+        rest = re.split(rf"\s*\b(?:{'|'.join([*_SOURCES, *_RELATIONS])})\b", rest)[0]
+    elif operation in ("put", "push"):
         rest, relation, landmark_words = _split_relation(rest)
     target, part = _object_and_part(rest)
-    if not target and before is not None:  # "put it on the plate", "... and put the bowl inside"
-        target, part = before.target, before.part
+    if (
+        not target and before is not None
+    ):  # "put it on the plate"; but "close it" is said of what things are in
+        inside = operation in ("open", "close") and before.relation == "in"
+        target, part = (before.landmark if inside else before.target), before.part
     if not target:
         raise InstructionError(f"the instruction {instruction!r} names no object after {clause!r}")
     landmark, landmark_part = _object_and_part(landmark_words)
