@@ -1,0 +1,293 @@
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+from tests.memory.builders import OPEN_WIDTH, entry, hand_pose, key_pose, robot
+
+from lerobot_openspm.control.executor import ControlSettings, Executor, Hand, Status
+from lerobot_openspm.control.transfer import transfer
+from lerobot_openspm.geometry import se3
+
+HOME = hand_pose(0.0, 0.0, 0.3)
+ROBOT = robot()
+GAINS = np.array([ROBOT.metres_per_action] * 3 + [ROBOT.radians_per_action] * 3)
+CHUNK = 5
+
+
+def toward(query, share=0.4):
+    """A stand-in for the flow model: part of the way to the target each step, as far as actions of 1 go."""
+    T, chunk = query.T_world_ee, []
+    for _ in range(CHUNK):
+        step = np.clip(share * se3.increment(T, query.T_world_target) / GAINS, -1, 1)
+        T = se3.apply_increment(T, step * GAINS)
+        chunk.append(np.append(step, ROBOT.command(bool(query.closed))))
+    return np.array(chunk)
+
+
+class World:
+    """A hand that does what it is told, and fingers that stop at what they hold."""
+
+    def __init__(self, T=HOME, held=0.03, gain=1.0, stuck=None):
+        self.T, self.opening, self.held, self.gain, self.stuck = T, OPEN_WIDTH, held, gain, stuck
+        self.step_count = 0
+
+    @property
+    def hand(self):
+        return Hand(self.T, self.opening)
+
+    def step(self, action):
+        moved = se3.apply_increment(self.T, action[:6] * GAINS * self.gain)
+        if self.stuck is None or not self.stuck(moved):
+            self.T = moved
+        self.opening = self.held if action[6] > 0 else OPEN_WIDTH
+        self.step_count += 1
+
+
+def make(settings=None, key_poses=None, hand=HOME):
+    memory = entry(key_poses=key_poses)
+    executor = Executor(settings or ControlSettings(), ROBOT)
+    executor.begin(transfer(memory, memory.layout, {}, hand), Hand(hand, OPEN_WIDTH))
+    return executor
+
+
+def run(executor, world, n_steps=600, until=lambda _: False, flow=toward):
+    """Act until done; returns, by key pose, the hand at the moment it was left, and the retries asked for."""
+    left, retries, steps_at = {}, 0, {}
+    for _ in range(n_steps):
+        index = executor.index
+        again = executor.advance(world.hand)
+        for passed in range(index, executor.index):
+            left[passed] = world.T
+        if again:
+            retries += 1
+            executor.begin(executor.plan, world.hand, executor.retry_index())
+        if executor.status is not Status.RUNNING or until(executor):
+            if executor.status is Status.DONE:
+                left[executor.index] = world.T
+            break
+        action = executor.next_action()
+        if action is None:
+            executor.push_chunk(flow(executor.query(world.hand)))
+            action = executor.next_action()
+        steps_at[executor.index] = steps_at.get(executor.index, 0) + 1
+        world.step(action)
+    return left, retries, steps_at
+
+
+def test_the_closed_loop_meets_every_key_pose_as_exactly_as_it_must():
+    executor, world = make(), World()
+    left, retries, _ = run(executor, world)
+    assert executor.status is Status.DONE
+    assert retries == 0
+    assert sorted(left) == list(range(8))
+    settings = ControlSettings()
+    for i, target in enumerate(executor.plan):
+        metres, radians = se3.distances(left[i], target.T_world_ee)
+        if target.memory.dwell:
+            continue
+        limits = (
+            (settings.residual_m, settings.residual_rad)
+            if target.precise
+            else (settings.passing_m, settings.passing_rad)
+        )
+        assert metres <= limits[0]
+        assert radians <= limits[1]
+
+
+def test_waiting_for_the_fingers_takes_the_demonstrated_steps():
+    executor, world = make(), World()
+    _, _, steps_at = run(executor, world)
+    for i, target in enumerate(executor.plan):
+        if target.memory.dwell:
+            assert steps_at[i] == target.memory.n_steps
+
+
+def test_via_points_are_passed_without_stopping_short():
+    loose, world = make(ControlSettings(passing_m=0.05, passing_rad=1.0)), World()
+    loose_left, _, _ = run(loose, world)
+    metres, _ = se3.distances(loose_left[0], loose.plan[0].T_world_ee)
+    assert ControlSettings().passing_m < metres <= 0.05
+
+
+@pytest.mark.parametrize("sign", [-1, 1])
+def test_a_key_pose_is_met_in_angle_too(sign):
+    T = hand_pose(0, 0, 0.3, sign * 0.5)
+    executor = make(key_poses=[key_pose("bowl", np.eye(4), "place")])
+    executor.begin([replace(executor.plan[0], T_world_ee=T)], Hand(HOME, OPEN_WIDTH))
+    executor.advance(Hand(HOME, OPEN_WIDTH))
+    assert executor.status is Status.RUNNING
+    executor.advance(Hand(hand_pose(0, 0, 0.3, sign * (0.5 - 0.059)), OPEN_WIDTH))
+    assert executor.status is Status.DONE
+
+
+def test_time_runs_out_in_the_closed_loop():
+    executor = make(ControlSettings(execution="closed_loop"))
+    world = World(stuck=lambda T: True)
+    _, retries, steps_at = run(executor, world)
+    assert executor.status is Status.DONE
+    assert retries == 0
+    length = float(se3.distance(HOME, executor.plan[0].T_world_ee))
+    assert steps_at[0] == max(10, int(np.ceil(length / ROBOT.metres_per_step)))
+
+
+def test_residual_correction_reaches_what_time_alone_does_not():
+    slow = 0.5
+    without = make(ControlSettings(execution="closed_loop"))
+    left_without, _, _ = run(without, World(gain=slow))
+    corrected = make()
+    left_with, retries, _ = run(corrected, World(gain=slow))
+    assert corrected.status is Status.DONE
+    assert retries == 0
+    error = lambda left, executor: float(se3.distances(left[1], executor.plan[1].T_world_ee)[0])  # noqa: E731
+    assert error(left_with, corrected) <= ControlSettings().residual_m < error(left_without, without)
+
+
+def blocked_at_the_bowl(executor):
+    height = executor.plan[1].T_world_ee[2, 3]
+    return lambda T: bool(T[2, 3] < height + 0.02)
+
+
+def test_what_cannot_be_met_is_corrected_then_tried_again_then_given_up():
+    settings = ControlSettings(max_corrections=3, max_attempts=2)
+    executor = make(settings)
+    world = World(stuck=blocked_at_the_bowl(executor))
+    _, retries, _ = run(executor, world, 2000)
+    assert executor.status is Status.NO_PROGRESS
+    assert retries == 2
+    assert executor.attempts == 3
+    assert executor.next_action()[:6].tolist() == [0.0] * 6
+
+
+def test_corrections_are_counted_once_time_is_up_and_forgotten_at_the_next_key_pose():
+    executor = make(ControlSettings(max_corrections=3))
+    world = World(stuck=blocked_at_the_bowl(executor))
+    run(executor, world, until=lambda e: e.index == 1)
+    assert executor.corrections == 0
+    run(executor, world, until=lambda e: e.corrections == 3)
+    assert executor.index == 1
+    assert executor.attempts == 0
+    # One more chunk makes it four, more than the three that are allowed.
+    run(executor, world, until=lambda e: e.attempts == 1)
+    assert executor.index == 0
+    assert executor.corrections == 0
+
+
+def test_a_via_point_that_is_blocked_is_left_behind():
+    executor = make()
+    high = executor.plan[0].T_world_ee[2, 3]
+    world = World(stuck=lambda T: bool(T[2, 3] < high + 0.03) and world.step_count < 200)
+    _, retries, _ = run(executor, world, until=lambda e: e.index == 1)
+    assert executor.index == 1
+    assert retries == 0
+    assert executor.status is Status.RUNNING
+
+
+def test_empty_fingers_after_the_grasp_ask_for_another_try():
+    executor, world = make(), World(held=0.001)
+    run(executor, world, until=lambda e: e.attempts == 1)
+    assert executor.status is Status.RUNNING
+    assert executor.index == 0  # back to the first approach of this grasp
+    world.held = 0.03
+    run(executor, world)
+    assert executor.status is Status.DONE
+    assert executor.attempts == 1
+
+
+@pytest.mark.parametrize(("share", "lost"), [(0.39, True), (0.41, False)])
+def test_fingers_hold_something_above_a_share_of_the_demonstrated_opening(share, lost):
+    executor = make()
+    executor.begin(executor.plan, Hand(HOME, OPEN_WIDTH), 4)  # carrying
+    grasped = executor.plan[2].memory.opening
+    assert executor.advance(Hand(HOME, share * grasped)) is lost
+
+
+def test_grip_is_not_judged_before_the_grasp_nor_in_a_push_nor_without_correction():
+    empty = Hand(HOME, 0.0)
+    executor = make()
+    for index in (0, 1, 2, 7):
+        executor.begin(executor.plan, empty, index)
+        assert executor.advance(empty) is False
+    plain = make(ControlSettings(execution="closed_loop"))
+    plain.begin(plain.plan, empty, 4)
+    assert plain.advance(empty) is False
+    fist = [
+        key_pose("plate", hand_pose(0, 0, 0.02), "approach", closed=True, opening=0.0),
+        key_pose("plate", hand_pose(0.2, 0, 0.02), "push", closed=True, opening=0.0),
+    ]
+    pushing = make(key_poses=fist)
+    pushing.begin(pushing.plan, empty, 1)
+    assert pushing.advance(empty) is False
+
+
+def test_a_retry_begins_at_the_first_approach_of_the_same_contact():
+    second = [key_pose("plate", hand_pose(0, 0, z), "approach") for z in (0.2, 0.1)]
+    second.append(key_pose("plate", hand_pose(0, 0, 0.1), "grasp", closed=True))
+    second.append(key_pose("plate", hand_pose(0, 0, 0.2), "place", closed=True))
+    executor = make(key_poses=[*entry().key_poses, *second])
+    found = []
+    for index in range(12):
+        executor.begin(executor.plan, Hand(HOME, OPEN_WIDTH), index)
+        found.append(executor.retry_index())
+    assert found == [0] * 8 + [8] * 4
+
+
+def test_the_open_loop_never_looks_at_the_hand():
+    settings = ControlSettings(execution="open_loop")
+    seen = []
+    for world in (World(), World(stuck=lambda T: True), World(gain=0.3, held=0.0)):
+        executor, queries = make(settings), []
+
+        def flow(query, queries=queries):
+            queries.append(query)
+            return toward(query)
+
+        run(executor, world, flow=flow)
+        assert executor.status is Status.DONE
+        seen.append(np.stack([query.T_world_ee for query in queries]))
+    assert_allclose(seen[1], seen[0])
+    assert_allclose(seen[2], seen[0])
+    assert_allclose(seen[0][0], HOME)
+
+
+def test_closed_loop_queries_start_from_the_hand():
+    executor = make()
+    elsewhere = Hand(hand_pose(0.1, 0.1, 0.2, 0.4), OPEN_WIDTH / 2)
+    query = executor.query(elsewhere)
+    assert_allclose(query.T_world_ee, elsewhere.T_world_ee)
+    assert_allclose(query.T_world_target, executor.plan[0].T_world_ee)
+    assert query.opening == pytest.approx(0.5)
+    assert query.closed == 0
+    assert executor.replans == 1
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
+def test_non_finite_actions_never_reach_the_robot(value):
+    executor = make()
+    chunk = np.zeros((CHUNK, 7))
+    chunk[3, 2] = value
+    with pytest.raises(FloatingPointError, match="non-finite"):
+        executor.push_chunk(chunk)
+    assert executor.next_action() is None
+
+
+def test_actions_left_over_are_dropped_at_the_next_key_pose():
+    executor = make()
+    executor.push_chunk(np.ones((CHUNK, 7)))
+    executor.next_action()
+    executor.advance(Hand(executor.plan[0].T_world_ee, OPEN_WIDTH))
+    assert executor.index == 1
+    assert executor.next_action() is None
+
+
+def test_holding_still_keeps_the_fingers_as_they_are():
+    executor = Executor(ControlSettings(), ROBOT)
+    assert executor.hold().tolist() == [0] * 6 + [ROBOT.open_command]
+    assert executor.next_action().tolist() == [0] * 6 + [ROBOT.open_command]
+    carrying = make()
+    carrying.begin(carrying.plan, Hand(HOME, 0.03), 4)
+    assert carrying.hold().tolist() == [0] * 6 + [ROBOT.close_command]
+    done = make(key_poses=[key_pose("bowl", HOME, "lift", closed=True)])
+    done.advance(Hand(done.plan[0].T_world_ee, 0.03))
+    assert done.status is Status.DONE
+    assert done.next_action().tolist() == [0] * 6 + [ROBOT.close_command]

@@ -1,0 +1,122 @@
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+from tests.memory.builders import OPEN_WIDTH, entry, hand_pose, robot
+
+from lerobot_openspm.control.executor import ControlSettings, Hand, Status
+from lerobot_openspm.control.row import LOOK_AGAIN_STEPS, Knowledge, Row
+from lerobot_openspm.control.transfer import TransferLimits
+from lerobot_openspm.errors import InstructionError
+from lerobot_openspm.memory.retrieval import ScoreWeights
+
+HAND = Hand(hand_pose(0.0, 0.0, 0.3), OPEN_WIDTH)
+STATE = np.arange(8.0)
+INSTRUCTION = "put the bowl on the plate"
+
+
+def knowledge(*entries, limits=None):
+    return Knowledge(
+        entries or (entry(),), {}, robot(), ScoreWeights(), limits or TransferLimits(), ControlSettings()
+    )
+
+
+class Eyes:
+    """Finds the objects it is shown, and remembers what it was asked for."""
+
+    def __init__(self, layout):
+        self.layout, self.asked = dict(layout), []
+
+    def __call__(self, names):
+        self.asked.append(list(names))
+        return {name: self.layout[name] for name in names if name in self.layout}
+
+
+def row(*entries, instruction=INSTRUCTION, seed=0, state=STATE, limits=None):
+    return Row(knowledge(*entries, limits=limits), instruction, state, seed)
+
+
+def test_the_first_observation_makes_a_plan():
+    eyes, one = Eyes(entry().layout), row()
+    assert one.status is Status.WAITING
+    one.observe(HAND, eyes)
+    assert one.status is Status.RUNNING
+    assert eyes.asked == [["bowl", "plate"]]
+    bowl = entry().layout["bowl"]
+    assert_allclose(one.executor.plan[0].T_world_ee, bowl @ entry().key_poses[0].T_obj_ee)
+    one.observe(HAND, eyes)
+    assert len(eyes.asked) == 1
+    assert one.next_action() is None  # a chunk is wanted
+
+
+def test_an_object_that_is_not_found_is_looked_for_again_and_then_found():
+    layout = entry().layout
+    eyes, one = Eyes({"bowl": layout["bowl"]}), row()
+    for _ in range(LOOK_AGAIN_STEPS):
+        one.observe(HAND, eyes)
+        assert one.status is Status.OBJECT_NOT_FOUND
+        assert one.next_action().tolist() == [0.0] * 6 + [-1.0]
+    assert len(eyes.asked) == 1
+    eyes.layout = {"plate": layout["plate"]}  # what was seen once is remembered
+    one.observe(HAND, eyes)
+    assert len(eyes.asked) == 2
+    assert one.status is Status.RUNNING
+
+
+def test_key_poses_out_of_reach_are_infeasible():
+    far = {name: T + np.array([[0, 0, 0, 3.0], *[[0] * 4] * 3]) for name, T in entry().layout.items()}
+    one = row()
+    one.observe(HAND, Eyes(far))
+    assert one.status is Status.INFEASIBLE
+    assert one.next_action().tolist() == [0.0] * 6 + [-1.0]
+
+
+def test_a_feasible_entry_is_preferred_to_a_better_one_that_is_not():
+    too_low = [
+        type(pose)(
+            **{**vars(pose), "T_obj_ee": pose.T_obj_ee - np.array([*[[0] * 4] * 2, [0, 0, 0, 0.5], [0] * 4])}
+        )
+        for pose in entry().key_poses
+    ]
+    bad, good = entry(key_poses=too_low, quality=1.0, source="bad"), entry(quality=0.1, source="good")
+    one = row(bad, good)
+    one.observe(HAND, Eyes(entry().layout))
+    assert one.status is Status.RUNNING
+    assert [scored.entry.source for scored in one.ranked] == ["good", "bad"]
+
+
+def test_a_missed_grasp_looks_again_and_goes_to_where_the_object_is_now():
+    eyes, one = Eyes(entry().layout), row()
+    one.observe(HAND, eyes)
+    one.executor.begin(one.executor.plan, HAND, 3)
+    moved = entry().layout["bowl"].copy()
+    moved[0, 3] += 0.05
+    eyes.layout["bowl"] = moved
+    one.observe(Hand(HAND.T_world_ee, 0.0), eyes)
+    assert len(eyes.asked) == 2
+    assert one.executor.index == 0
+    assert_allclose(one.executor.plan[0].T_world_ee, moved @ entry().key_poses[0].T_obj_ee)
+
+
+def test_an_unknown_instruction_raises():
+    with pytest.raises(InstructionError, match="put the bowl on the plate"):
+        row(instruction="put the box on the plate").observe(HAND, Eyes({}))
+
+
+def test_noise_is_a_function_of_seed_episode_and_chunk_alone():
+    shape, eyes = (5, 7), Eyes(entry().layout)
+    others = [row(state=STATE + i) for i in range(1, 4)]  # made before: no shared generator moves on
+    first, again = row(), row()
+    noise = first.noise(shape)
+    for other in others:
+        assert not np.allclose(other.noise(shape), noise)
+    assert_allclose(again.noise(shape), noise, rtol=0)
+    assert not np.allclose(row(seed=1).noise(shape), noise)
+    assert not np.allclose(row(instruction="place the bowl on the plate").noise(shape), noise)
+    first.observe(HAND, eyes)
+    again.observe(HAND, eyes)
+    first.query(HAND)
+    again.query(HAND)
+    assert not np.allclose(first.noise(shape), noise)
+    assert_allclose(first.noise(shape), again.noise(shape), rtol=0)
+    assert abs(float(row().noise((100, 100)).mean())) < 0.05
+    assert float(row().noise((100, 100)).std()) == pytest.approx(1, abs=0.05)

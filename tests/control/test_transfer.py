@@ -1,0 +1,141 @@
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from numpy.testing import assert_allclose
+from tests.geometry.strategies import transforms
+from tests.memory.builders import entry, hand_pose, key_pose, robot
+
+from lerobot_openspm.control.transfer import TransferLimits, check_transfer, transfer, transfer_pose
+from lerobot_openspm.geometry import se3
+from lerobot_openspm.memory.entry import WORLD
+
+HOME = hand_pose(0.0, 0.0, 0.3)
+
+
+@given(transforms(), transforms(), transforms())
+def test_the_papers_theorem_holds_for_any_rigid_motion(G, T_world_obj, T_world_ee):
+    T_obj_ee = se3.inverse(T_world_obj) @ T_world_ee
+    moved_obj = G @ T_world_obj
+    moved_ee = transfer_pose(moved_obj, T_obj_ee)
+    assert_allclose(se3.inverse(moved_obj) @ moved_ee, se3.inverse(T_world_obj) @ T_world_ee, atol=1e-9)
+    assert_allclose(moved_ee, G @ T_world_ee, atol=1e-9)
+
+
+def test_transfer_by_hand():
+    # The object stands at (1, 0, 0), turned by 90 degrees: its x is the world's y.
+    T = transfer_pose(se3.from_yaw([1.0, 0, 0], np.pi / 2), se3.from_yaw([0.2, 0.1, 0.3], 0.0))
+    assert_allclose(T[:3, 3], [0.9, 0.2, 0.3], atol=1e-12)
+    assert_allclose(se3.yaw_of(T), np.pi / 2)
+
+
+def test_transfer_is_batched():
+    T = se3.from_yaw(np.zeros((4, 3)), np.arange(4.0))
+    assert_allclose(transfer_pose(T, T[1])[2], T[2] @ T[1])
+
+
+@given(st.floats(-1, 1), st.floats(-1, 1), st.floats(-3, 3))
+def test_moving_all_objects_moves_all_targets_alike(x, y, yaw):
+    G = se3.from_yaw([x, y, 0.0], yaw)
+    memory = entry()
+    before = transfer(memory, memory.layout, {}, HOME)
+    after = transfer(memory, {name: G @ T for name, T in memory.layout.items()}, {}, HOME)
+    assert len(after) == len(memory.key_poses)
+    for old, new in zip(before, after, strict=True):
+        assert_allclose(new.T_world_ee, G @ old.T_world_ee, atol=1e-9)
+
+
+def test_moving_one_object_moves_its_own_targets_alone():
+    memory, G = entry(), se3.from_yaw([0.1, -0.2, 0.0], 0.7)
+    layout = memory.layout | {"plate": G @ memory.layout["plate"]}
+    before, after = transfer(memory, memory.layout, {}, HOME), transfer(memory, layout, {}, HOME)
+    for old, new in zip(before, after, strict=True):
+        moved = G if new.memory.anchor.place == "plate" else np.eye(4)
+        assert_allclose(new.T_world_ee, moved @ old.T_world_ee, atol=1e-9)
+
+
+def test_an_anchor_with_the_worlds_axes_follows_the_place_and_not_the_turn():
+    pose = key_pose("rack", hand_pose(0.1, 0.0, 0.2), "place", axes=WORLD)
+    layout = {"rack": se3.from_yaw([0.3, 0.4, 0.0], 1.2)}
+    (target,) = transfer(entry(key_poses=[pose], layout=layout), layout, {}, HOME)
+    assert_allclose(target.T_world_ee, hand_pose(0.4, 0.4, 0.2), atol=1e-12)
+
+
+def test_an_anchor_with_anothers_axes_follows_the_place_of_one_and_the_turn_of_the_other():
+    pose = key_pose("plate", hand_pose(0.1, 0.0, 0.2), "place", axes="bowl")
+    layout = {"plate": se3.from_yaw([0.3, 0.4, 0.0], 1.2), "bowl": se3.from_yaw([9.0, 9.0, 0.0], np.pi / 2)}
+    (target,) = transfer(entry(key_poses=[pose], layout=layout), layout, {}, HOME)
+    assert_allclose(target.T_world_ee, hand_pose(0.3, 0.5, 0.2, np.pi / 2), atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("hand_yaw", "turned"), [(0.0, 0.2), (0.4, 0.2), (np.pi, 0.2 - np.pi), (-2.5, 0.2 - np.pi)]
+)
+def test_a_symmetric_object_is_met_from_the_side_that_turns_the_hand_least(hand_yaw, turned):
+    pose = key_pose("box", hand_pose(0.05, 0.0, 0.1), "grasp", closed=True)
+    layout = {"box": se3.from_yaw([0.2, 0.1, 0.0], 0.2)}
+    memory = entry(key_poses=[pose], layout=layout)
+    (target,) = transfer(memory, layout, {"box": np.pi}, hand_pose(0, 0, 0.3, hand_yaw))
+    expected = se3.from_yaw([0.2, 0.1, 0.0], turned) @ pose.T_obj_ee
+    assert_allclose(target.T_world_ee, expected, atol=1e-9)
+    (fixed,) = transfer(memory, layout, {"box": 2 * np.pi}, hand_pose(0, 0, 0.3, hand_yaw))
+    assert_allclose(fixed.T_world_ee, layout["box"] @ pose.T_obj_ee, atol=1e-12)
+
+
+def test_one_choice_of_side_holds_for_all_key_poses_of_an_object():
+    memory = entry()
+    targets = transfer(memory, memory.layout, {"bowl": np.pi}, hand_pose(0, 0, 0.3, np.pi + 0.3))
+    at_bowl = [t for t in targets if t.memory.anchor.place == "bowl"]
+    turned = memory.layout["bowl"] @ se3.from_yaw(np.zeros(3), np.pi)
+    for target in at_bowl:
+        assert_allclose(target.T_world_ee, turned @ target.memory.T_obj_ee, atol=1e-9)
+
+
+def test_contacts_and_the_arrivals_before_them_are_precise():
+    targets = transfer(entry(), entry().layout, {}, HOME)
+    assert [(t.memory.phase, t.precise) for t in targets] == [
+        ("approach", False), ("approach", True), ("grasp", True), ("lift", False), ("pre-place", False),
+        ("place", True), ("release", True), ("retreat", False),
+    ]  # fmt: skip
+
+
+def problems(*poses, hand=HOME, limits=None):
+    layout = {"bowl": np.eye(4)}
+    key_poses = [key_pose("bowl", T, phase) for phase, T in poses]
+    targets = transfer(entry(key_poses=key_poses, layout=layout), layout, {}, hand)
+    return check_transfer(targets, hand, robot(), limits or TransferLimits())
+
+
+def test_key_poses_within_bounds_pass():
+    assert problems(("approach", hand_pose(0, 0, 0.2)), ("grasp", hand_pose(0, 0, 0.0))) == []
+    assert problems(("approach", hand_pose(0.55, 0.0, 0.2))) == []  # within the margin
+    assert problems(("grasp", hand_pose(0, 0, -0.009))) == []
+
+
+@pytest.mark.parametrize(
+    ("T", "word"),
+    [
+        (hand_pose(0.62, 0, 0.2), "0.120 m outside the demonstrated workspace"),
+        (hand_pose(0, -0.62, 0.2), "0.120 m outside the demonstrated workspace"),
+        (hand_pose(0, 0, 0.62), "0.120 m outside the demonstrated workspace"),
+        (hand_pose(0, 0, -0.02), "0.020 m below the lowest demonstrated hand position"),
+        (hand_pose(0, 0, 0.2, 3.0), "0.10 m and 3.00 rad from the one before"),
+    ],
+)
+def test_each_check_names_the_key_pose_and_what_is_wrong(T, word):
+    (problem,) = problems(("approach", hand_pose(0, 0, 0.3)), ("grasp", T))
+    assert problem.startswith("key pose 1 (grasp at bowl)")
+    assert word in problem
+
+
+def test_a_jump_is_measured_from_the_key_pose_before_and_first_from_the_hand():
+    limits = TransferLimits(max_jump_m=0.25)
+    far = problems(("approach", hand_pose(0, 0, 0.2)), ("grasp", hand_pose(0.3, 0, 0.2)), limits=limits)
+    assert far == ["key pose 1 (grasp at bowl) is 0.30 m and 0.00 rad from the one before"]
+    first = problems(("approach", hand_pose(0.3, 0, 0.3)), ("grasp", hand_pose(0.3, 0, 0.2)), limits=limits)
+    assert first == ["key pose 0 (approach at bowl) is 0.30 m and 0.00 rad from the one before"]
+
+
+def test_every_problem_is_listed():
+    found = problems(("approach", hand_pose(0.9, 0, 0.2)), ("grasp", hand_pose(-0.1, 0, -0.1)))
+    assert len(found) == 4  # outside, jump; below, jump
