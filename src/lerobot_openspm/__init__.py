@@ -1,0 +1,1 @@
+"""OpenSPM: manipulation from a readable memory of key poses."""

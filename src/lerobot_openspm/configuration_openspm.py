@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any, get_args
+from typing import Any, Literal, get_args
 
 from lerobot.configs import NormalizationMode, PreTrainedConfig
 from lerobot.optim import AdamWConfig, CosineDecayWithWarmupSchedulerConfig
@@ -16,8 +16,8 @@ from lerobot_openspm.flow.condition import Conditioning
 from lerobot_openspm.geometry.layout import ROTATION_KINDS, VectorLayout, parse_layout
 from lerobot_openspm.memory.retrieval import ScoreWeights
 
-PERCEPTIONS = ("demonstrations", "oracle")
-MEMORY_UPDATES = ("keep", "append", "rebuild")
+PerceptionSource = Literal["demonstrations", "oracle"]
+MemoryUpdate = Literal["keep", "append", "rebuild"]
 
 
 @PreTrainedConfig.register_subclass("openspm")
@@ -83,9 +83,9 @@ class OpenSPMConfig(PreTrainedConfig):
     action_rotation: str | None = None
 
     # Memory and perception.
-    perception: str = "demonstrations"
+    perception: PerceptionSource = "demonstrations"
     memory_episodes: list[int] | None = None
-    memory_update: str = "keep"
+    memory_update: MemoryUpdate = "keep"
     weight_semantic: float = 1.0
     weight_geometric: float = 0.5
     weight_quality: float = 0.5
@@ -93,7 +93,7 @@ class OpenSPMConfig(PreTrainedConfig):
     # Flow model.
     chunk_size: int = 5
     n_action_steps: int = 5
-    conditioning: str = "equivariant"
+    conditioning: Conditioning = "equivariant"
     hidden_dim: int = 268
     num_inference_steps: int = 8
     samples_per_frame: int = 128
@@ -102,7 +102,7 @@ class OpenSPMConfig(PreTrainedConfig):
     noise_seed: int = 0
 
     # Control.
-    execution: str = "closed_loop_trc"
+    execution: Execution = "closed_loop_trc"
     residual_m: float = 0.004
     residual_rad: float = 0.06
     passing_m: float = 0.015
@@ -122,8 +122,8 @@ class OpenSPMConfig(PreTrainedConfig):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        _require_choice("perception", self.perception, PERCEPTIONS)
-        _require_choice("memory_update", self.memory_update, MEMORY_UPDATES)
+        _require_choice("perception", self.perception, get_args(PerceptionSource))
+        _require_choice("memory_update", self.memory_update, get_args(MemoryUpdate))
         _require_choice("conditioning", self.conditioning, get_args(Conditioning))
         _require_choice("execution", self.execution, get_args(Execution))
         for name in ("state_rotation", "action_rotation"):
@@ -134,8 +134,8 @@ class OpenSPMConfig(PreTrainedConfig):
                 f"n_action_steps is {self.n_action_steps}, expected 1 to chunk_size ({self.chunk_size})"
             )
         positive = (
-            "hidden_dim", "num_inference_steps", "samples_per_frame", "residual_m", "residual_rad", "passing_m",
-            "passing_rad", "max_jump_m", "max_jump_rad", "optimizer_lr", "scheduler_decay_steps",
+            "hidden_dim", "num_inference_steps", "samples_per_frame", "residual_m", "residual_rad",
+            "passing_m", "passing_rad", "max_jump_m", "max_jump_rad", "optimizer_lr", "scheduler_decay_steps",
         )  # fmt: skip
         for name in positive:
             if getattr(self, name) <= 0:
@@ -161,14 +161,17 @@ class OpenSPMConfig(PreTrainedConfig):
 
     @property
     def control_settings(self) -> ControlSettings:
+        """The options that say how key poses are followed."""
         return ControlSettings(**{name: getattr(self, name) for name in ControlSettings.__dataclass_fields__})
 
     @property
     def transfer_limits(self) -> TransferLimits:
+        """The bounds of the checks on transferred key poses."""
         return TransferLimits(**{name: getattr(self, name) for name in TransferLimits.__dataclass_fields__})
 
     @property
     def score_weights(self) -> ScoreWeights:
+        """The weights of retrieval."""
         return ScoreWeights(self.weight_semantic, self.weight_geometric, self.weight_quality)
 
     def validate_features(self) -> None:
@@ -189,9 +192,11 @@ class OpenSPMConfig(PreTrainedConfig):
                 )
 
     def get_optimizer_preset(self) -> AdamWConfig:
+        """AdamW over the flow model, as LeRobot's training uses it unless told otherwise."""
         return AdamWConfig(lr=self.optimizer_lr, weight_decay=self.optimizer_weight_decay, grad_clip_norm=1.0)
 
     def get_scheduler_preset(self) -> CosineDecayWithWarmupSchedulerConfig:
+        """Cosine decay; LeRobot scales it to the number of training steps."""
         return CosineDecayWithWarmupSchedulerConfig(
             peak_lr=self.optimizer_lr,
             decay_lr=self.optimizer_lr / 50,
@@ -201,15 +206,17 @@ class OpenSPMConfig(PreTrainedConfig):
 
     @property
     def observation_delta_indices(self) -> None:
+        """One observation at a time."""
         return None
 
     @property
     def action_delta_indices(self) -> None:
-        # Chunks come from the mined segments, which end at key poses; the loader's would run across them.
+        """None: chunks come from the mined segments, which end at key poses; the loader's run across them."""
         return None
 
     @property
     def reward_delta_indices(self) -> None:
+        """No rewards are used."""
         return None
 
 

@@ -1,4 +1,4 @@
-"""Everything a policy has learned besides its weights: entries, objects, robot, cameras. Saved and loaded whole.
+"""Everything a policy has learned besides its weights: entries, objects, robot, cameras.
 
 Three files lie beside a checkpoint's weights: ``memory.json`` (what a person reads), ``memory.safetensors``
 (the arrays it refers to, by checksum) and ``cameras.json`` (the calibration).
@@ -110,14 +110,17 @@ def load_experience(directory: Path) -> Experience:
     version = memory.get("version")
     if not isinstance(version, int) or version > VERSION or version < 1:
         raise MemoryFormatError(
-            f"{where}: got version {version!r}, this release reads up to {VERSION}; upgrade lerobot_policy_openspm"
+            f"{where}: got version {version!r}, this release reads up to {VERSION}; "
+            "upgrade lerobot_policy_openspm"
         )
     try:
         checksum, rows, objects = memory["arrays"]["sha256"], memory["entries"], memory["objects"]
         robot, perception = robot_from_dict(memory["robot"], where), str(memory["perception"])
         simulator_objects = tuple(str(name) for name in memory["simulator_objects"])
     except (KeyError, TypeError) as error:
-        raise MemoryFormatError(f"{where}: field {error} is missing or malformed; train or pull it again") from error
+        raise MemoryFormatError(
+            f"{where}: field {error} is missing or malformed; train or pull it again"
+        ) from error
     if not isinstance(rows, list) or not isinstance(objects, list):
         raise MemoryFormatError(f"{where}: 'entries' and 'objects' must be lists")
     arrays = _read_arrays(directory / MEMORY_ARRAYS, checksum)
@@ -166,7 +169,9 @@ def _read(path: Path, limit: int) -> bytes:
             "lerobot-train --policy.type=openspm, or pull the whole checkpoint"
         )
     if path.stat().st_size > limit:
-        raise MemoryFormatError(f"{path}: {path.stat().st_size} bytes, more than the {limit} this release reads")
+        raise MemoryFormatError(
+            f"{path}: {path.stat().st_size} bytes, more than the {limit} this release reads"
+        )
     return path.read_bytes()
 
 

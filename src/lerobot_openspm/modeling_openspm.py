@@ -22,10 +22,11 @@ from lerobot_openspm.errors import DatasetError, MemoryFormatError
 from lerobot_openspm.experience import FILES, Experience, load_experience, save_experience
 from lerobot_openspm.flow.condition import CONDITION_DIM, Query, encode, to_world_frame
 from lerobot_openspm.flow.network import VelocityField
+from lerobot_openspm.flow.training_set import TrainingSet
 from lerobot_openspm.geometry.camera import load_cameras
 from lerobot_openspm.observation import Observation, split_batch
 from lerobot_openspm.perceive import find_objects
-from lerobot_openspm.training import TrainingSet, mine_experience, training_set
+from lerobot_openspm.training import mine_experience, training_set
 
 logger = logging.getLogger(__name__)
 
@@ -43,13 +44,12 @@ class OpenSPMPolicy(PreTrainedPolicy):
         dataset_meta: Any | None = None,
         **kwargs: Any,
     ):
-        """
-        Args:
-            config: The configuration.
-            dataset_stats: Not used: poses are not normalised.
-            dataset_meta: Metadata of the dataset to mine and to learn from; None for a policy that is about
-                to be loaded.
-            kwargs: What else LeRobot passes to every policy.
+        """Args:
+        config: The configuration.
+        dataset_stats: Not used: poses are not normalised.
+        dataset_meta: Metadata of the dataset to mine and to learn from; None for a policy that is about
+            to be loaded.
+        kwargs: What else LeRobot passes to every policy.
         """
         super().__init__(config)
         config.validate_features()
@@ -80,7 +80,9 @@ class OpenSPMPolicy(PreTrainedPolicy):
             row.observe(observation.hand, lambda names, seen=observation: self._find(names, seen))
             action = row.next_action()
             if action is None:
-                row.executor.push_chunk(self._chunk(row, row.query(observation.hand))[: self.config.n_action_steps])
+                row.executor.push_chunk(
+                    self._chunk(row, row.query(observation.hand))[: self.config.n_action_steps]
+                )
                 action = row.next_action()
             actions.append(action)
         vectors = action_layout.encode_actions(np.stack(actions))
@@ -158,6 +160,7 @@ class OpenSPMPolicy(PreTrainedPolicy):
         return loss, {"flow_loss": float(losses.mean().detach())}
 
     def get_optim_params(self) -> Any:
+        """The flow model's parameters."""
         return self.parameters()
 
     # Persistence: the memory travels with the weights.
@@ -195,12 +198,12 @@ class OpenSPMPolicy(PreTrainedPolicy):
             files = [CONFIG_NAME, SAFETENSORS_SINGLE_FILE, *FILES]
             try:
                 snapshot = snapshot_download(
-                    str(pretrained_name_or_path), allow_patterns=files, force_download=force_download, token=token,
-                    cache_dir=cache_dir, local_files_only=local_files_only, revision=revision,
+                    str(pretrained_name_or_path), allow_patterns=files, force_download=force_download,
+                    token=token, cache_dir=cache_dir, local_files_only=local_files_only, revision=revision,
                 )  # fmt: skip
             except HFValidationError as error:
                 raise FileNotFoundError(
-                    f"no checkpoint folder at {pretrained_name_or_path}, and it is no name on the Hub (user/name)"
+                    f"no checkpoint folder at {pretrained_name_or_path}, and no name on the Hub (user/name)"
                 ) from error
             directory = Path(snapshot)
         policy = super().from_pretrained(directory, config=config, strict=strict, **kwargs)
@@ -217,7 +220,9 @@ class OpenSPMPolicy(PreTrainedPolicy):
             if self.config.memory_update != "keep":
                 known = self.experience if self.config.memory_update == "append" else None
                 self.experience = mine_experience(dataset_meta, self.config, known)
-            logger.info("memory_update=%s: %d entries", self.config.memory_update, len(self.experience.entries))
+            logger.info(
+                "memory_update=%s: %d entries", self.config.memory_update, len(self.experience.entries)
+            )
             self._training_set = training_set(dataset_meta, self.config)
         if self.experience.perception != self.config.perception:
             raise MemoryFormatError(

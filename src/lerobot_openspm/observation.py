@@ -89,7 +89,9 @@ def split_batch(batch: Mapping[str, Any], state_layout: VectorLayout) -> list[Ob
         raise ObservationError(f"the observation has no 'task', the instruction; it has {sorted(batch)}")
     tasks = [tasks] * len(states) if isinstance(tasks, str) else list(tasks)
     T_world_ee, openings = state_layout.poses(states), state_layout.openings(states)
-    images = {k: v for k, v in batch.items() if k.startswith("observation.image") and isinstance(v, torch.Tensor)}
+    images = {
+        k: v for k, v in batch.items() if k.startswith("observation.image") and isinstance(v, torch.Tensor)
+    }
     poses = batch[OBJECT_POSES].detach().cpu().numpy().astype(float) if OBJECT_POSES in batch else None
     return [
         Observation(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 
 from lerobot_openspm.experience import Experience
 from lerobot_openspm.geometry.se3 import Array

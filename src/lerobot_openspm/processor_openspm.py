@@ -13,7 +13,8 @@ from lerobot_openspm.configuration_openspm import OpenSPMConfig
 def make_openspm_pre_post_processors(
     config: OpenSPMConfig, dataset_stats: dict[str, dict[str, torch.Tensor]] | None = None
 ) -> tuple[
-    PolicyProcessorPipeline[dict[str, Any], dict[str, Any]], PolicyProcessorPipeline[PolicyAction, PolicyAction]
+    PolicyProcessorPipeline[dict[str, Any], dict[str, Any]],
+    PolicyProcessorPipeline[PolicyAction, PolicyAction],
 ]:
     """Create the pipelines: rename, batch, device, normalise; and unnormalise, to CPU.
 

@@ -7,17 +7,22 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 from lerobot.datasets import LeRobotDataset
-from torch import Tensor
 
 from lerobot_openspm.configuration_openspm import OpenSPMConfig
 from lerobot_openspm.errors import CalibrationError, DatasetError
 from lerobot_openspm.experience import Experience
-from lerobot_openspm.flow.samples import action_scale, conditions_and_chunks, perturbed, segment_frames
+from lerobot_openspm.flow.samples import perturbed, segment_frames
+from lerobot_openspm.flow.training_set import TrainingSet
 from lerobot_openspm.geometry.camera import load_cameras
 from lerobot_openspm.mining.dataset import Demonstrations
-from lerobot_openspm.mining.mine import build_entries, layouts_in_scenes, learn_scenes, mine_key_poses, oracle_layouts
+from lerobot_openspm.mining.mine import (
+    build_entries,
+    layouts_in_scenes,
+    learn_scenes,
+    mine_key_poses,
+    oracle_layouts,
+)
 
 logger = logging.getLogger(__name__)
 
@@ -67,8 +72,9 @@ def mine_experience(dataset_meta: Any, config: OpenSPMConfig, known: Experience 
     entries = build_entries(mined.mined, layouts, yaw_periods, demonstrations.name)
     if not entries:
         raise DatasetError(
-            f"dataset {demonstrations.name} has key poses in {len(mined.mined)} episodes, but the objects they "
-            "belong to were found in none; check --policy.cameras, or record with the hand out of view at the start"
+            f"dataset {demonstrations.name} has key poses in {len(mined.mined)} episodes, but the objects "
+            "they belong to were found in none; check --policy.cameras, or record with the hand out of view "
+            "at the start"
         )
     logger.info(
         "mined %d entries from %d episodes (%d skipped); objects: %s",
@@ -78,59 +84,21 @@ def mine_experience(dataset_meta: Any, config: OpenSPMConfig, known: Experience 
     return known.appended(experience) if known else experience
 
 
-class TrainingSet:
-    """Conditions and chunks of every frame of every segment, by dataset index."""
-
-    def __init__(self, index: np.ndarray, conditions: np.ndarray, chunks: np.ndarray, plain: int, remembered: np.ndarray):
-        self.action_scale = torch.as_tensor(action_scale(chunks[:plain]), dtype=torch.float32)
-        self._conditions = torch.as_tensor(conditions, dtype=torch.float32)
-        self._chunks = torch.as_tensor(chunks, dtype=torch.float32)
-        # Rows that training may draw from: those of episodes that may enter the memory.
-        self._drawable = torch.as_tensor(np.flatnonzero(remembered))
-        rows = torch.full((int(index.max()) + 1,), -1, dtype=torch.long)
-        rows[torch.as_tensor(index[:plain])] = torch.arange(plain)
-        self._row_of_index = rows
-
-    def draw(self, index: Tensor, draws: int, training: bool) -> tuple[Tensor, Tensor]:
-        """Samples for a batch of frames: `draws` for each, the first of them the frame itself.
-
-        A frame that belongs to no segment (a pause, or after the last key pose) is replaced by another one.
-
-        Args:
-            index: Dataset index ``(b,)``.
-            draws: Samples per frame.
-            training: Whether the other samples, and the replacements, may be drawn at random.
-
-        Returns:
-            Conditions ``(b * draws, condition_dim)`` and chunks ``(b * draws, H, 7)``, frame by frame.
-        """
-        index = index.cpu().flatten()
-        inside = index < len(self._row_of_index)
-        rows = torch.where(inside, self._row_of_index[index.clamp(max=len(self._row_of_index) - 1)], -1)
-        spare = torch.randint(len(self._drawable), (len(rows),)) if training else index % len(self._drawable)
-        rows = torch.where(rows < 0, self._drawable[spare], rows)
-        others = self._drawable[torch.randint(len(self._drawable), (len(rows), draws - 1))]
-        rows = torch.cat([rows[:, None], others], dim=1).flatten()
-        return self._conditions[rows], self._chunks[rows]
-
-
 def training_set(dataset_meta: Any, config: OpenSPMConfig) -> TrainingSet:
-    """Cut all episodes of a dataset into training samples. Reads no image."""
+    """Cut all episodes of a dataset into training samples. Reads no image.
+
+    Held-out episodes can be looked up, for a validation loss, but nothing is measured on them or drawn from
+    them.
+    """
     demonstrations = open_demonstrations(dataset_meta, config)
-    mined = mine_key_poses(demonstrations)
-    episodes = [item.episode for item in mined.mined]
-    frames = segment_frames(episodes, [item.key_poses for item in mined.mined], mined.robot, config.chunk_size)
+    robot = mine_key_poses(demonstrations, config.memory_episodes).robot
+    mined = mine_key_poses(demonstrations, robot=robot).mined
+    episodes = [item.episode for item in mined]
+    frames = segment_frames(episodes, [item.key_poses for item in mined], robot, config.chunk_size)
+    allowed = [e.index for e in episodes] if config.memory_episodes is None else config.memory_episodes
     rng = np.random.default_rng(0)
-    copies = [frames]
-    if config.perturbation_m > 0 or config.perturbation_rad > 0:
-        copies += [
-            perturbed(frames, mined.robot, config.perturbation_m, config.perturbation_rad, rng)
-            for _ in range(PERTURBED_COPIES)
-        ]
-    encoded = [conditions_and_chunks(copy, config.conditioning) for copy in copies]  # type: ignore[arg-type]
-    index = np.concatenate([copy.index for copy in copies])
-    episode = np.concatenate([copy.episode for copy in copies])
-    allowed = config.memory_episodes
-    remembered = np.isin(episode, allowed) if allowed is not None else np.ones(len(episode), bool)
-    conditions, chunks = (np.concatenate(parts) for parts in zip(*encoded, strict=True))
-    return TrainingSet(index, conditions, chunks, len(frames), remembered)
+    copies = [
+        perturbed(frames, robot, config.perturbation_m, config.perturbation_rad, rng)
+        for _ in range(PERTURBED_COPIES if config.perturbation_m > 0 or config.perturbation_rad > 0 else 0)
+    ]
+    return TrainingSet(frames, copies, np.asarray(allowed), config.conditioning)

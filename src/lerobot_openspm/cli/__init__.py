@@ -1,0 +1,1 @@
+"""The `openspm` commands: argument parsing and printing only."""

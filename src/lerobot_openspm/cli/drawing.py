@@ -26,7 +26,7 @@ FONT = cv2.FONT_HERSHEY_SIMPLEX
 
 
 def draw_key_poses(view: View, poses: Sequence[Array], phases: Sequence[str], scale: int = 2) -> Image:
-    """Draw hand poses ``T_world_ee`` ``(4, 4)`` into a view: the way, a dot and the fingers' axes for each."""
+    """Draw hand poses ``T_world_ee`` ``(4, 4)`` into a view: the way, and the hand's axes at each."""
     height, width = view.image.shape[:2]
     image = cv2.resize(view.image, (width * scale, height * scale), interpolation=cv2.INTER_CUBIC)
     tips = np.stack([T[:3, 3] for T in poses])

@@ -38,16 +38,22 @@ def main(args: list[str]) -> None:
     for entry in shown[: config.limit]:
         print("\n".join(_lines(entry)), end="\n\n")
     per_task = Counter(entry.language for entry in experience.entries)
-    print(json.dumps({"entries": len(experience.entries), "shown": len(shown[: config.limit]), "per_task": per_task}))
+    print(
+        json.dumps(
+            {"entries": len(experience.entries), "shown": len(shown[: config.limit]), "per_task": per_task}
+        )
+    )
 
 
 def _lines(entry: MemoryEntry) -> list[str]:
     head = f"{entry.language!r} from {entry.source}, version {entry.version}, quality {entry.quality:.2f}"
-    columns = f"  {'phase':10s} {'place':18s} {'axes':18s} {'hand in its frame, mm':>24s} {'turn, deg':>22s} gripper conf."
+    names = f"{'phase':10s} {'place':18s} {'axes':18s}"
+    columns = f"  {names} {'hand in its frame, mm':>24s} {'turn, deg':>22s} gripper conf."
     rows = []
     for pose in entry.key_poses:
         mm = " ".join(f"{1000 * x:7.1f}" for x in pose.T_obj_ee[:3, 3])
         deg = " ".join(f"{np.rad2deg(x):6.1f}" for x in se3.log_so3(pose.T_obj_ee[:3, :3]))
         gripper = "closed" if pose.closed else "open"
-        rows.append(f"  {pose.phase:10s} {pose.anchor.place:18s} {pose.anchor.axes:18s} {mm:>24s} {deg:>22s} {gripper:7s} {pose.confidence:.2f}")
+        names = f"{pose.phase:10s} {pose.anchor.place:18s} {pose.anchor.axes:18s}"
+        rows.append(f"  {names} {mm:>24s} {deg:>22s} {gripper:7s} {pose.confidence:.2f}")
     return [head, columns, *rows]

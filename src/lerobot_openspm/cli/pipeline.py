@@ -58,7 +58,9 @@ def train(dataset: Path, output: Path, options: Sequence[str] = ()) -> tuple[Pat
     return checkpoint, float(json.loads(done.read_text())["seconds"])
 
 
-def evaluate(checkpoint: Path, output: Path, episodes: int, seed: int, options: Sequence[str] = ()) -> list[Episode]:
+def evaluate(
+    checkpoint: Path, output: Path, episodes: int, seed: int, options: Sequence[str] = ()
+) -> list[Episode]:
     """Run lerobot-eval on all tasks, unless it is done. Returns its episodes."""
     done, log = output / DONE, output / "episodes.jsonl"
     if not done.exists():
@@ -97,4 +99,8 @@ def rate(successes: int, n: int) -> dict[str, Any]:
 
 def mean_steps(episodes: Sequence[Episode]) -> float:
     """Mean steps of the successful episodes; NaN if there is none."""
-    return float(np.mean([e.steps for e in episodes if e.success])) if any(e.success for e in episodes) else float("nan")
+    return (
+        float(np.mean([e.steps for e in episodes if e.success]))
+        if any(e.success for e in episodes)
+        else float("nan")
+    )

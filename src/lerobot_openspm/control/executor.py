@@ -15,6 +15,7 @@ from lerobot_openspm.control.transfer import Target
 from lerobot_openspm.flow.condition import Query, progress
 from lerobot_openspm.geometry import se3
 from lerobot_openspm.geometry.se3 import Array
+from lerobot_openspm.memory.entry import PHASES
 from lerobot_openspm.memory.robot import RobotModel
 
 logger = logging.getLogger(__name__)
@@ -44,8 +45,8 @@ class ControlSettings:
     """How key poses are followed.
 
     Attributes:
-        execution: ``open_loop`` plans every chunk from where the hand should be; ``closed_loop`` from where it
-            is; ``closed_loop_trc`` adds terminal residual correction.
+        execution: ``open_loop`` plans every chunk from where the hand should be; ``closed_loop`` from where
+            it is; ``closed_loop_trc`` adds terminal residual correction.
         residual_m: The paper's epsilon_r: a precise key pose is met within this distance ...
         residual_rad: ... and this angle.
         passing_m: A key pose that is only passed by is met within this distance ...
@@ -65,7 +66,7 @@ class ControlSettings:
 
 @dataclass(frozen=True)
 class Hand:
-    """What proprioception says: pose ``T_world_ee`` ``(4, 4)``, and opening in the units of the state."""
+    """What proprioception says: pose ``T_world_ee`` ``(4, 4)``, and opening in the state's units."""
 
     T_world_ee: Array
     opening: float
@@ -99,6 +100,7 @@ class Executor:
 
     @property
     def target(self) -> Target | None:
+        """The key pose that is being approached, or None."""
         return self.plan[self.index] if self.status is Status.RUNNING else None
 
     def advance(self, hand: Hand) -> bool:
@@ -157,7 +159,7 @@ class Executor:
             progress=progress(self._start, here, target.T_world_ee),
             closed=np.asarray(float(target.memory.closed)),
             opening=np.asarray(hand.opening / max(self._robot.open_width, 1e-9)),
-            dwell=np.asarray(float(target.memory.dwell)),
+            phase=np.asarray(PHASES.index(target.memory.phase)),
         )
 
     def push_chunk(self, actions: Array) -> None:

@@ -10,17 +10,22 @@ from dataclasses import dataclass
 import numpy as np
 
 from lerobot_openspm.control.executor import ControlSettings, Executor, Hand, Status
-from lerobot_openspm.control.transfer import Target, TransferLimits, check_transfer, transfer
+from lerobot_openspm.control.transfer import Target, TransferLimits, check_transfer, shape_deviation, transfer
 from lerobot_openspm.flow.condition import Query
 from lerobot_openspm.geometry.se3 import Array
 from lerobot_openspm.memory.entry import MemoryEntry
-from lerobot_openspm.memory.retrieval import ScoreWeights, Scored, retrieve, semantic_candidates
+from lerobot_openspm.memory.retrieval import Scored, ScoreWeights, retrieve, semantic_candidates
 from lerobot_openspm.memory.robot import RobotModel
 
 logger = logging.getLogger(__name__)
 
 # An object that is not found is looked for again after this many steps.
 LOOK_AGAIN_STEPS = 5
+
+# An entry whose key poses lie this much differently to one another here counts as 1/e alike.
+SHAPE_SCALE_M = 0.1
+# An entry that can be executed at all scores at least this.
+MIN_USABLE_SCORE = 1e-3
 
 # Names of objects -> poses T_world_obj of those that are found in the present images.
 Look = Callable[[Sequence[str]], Mapping[str, Array]]
@@ -60,6 +65,7 @@ class Row:
 
     @property
     def status(self) -> Status:
+        """What the execution is up to."""
         return self.executor.status
 
     def observe(self, hand: Hand, look: Look) -> None:
@@ -88,7 +94,7 @@ class Row:
         names = list(dict.fromkeys(name for entry, _ in candidates for name in entry.objects))
         self.layout |= look(names)
         self.ranked = retrieve(
-            candidates, self.layout, lambda entry: not self._problems(entry, hand), self._knowledge.weights
+            candidates, lambda entry: self._geometric_score(entry, hand), self._knowledge.weights
         )
         best = self.ranked[0].entry
         if missing := [name for name in best.objects if name not in self.layout]:
@@ -106,6 +112,13 @@ class Row:
         ahead = list(dict.fromkeys(name for pose in entry.key_poses[index:] for name in pose.anchor.objects))
         self.layout |= look(ahead)
         self.executor.begin(self._transfer(entry, hand), hand, index)
+
+    def _geometric_score(self, entry: MemoryEntry, hand: Hand) -> float:
+        """``S_geo``: 0 if the entry cannot be executed here, else more the more it is like its demonstration."""
+        if any(name not in self.layout for name in entry.objects) or self._problems(entry, hand):
+            return 0.0
+        deviation = shape_deviation(entry, self._transfer(entry, hand))
+        return max(float(np.exp(-deviation / SHAPE_SCALE_M)), MIN_USABLE_SCORE)
 
     def _transfer(self, entry: MemoryEntry, hand: Hand) -> tuple[Target, ...]:
         return transfer(entry, self.layout, self._knowledge.yaw_periods, hand.T_world_ee)

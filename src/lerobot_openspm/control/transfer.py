@@ -15,6 +15,11 @@ from lerobot_openspm.memory.robot import RobotModel
 # Phases in which the hand touches something: their key poses are met precisely, the others in passing.
 PRECISE_PHASES = ("grasp", "place", "release", "push", "open", "turn")
 
+# Phases in which an object follows the hand along a constraint.
+CONSTRAINED_PHASES = ("push", "open", "turn")
+# How much a different way through free space counts beside a different way in contact.
+FREE_SPACE_SHARE = 0.2
+
 
 @dataclass(frozen=True)
 class Target:
@@ -68,13 +73,33 @@ def transfer(
 
 
 def _nearest_equivalent(
-    name: str, pose: MemoryKeyPose, layout: Mapping[str, Array], yaw_periods: Mapping[str, float], before: Array
+    name: str,
+    pose: MemoryKeyPose,
+    layout: Mapping[str, Array],
+    yaw_periods: Mapping[str, float],
+    before: Array,
 ) -> Array:
     """The pose of a symmetric object, among those that look alike, from which the hand has to turn least."""
     choices = se3.yaw_equivalents(layout[name], yaw_periods.get(name, 2 * np.pi))
     after = [transfer_pose(pose.anchor.frame({**layout, name: T}), pose.T_obj_ee) for T in choices]
     turns = [float(se3.distances(before, T)[1]) for T in after]
     return choices[int(np.argmin(turns))]
+
+
+def shape_deviation(entry: MemoryEntry, targets: Sequence[Target]) -> float:
+    """How differently the hand has to move here from how the demonstration moved, in metres.
+
+    Compared are the ways between consecutive key poses, seen from the later one. Between key poses of one
+    anchor nothing differs. Where the hand pushes, pulls or turns something, a different way does different
+    things to the object, so those count in full; in free space it hardly matters.
+    """
+    shown = [pose.anchor.frame(entry.layout) @ pose.T_obj_ee for pose in entry.key_poses]
+    now = [target.T_world_ee for target in targets]
+    constrained, free = [0.0], [0.0]
+    for i, pose in enumerate(entry.key_poses[1:], start=1):
+        ways = [se3.inverse(poses[i]) @ poses[i - 1] for poses in (shown, now)]
+        (constrained if pose.phase in CONSTRAINED_PHASES else free).append(float(se3.distance(*ways)))
+    return max(constrained) + FREE_SPACE_SHARE * float(np.mean(free))
 
 
 @dataclass(frozen=True)

@@ -32,7 +32,7 @@ class TabletopEnvConfig(EnvConfig):
     observation_width: int = 256
     # True poses as observation.object_poses: for oracle ablations, never for a policy's reported figure.
     object_poses: bool = False
-    # File that every environment appends one JSON line per finished episode to: task, seed, steps, success, status.
+    # File to append one JSON line per finished episode to: task, seed, steps, success, status.
     episode_log: str | None = None
     features: dict[str, PolicyFeature] = field(
         default_factory=lambda: {ACTION: PolicyFeature(type=FeatureType.ACTION, shape=(ACTION_SIZE,))}

@@ -154,7 +154,7 @@ class TabletopSimulator:
     def finger_positions(self) -> np.ndarray:
         """(2,) metres: left is positive, right negative, as in LIBERO; (0.04, -0.04) is open.
 
-        The joints' stops are soft: fingers that press on nothing go a little beyond closed, which reads as closed.
+        The joints' stops are soft: fingers that press on nothing go a little beyond, which reads as closed.
         """
         left, right = (float(self.data.qpos[self._qpos[name]]) for name in ("finger_left", "finger_right"))
         return np.array([max(left, 0.0), min(right, 0.0)])

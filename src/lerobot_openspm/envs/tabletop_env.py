@@ -143,8 +143,14 @@ class TabletopEnv(gym.Env):
         return {"is_success": status == "success", "status": status, "unstable": status == "unstable"}
 
     def _append_to_log(self, status: str) -> None:
-        """One JSON object a line: lerobot-eval keeps success alone, not how long an episode took or how it ended."""
-        line = {"task": self.task, "seed": self._seed, "steps": self._steps, "success": status == "success", "status": status}
+        """One JSON object a line: lerobot-eval keeps success alone, not the steps nor how an episode ended."""
+        line = {
+            "task": self.task,
+            "seed": self._seed,
+            "steps": self._steps,
+            "success": status == "success",
+            "status": status,
+        }
         # A single write in append mode, so that the lines of several processes never mix.
         with open(self._episode_log, "ab", buffering=0) as log:  # type: ignore[arg-type]
             log.write((json.dumps(line) + "\n").encode())

@@ -11,10 +11,11 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from lerobot_openspm.geometry import se3
 from lerobot_openspm.geometry.se3 import Array
+from lerobot_openspm.memory.entry import PHASES
 
 Conditioning = Literal["paper", "equivariant"]
 CONDITIONINGS: tuple[Conditioning, ...] = ("paper", "equivariant")
@@ -24,7 +25,7 @@ CONDITIONINGS: tuple[Conditioning, ...] = ("paper", "equivariant")
 POSITION_SCALES_M = (0.2, 0.03, 0.006)
 ROTATION_SCALES_RAD = (1.0, 0.1)
 _RELATIVE = 3 * len(POSITION_SCALES_M) + 3 * len(ROTATION_SCALES_RAD)
-_COMMON = 4
+_COMMON = 3 + len(PHASES)
 CONDITION_DIM: dict[Conditioning, int] = {
     "paper": 18 + _RELATIVE + _COMMON,
     "equivariant": _RELATIVE + _COMMON,
@@ -33,7 +34,7 @@ CONDITION_DIM: dict[Conditioning, int] = {
 
 @dataclass(frozen=True)
 class Query:
-    """Where the hand is, where it goes, and how far along it is: ``c_t`` of the paper, batched over ``(...)``.
+    """Where the hand is, where it goes, how far along it is: ``c_t`` of the paper, batched over ``(...)``.
 
     Attributes:
         T_world_ee: Current hand pose ``(..., 4, 4)``.
@@ -41,7 +42,9 @@ class Query:
         progress: Share ``(...)`` of the segment that lies behind, the paper's tau, 0 to 1.
         closed: Whether the gripper is to be closed on the way, ``(...)`` of 0 and 1.
         opening: Gripper opening ``(...)`` as a share of the open gripper's.
-        dwell: Whether the hand waits for the fingers, ``(...)`` of 0 and 1.
+        phase: Index ``(...)`` into :data:`PHASES` of the phase that the target ends. The paper's condition
+            lacks it, but the same pair of poses is an arc through the air when something is carried and a
+            straight line along the table when it is pushed.
     """
 
     T_world_ee: Array
@@ -49,7 +52,7 @@ class Query:
     progress: Array
     closed: Array
     opening: Array
-    dwell: Array
+    phase: NDArray[np.int64]
 
 
 def progress(T_world_start: ArrayLike, T_world_ee: ArrayLike, T_world_target: ArrayLike) -> Array:
@@ -63,7 +66,8 @@ def progress(T_world_start: ArrayLike, T_world_ee: ArrayLike, T_world_target: Ar
 
 def encode(query: Query, conditioning: Conditioning) -> Array:
     """Condition vectors ``(..., CONDITION_DIM[conditioning])`` of queries."""
-    common = np.stack([query.progress, query.closed, query.opening, query.dwell], axis=-1).astype(float)
+    measures = np.stack([query.progress, query.closed, query.opening], axis=-1).astype(float)
+    common = np.concatenate([measures, np.eye(len(PHASES))[query.phase]], axis=-1)
     if conditioning == "equivariant":
         relative = se3.inverse(query.T_world_target) @ query.T_world_ee
         return np.concatenate([_relative_features(relative), common], axis=-1)

@@ -23,6 +23,8 @@ class VelocityField(nn.Module):
         width: Width of the hidden layers and of the latent condition.
     """
 
+    action_scale: Tensor
+
     def __init__(self, condition_dim: int, chunk_size: int, action_dim: int, width: int):
         super().__init__()
         self.chunk_size, self.action_dim = chunk_size, action_dim
@@ -32,13 +34,14 @@ class VelocityField(nn.Module):
         self.step_embedding = nn.Embedding(chunk_size, STEP_FEATURES)
         decoder_dim = width + chunk_size * action_dim + TIME_FEATURES + STEP_FEATURES
         self.decoder = nn.Sequential(
-            nn.Linear(decoder_dim, width), nn.SiLU(), nn.Linear(width, width), nn.SiLU(), nn.Linear(width, action_dim)
+            nn.Linear(decoder_dim, width), nn.SiLU(), nn.Linear(width, width), nn.SiLU(),
+            nn.Linear(width, action_dim),
         )  # fmt: skip
         # Actions are learned in units of their spread over the demonstrations.
         self.register_buffer("action_scale", torch.ones(action_dim))
 
     def forward(self, actions: Tensor, time: Tensor, latent: Tensor) -> Tensor:
-        """Velocity ``(b, H, action_dim)`` of noisy chunks ``(b, H, action_dim)`` at flow times ``(b,)`` in [0, 1].
+        """Velocity of noisy chunks, both ``(b, H, action_dim)``, at flow times ``(b,)`` in [0, 1].
 
         `latent` is ``encoder(condition)``, ``(b, width)``, computed once a chunk however many times the field
         is evaluated.
@@ -49,7 +52,7 @@ class VelocityField(nn.Module):
         return self.decoder(torch.cat([context[:, None].expand(b, h, -1), steps], dim=-1))
 
     def loss(self, condition: Tensor, actions: Tensor, noise: Tensor, time: Tensor) -> Tensor:
-        """``L_FM`` per sample, ``(b,)``: squared error of the velocity at ``a_xi = (1 - xi) a_0 + xi a_data``.
+        """``L_FM`` per sample ``(b,)``: squared error of the velocity at ``a_xi = (1 - xi) a_0 + xi a_data``.
 
         Args:
             condition: ``(b, condition_dim)``.
@@ -63,7 +66,7 @@ class VelocityField(nn.Module):
         return (velocity - (data - noise)).square().mean(dim=(1, 2))
 
     def sample(self, condition: Tensor, noise: Tensor, n_steps: int) -> Tensor:
-        """Integrate the field from noise to chunks ``(b, H, action_dim)`` in action units, with Euler steps."""
+        """Integrate the field from noise to chunks ``(b, H, action_dim)`` in action units, by Euler steps."""
         latent = self.encoder(condition)
         # LeRobot's integrator runs from t = 1 (noise) to t = 0 (data); the paper's xi is 1 - t.
         reversed_field: Callable[[Tensor, Tensor], Tensor] = lambda a, t: -self(a, 1 - t, latent)  # noqa: E731

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from lerobot_openspm.flow.condition import Conditioning, Query, encode, progress, to_model_frame
 from lerobot_openspm.geometry import se3
 from lerobot_openspm.geometry.se3 import Array
+from lerobot_openspm.memory.entry import DWELL_PHASES, PHASES
 from lerobot_openspm.memory.robot import RobotModel
 from lerobot_openspm.mining.key_poses import KeyPose
 from lerobot_openspm.mining.signals import Episode
@@ -89,7 +90,7 @@ def _one_segment(
         progress=progress(start, T_world_ee, target),
         closed=np.full(n, float(pose.closed)),
         opening=episode.opening[frames] / max(robot.open_width, 1e-9),
-        dwell=np.full(n, float(pose.dwell)),
+        phase=np.full(n, PHASES.index(pose.phase)),
     )
     index = episode.from_index + frames
     return SegmentFrames(index, np.full(n, episode.index), query, np.array(start), actions)
@@ -106,7 +107,8 @@ def perturbed(
     """
     query, n = frames.query, len(frames)
     away = se3.distance(query.T_world_ee, query.T_world_target)
-    size = (np.minimum(1.0, 0.25 + away / 0.1) * (1 - query.dwell))[:, None]
+    waiting = np.isin(query.phase, [PHASES.index(phase) for phase in DWELL_PHASES])
+    size = np.where(waiting, 0.0, np.minimum(1.0, 0.25 + away / 0.1))[:, None]
     shift = rng.normal(size=(n, 6)) * size * np.array([std_m] * 3 + [std_rad] * 3)
     moved = se3.apply_increment(query.T_world_ee, shift)
     gains = np.array([robot.metres_per_action] * 3 + [robot.radians_per_action] * 3)
@@ -115,7 +117,7 @@ def perturbed(
     actions[..., :6] += correction[:, None] / actions.shape[1]
     query = Query(
         moved, query.T_world_target, progress(frames.T_world_start, moved, query.T_world_target),
-        query.closed, query.opening, query.dwell,
+        query.closed, query.opening, query.phase,
     )  # fmt: skip
     return SegmentFrames(frames.index, frames.episode, query, frames.T_world_start, actions)
 

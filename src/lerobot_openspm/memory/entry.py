@@ -35,6 +35,7 @@ class SubTask:
 
     @property
     def objects(self) -> tuple[str, ...]:
+        """The objects that are named: target, then landmark."""
         return tuple(name for name in (self.target, self.landmark) if name)
 
 
@@ -45,6 +46,9 @@ class RetrievalKey:
     sub_tasks: tuple[SubTask, ...]
     phases: tuple[str, ...]
 
+
+# Phases in which the hand stands still and waits for the fingers.
+DWELL_PHASES = ("grasp", "release")
 
 WORLD = "world"
 
@@ -109,7 +113,7 @@ class MemoryEntry:
         key: What the entry is found by, ``k_i``.
         language: The instruction of the demonstration, ``l_i``.
         key_poses: In the order of execution.
-        quality: The paper's ``r_i``, 0 to 1: how closely the demonstration agrees with the others of its task.
+        quality: The paper's ``r_i``, 0 to 1: how closely the demonstration agrees with others of its task.
         version: The paper's ``nu_i``: counts up when an entry is replaced.
         source: Dataset and episode the entry was mined from.
         layout: Poses ``T_world_obj`` ``(4, 4)`` of the objects at the start of the demonstration.

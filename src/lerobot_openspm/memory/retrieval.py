@@ -2,20 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
-import numpy as np
-
 from lerobot_openspm.errors import InstructionError
-from lerobot_openspm.geometry.se3 import Array
 from lerobot_openspm.memory.entry import MemoryEntry, SubTask
 from lerobot_openspm.memory.instruction import parse_instruction
 
 # Below this semantic score an entry is about something else.
 MIN_SEMANTIC = 0.75
-# Layouts whose objects stand this much differently relative to one another count as 1/e alike.
-LAYOUT_SCALE_M = 0.15
 
 
 @dataclass(frozen=True)
@@ -86,41 +81,23 @@ def _names_agree(asked: str, known: str) -> float:
     return 0.8 if a and k and shared == min(len(set(a)), len(set(k))) else 0.0
 
 
-def layout_similarity(now: Mapping[str, Array], then: Mapping[str, Array]) -> float:
-    """How alike two layouts ``{name: T_world_obj}`` are in 0..1, by where the objects stand to one another."""
-    shared = sorted(set(now) & set(then))
-    if not shared:
-        return 0.0
-    p_now = np.stack([now[name][:3, 3] for name in shared])
-    p_then = np.stack([then[name][:3, 3] for name in shared])
-    if len(shared) > 1:
-        p_now, p_then = p_now - p_now.mean(axis=0), p_then - p_then.mean(axis=0)
-    return float(np.exp(-np.linalg.norm(p_now - p_then, axis=1).mean() / LAYOUT_SCALE_M))
-
-
 def retrieve(
     candidates: Sequence[tuple[MemoryEntry, float]],
-    layout: Mapping[str, Array],
-    feasible: Callable[[MemoryEntry], bool],
+    geometric: Callable[[MemoryEntry], float],
     weights: ScoreWeights,
 ) -> list[Scored]:
     """Rank entries by ``lambda_s S_sem + lambda_g S_geo + lambda_r r``, best first.
 
     Args:
         candidates: Entries with their semantic score.
-        layout: Poses ``T_world_obj`` of the objects found in the present scene.
-        feasible: Whether an entry's key poses, carried over to the scene, pass the transfer checks.
+        geometric: ``S_geo`` in 0..1 of an entry in the present scene; 0 if it cannot be executed there, because
+            an object was not found or its key poses, carried over, fail the checks.
         weights: The three lambdas.
-
-    Returns:
-        Ranked entries. ``S_geo`` is 0 for an entry with an object that was not found or with infeasible key
-        poses, so that such an entry comes first only when there is no other.
     """
     ranked = []
     for entry, semantic in candidates:
-        usable = all(name in layout for name in entry.objects) and feasible(entry)
-        geometric = 0.5 + 0.5 * layout_similarity(layout, entry.layout) if usable else 0.0
-        total = weights.semantic * semantic + weights.geometric * geometric + weights.quality * entry.quality
-        ranked.append(Scored(entry, semantic, geometric, entry.quality, total))
+        geometry = geometric(entry)
+        total = weights.semantic * semantic + weights.geometric * geometry + weights.quality * entry.quality
+        ranked.append(Scored(entry, semantic, geometry, entry.quality, total))
     # Usable entries first whatever the weights: an infeasible one cannot be executed.
     return sorted(ranked, key=lambda scored: (scored.geometric == 0.0, -scored.total))

@@ -19,10 +19,11 @@ KEY_POSE_ARRAY, LAYOUT_ARRAY = "entries.T_obj_ee", "entries.T_world_obj"
 
 def entries_to_parts(entries: Sequence[MemoryEntry]) -> tuple[list[dict[str, Any]], dict[str, Array]]:
     """Split entries into JSON rows and two arrays of transforms, in the order of the rows."""
-    rows = []
+    rows: list[dict[str, Any]] = []
     for entry in entries:
         key_poses = [
-            {name: value for name, value in asdict(pose).items() if name != "T_obj_ee"} for pose in entry.key_poses
+            {name: value for name, value in asdict(pose).items() if name != "T_obj_ee"}
+            for pose in entry.key_poses
         ]
         rows.append(
             {
@@ -37,8 +38,11 @@ def entries_to_parts(entries: Sequence[MemoryEntry]) -> tuple[list[dict[str, Any
         )
     poses = [pose.T_obj_ee for entry in entries for pose in entry.key_poses]
     layouts = [T for entry in entries for T in entry.layout.values()]
-    stack = lambda Ts: np.stack(Ts) if Ts else np.zeros((0, 4, 4))  # noqa: E731
-    return rows, {KEY_POSE_ARRAY: stack(poses), LAYOUT_ARRAY: stack(layouts)}
+    return rows, {KEY_POSE_ARRAY: _stacked(poses), LAYOUT_ARRAY: _stacked(layouts)}
+
+
+def _stacked(transforms: Sequence[Array]) -> Array:
+    return np.stack(transforms) if transforms else np.zeros((0, 4, 4))
 
 
 def entries_from_parts(
@@ -47,13 +51,16 @@ def entries_from_parts(
     """Inverse of :func:`entries_to_parts`. Raises MemoryFormatError naming file and field."""
     poses = _transforms(arrays, KEY_POSE_ARRAY, where)
     layouts = _transforms(arrays, LAYOUT_ARRAY, where)
-    entries, n_poses, n_layouts = [], 0, 0
+    entries: list[MemoryEntry] = []
+    n_poses, n_layouts = 0, 0
     for i, row in enumerate(rows):
         try:
             k, n = len(row["key_poses"]), len(row["layout"])
             entry = _entry(row, poses[n_poses : n_poses + k], layouts[n_layouts : n_layouts + n])
         except (KeyError, TypeError, ValueError, IndexError) as error:
-            raise MemoryFormatError(f"{where}: entries[{i}] is malformed: {error!r}; train or pull it again") from error
+            raise MemoryFormatError(
+                f"{where}: entries[{i}] is malformed: {error!r}; train or pull it again"
+            ) from error
         entries.append(entry)
         n_poses, n_layouts = n_poses + k, n_layouts + n
     if n_poses != len(poses) or n_layouts != len(layouts):
@@ -67,7 +74,9 @@ def entries_from_parts(
 def _entry(row: Mapping[str, Any], poses: Array, layouts: Array) -> MemoryEntry:
     if len(poses) != len(row["key_poses"]) or len(layouts) != len(row["layout"]):
         raise ValueError("fewer transforms than the entry names")
-    sub_tasks = tuple(SubTask(**{str(k): str(v) for k, v in item.items()}) for item in row["key"]["sub_tasks"])
+    sub_tasks = tuple(
+        SubTask(**{str(k): str(v) for k, v in item.items()}) for item in row["key"]["sub_tasks"]
+    )
     key = RetrievalKey(sub_tasks, tuple(str(phase) for phase in row["key"]["phases"]))
     key_poses = tuple(_key_pose(fields, T) for fields, T in zip(row["key_poses"], poses, strict=True))
     layout = {str(name): T for name, T in zip(row["layout"], layouts, strict=True)}
@@ -76,7 +85,9 @@ def _entry(row: Mapping[str, Any], poses: Array, layouts: Array) -> MemoryEntry:
         raise ValueError(f"quality is {quality}, expected 0 to 1")
     if not key_poses or not sub_tasks:
         raise ValueError("an entry needs a sub-task and a key pose")
-    return MemoryEntry(key, str(row["language"]), key_poses, quality, int(row["version"]), str(row["source"]), layout)
+    return MemoryEntry(
+        key, str(row["language"]), key_poses, quality, int(row["version"]), str(row["source"]), layout
+    )
 
 
 def _key_pose(fields: Mapping[str, Any], T_obj_ee: Array) -> MemoryKeyPose:
@@ -87,15 +98,24 @@ def _key_pose(fields: Mapping[str, Any], T_obj_ee: Array) -> MemoryKeyPose:
         raise ValueError(f"confidence {confidence} or opening {opening} is out of range")
     if not isinstance(fields["closed"], bool) or not isinstance(fields["dwell"], bool):
         raise ValueError("'closed' and 'dwell' must be true or false")
+    anchor = Anchor(str(fields["anchor"]["place"]), str(fields["anchor"]["axes"]))
     return MemoryKeyPose(
-        Anchor(str(fields["anchor"]["place"]), str(fields["anchor"]["axes"])), T_obj_ee, phase, confidence, fields["closed"], opening,
-        int(fields["n_steps"]), fields["dwell"],
-    )  # fmt: skip
+        anchor,
+        T_obj_ee,
+        phase,
+        confidence,
+        fields["closed"],
+        opening,
+        int(fields["n_steps"]),
+        fields["dwell"],
+    )
 
 
 def _transforms(arrays: Mapping[str, Array], name: str, where: str) -> Array:
     if name not in arrays:
-        raise MemoryFormatError(f"{where}: array {name!r} is missing, got {sorted(arrays)}; train or pull it again")
+        raise MemoryFormatError(
+            f"{where}: array {name!r} is missing, got {sorted(arrays)}; train or pull it again"
+        )
     T = arrays[name]
     if T.ndim != 3 or T.shape[1:] != (4, 4) or T.dtype != np.float64 or not se3.is_rigid(T):
         raise MemoryFormatError(
@@ -113,10 +133,14 @@ def robot_to_dict(robot: RobotModel) -> dict[str, Any]:
 def robot_from_dict(fields: Mapping[str, Any], where: str) -> RobotModel:
     """Inverse of :func:`robot_to_dict`. Raises MemoryFormatError naming file and field."""
     try:
-        numbers = {name: float(fields[name]) for name in RobotModel.__dataclass_fields__ if name != "workspace"}
+        numbers = {
+            name: float(fields[name]) for name in RobotModel.__dataclass_fields__ if name != "workspace"
+        }
         workspace = np.asarray(fields["workspace"], float)
     except (KeyError, TypeError, ValueError) as error:
-        raise MemoryFormatError(f"{where}: 'robot' is malformed: {error!r}; train or pull it again") from error
+        raise MemoryFormatError(
+            f"{where}: 'robot' is malformed: {error!r}; train or pull it again"
+        ) from error
     if workspace.shape != (2, 3) or not np.isfinite([*numbers.values(), *workspace.flat]).all():
         raise MemoryFormatError(f"{where}: 'robot' must hold finite numbers and a (2, 3) workspace")
     return RobotModel(workspace=workspace, **numbers)

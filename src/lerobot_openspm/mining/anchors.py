@@ -93,7 +93,9 @@ def _cost(anchor: Anchor, members: Sequence[tuple[KeyPose, Mapping[str, Array]]]
     if not found:
         return np.inf
     poses = np.stack([se3.inverse(anchor.frame(layout)) @ pose.T_world_ee for pose, layout in found])
-    prior = (PRIOR_M * (anchor.place != suggested) + AXES_PRIOR_M * (anchor.axes != anchor.place)) / len(found)
+    prior = (PRIOR_M * (anchor.place != suggested) + AXES_PRIOR_M * (anchor.axes != anchor.place)) / len(
+        found
+    )
     return spread(poses) + prior + PRIOR_M * (1 - len(found) / len(members))
 
 
@@ -141,11 +143,18 @@ def qualities(demonstrations: Sequence[Demonstration], anchors: Mapping[Role, An
     for i, demonstration in enumerate(demonstrations):
         for role, pose in zip(roles(demonstration.key_poses), demonstration.key_poses, strict=True):
             anchor = anchors.get(role)
-            if pose.phase in CONTACT_PHASES and anchor and all(n in demonstration.layout for n in anchor.objects):
+            if (
+                pose.phase in CONTACT_PHASES
+                and anchor
+                and all(n in demonstration.layout for n in anchor.objects)
+            ):
                 gathered[role].append((i, se3.inverse(anchor.frame(demonstration.layout)) @ pose.T_world_ee))
     worst = np.zeros(len(demonstrations))
     for members in gathered.values():
         distances = deviations(np.stack([T for _, T in members]))
+        # Where all of them differ, as in where a push ends, differing says nothing against one.
+        if np.median(distances) > QUALITY_SCALE_M:
+            continue
         for (i, _), distance in zip(members, distances, strict=True):
             worst[i] = max(worst[i], distance)
     return [float(np.exp(-((w / QUALITY_SCALE_M) ** 2))) for w in worst]

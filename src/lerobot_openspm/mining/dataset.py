@@ -33,12 +33,13 @@ class Demonstrations:
         missing = [key for key in (OBS_STATE, ACTION) if key not in dataset.features]
         if missing:
             raise DatasetError(
-                f"dataset {dataset.repo_id} lacks {missing}; it has {sorted(dataset.features)}. OpenSPM mines "
-                "end-effector poses and increments: record them, or rename the features"
+                f"dataset {dataset.repo_id} lacks {missing}; it has {sorted(dataset.features)}. OpenSPM "
+                "mines end-effector poses and increments: record them, or rename the features"
             )
 
     @property
     def name(self) -> str:
+        """The dataset's repository id."""
         return str(self._dataset.repo_id)
 
     def episodes(self, indices: Sequence[int] | None = None) -> list[Episode]:
@@ -87,7 +88,7 @@ class Demonstrations:
         return views
 
     def simulator_poses(self, episode: Episode, frame: int) -> dict[str, Array]:
-        """True object poses ``T_world_obj`` by name, where a simulator recorded them (oracle ablation only)."""
+        """True object poses ``T_world_obj`` by name, as a simulator recorded them (oracle ablation only)."""
         if SIMULATOR_POSES not in self._dataset.features:
             raise DatasetError(
                 f"dataset {self.name} has no {SIMULATOR_POSES!r}, which --policy.perception=oracle needs; "

@@ -8,6 +8,7 @@ and the corners that matter (above the object, after lifting it, above the targe
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -34,6 +35,8 @@ LIFTED_M = 0.03
 TURNED_RAD = np.deg2rad(35)
 # A hand that pushes stays within this height of its lowest point.
 PUSH_BAND_M = 0.015
+# A hand that sinks by less than this in two steps travels level.
+LEVEL_M = 0.001
 # Corners this close to a contact pose are the contact pose.
 MIN_SPACING_M = 0.02
 
@@ -97,7 +100,13 @@ def find_key_poses(episode: Episode, robot: RobotModel) -> list[KeyPose]:
 
 
 def _span_marks(
-    episode: Episode, start: int, end: int, event_end: int | None, next_end: int | None, closed: bool, contact: int
+    episode: Episode,
+    start: int,
+    end: int,
+    event_end: int | None,
+    next_end: int | None,
+    closed: bool,
+    contact: int,
 ) -> list[_Mark]:
     """The key poses of one span of motion between two gripper transitions, and of the transition after it.
 
@@ -145,7 +154,7 @@ def _push_marks(episode: Episode, start: int, end: int, closed: bool, contact: i
     """Approach, push and retreat of a hand that holds nothing but travels low."""
     height = episode.T_world_ee[start : end + 1, 2, 3]
     low = np.flatnonzero(height < height.min() + PUSH_BAND_M)
-    first, last = start + int(low[0]), start + int(low[-1])
+    first, last = start + _bottom(height, int(low[0]), 1), start + _bottom(height, int(low[-1]), -1)
     metres, _ = se3.distances(episode.T_world_ee[first], episode.T_world_ee[last])
     if metres < 0.04:  # a hand that only passes a low point pushes nothing
         return []
@@ -158,6 +167,14 @@ def _push_marks(episode: Episode, start: int, end: int, closed: bool, contact: i
         *retreat,
         _Mark(end, "retreat", 0.8, closed, False, contact),
     ]
+
+
+def _bottom(height: Array, index: int, step: int) -> int:
+    """Walk from an index, forwards or backwards, to where the hand stops going down."""
+    ahead = index + 2 * step
+    while 0 <= ahead < len(height) and height[ahead] < height[index] - LEVEL_M:
+        index, ahead = index + step, ahead + step
+    return index
 
 
 def _corner_marks(
@@ -212,7 +229,7 @@ def _debounced(closed: NDArray[np.bool_]) -> NDArray[np.bool_]:
     closed = closed.copy()
     edges = np.flatnonzero(np.diff(closed)) + 1
     bounds = [0, *edges.tolist(), len(closed)]
-    for first, last in zip(bounds[:-1], bounds[1:], strict=True):
+    for first, last in pairwise(bounds):
         if first > 0 and last - first < MIN_COMMAND_STEPS:
             closed[first:last] = closed[first - 1]
     return closed

@@ -6,7 +6,6 @@ import logging
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Literal
 
 import numpy as np
 from tqdm import tqdm
@@ -38,8 +37,6 @@ from lerobot_openspm.perception.types import Hint, Scene
 
 logger = logging.getLogger(__name__)
 
-PerceptionSource = Literal["demonstrations", "oracle"]
-
 
 @dataclass(frozen=True)
 class MinedEpisode:
@@ -65,14 +62,21 @@ class MinedKeyPoses:
     skipped: dict[int, str]
 
 
-def mine_key_poses(demonstrations: Demonstrations, indices: Sequence[int] | None = None) -> MinedKeyPoses:
+def mine_key_poses(
+    demonstrations: Demonstrations, indices: Sequence[int] | None = None, robot: RobotModel | None = None
+) -> MinedKeyPoses:
     """Find the key poses of episodes. Reads no image.
+
+    Args:
+        demonstrations: The dataset.
+        indices: The episodes; all if not given.
+        robot: What is known of the robot; observed in the same episodes if not given.
 
     Raises:
         DatasetError: No episode has any. The error gives the reasons.
     """
     episodes = demonstrations.episodes(indices)
-    robot = observe_robot(episodes)
+    robot = robot or observe_robot(episodes)
     mined, skipped = [], {}
     for episode in episodes:
         try:
@@ -242,7 +246,14 @@ def _remember(
         T_obj_ee = se3.inverse(anchor.frame(demonstration.layout)) @ pose.T_world_ee
         kept.append(
             MemoryKeyPose(
-                anchor, T_obj_ee, pose.phase, pose.confidence, pose.closed, pose.opening, pose.n_steps, pose.dwell
+                anchor,
+                T_obj_ee,
+                pose.phase,
+                pose.confidence,
+                pose.closed,
+                pose.opening,
+                pose.n_steps,
+                pose.dwell,
             )
         )
     return tuple(kept)

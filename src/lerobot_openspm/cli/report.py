@@ -1,0 +1,104 @@
+"""The page that a person opens first: success per task, film strips, key poses drawn into a camera image."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from importlib.resources import files
+from pathlib import Path
+from typing import Any
+
+from jinja2 import Environment, select_autoescape
+from lerobot.datasets import LeRobotDataset
+from tqdm import tqdm
+
+from lerobot_openspm.cli.drawing import draw_key_poses, film_strip, save_png
+from lerobot_openspm.cli.pipeline import REPO_ID, Episode, mean_steps, rate
+from lerobot_openspm.configuration_openspm import OpenSPMConfig
+from lerobot_openspm.envs.tasks import TASKS
+from lerobot_openspm.experience import Experience, load_experience
+from lerobot_openspm.memory.entry import MemoryEntry
+from lerobot_openspm.training import open_demonstrations
+
+# Rollouts shown per task: this many that succeeded, and this many that failed.
+SHOWN_SUCCESSES, SHOWN_FAILURES = 1, 2
+
+
+def write_report(
+    folder: Path,
+    result: dict[str, Any],
+    episodes: Sequence[Episode],
+    dataset: Path,
+    checkpoint: Path,
+    evaluation: Path,
+) -> Path:
+    """Draw the pictures and write ``index.html``. Returns its path."""
+    experience = load_experience(checkpoint)
+    demonstrations = LeRobotDataset(REPO_ID, root=dataset, video_backend="pyav")
+    tasks = []
+    for name in tqdm(dict.fromkeys(e.task for e in episodes), desc="Drawing", unit="task"):
+        own = [e for e in episodes if e.task == name]
+        instruction = TASKS[name].instruction
+        entries = [entry for entry in experience.entries if entry.language == instruction]
+        best = max(entries, key=lambda entry: entry.quality, default=None)
+        poses = folder / f"{name}_key_poses.png"
+        if best is not None:
+            save_png(_key_pose_picture(best, experience, demonstrations), poses)
+        tasks.append(
+            {
+                "instruction": instruction,
+                **rate(sum(e.success for e in own), len(own)),
+                "mean_steps": _rounded(mean_steps(own)),
+                "entries": len(entries),
+                "anchors": ", ".join(best.objects) if best else "",
+                "poses": poses.name,
+                "films": _films(own, evaluation, folder),
+            }
+        )
+    template = files("lerobot_openspm.cli").joinpath("templates/report.html").read_text()
+    page = Environment(autoescape=select_autoescape()).from_string(template)
+    path = folder / "index.html"
+    path.write_text(page.render(title="OpenSPM on the tabletop", tasks=tasks, **result))
+    return path
+
+
+def _key_pose_picture(entry: MemoryEntry, experience: Experience, dataset: LeRobotDataset) -> Any:
+    """The entry's key poses in the first frame of the demonstration it was mined from."""
+    config = OpenSPMConfig(device="cpu", push_to_hub=False)
+    demonstrations = open_demonstrations(dataset.meta, config)
+    episode = demonstrations.episodes([int(entry.source.rsplit("#", 1)[1])])[0]
+    key, camera = next((k, c) for k, c in experience.cameras.items() if c.mount == "world")
+    view = demonstrations.views(episode, 0, {key: camera})[key]
+    poses = [pose.anchor.frame(entry.layout) @ pose.T_obj_ee for pose in entry.key_poses]
+    return draw_key_poses(view, poses, [pose.phase for pose in entry.key_poses])
+
+
+def _films(episodes: Sequence[Episode], evaluation: Path, folder: Path) -> list[dict[str, Any]]:
+    """Film strips of a few rollouts; lerobot-eval films the first ten of a task, in the order of seeds."""
+    suite = "openspm_tabletop"
+    videos = evaluation / "videos" / f"{suite}_{list(TASKS).index(episodes[0].task)}"
+    filmed = [
+        (episode, video)
+        for i, episode in enumerate(sorted(episodes, key=lambda e: e.seed))
+        if (video := videos / f"eval_episode_{i}.mp4").exists()
+    ]
+    successes = [item for item in filmed if item[0].success][:SHOWN_SUCCESSES]
+    failures = [item for item in filmed if not item[0].success][:SHOWN_FAILURES]
+    films = []
+    for episode, video in successes + failures:
+        strip = folder / f"{episode.task}_{episode.seed}.png"
+        save_png(film_strip(video), strip)
+        outcome = "success" if episode.success else f"failed ({episode.status.replace('_', ' ')})"
+        films.append(
+            {
+                "video": os.path.relpath(video, folder),
+                "seed": episode.seed,
+                "outcome": f"{outcome} after {episode.steps} steps",
+                "strip": strip.name,
+            }
+        )
+    return films
+
+
+def _rounded(value: float) -> str:
+    return "-" if value != value else f"{value:.0f}"

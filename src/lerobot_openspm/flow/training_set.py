@@ -1,0 +1,73 @@
+"""The samples that the flow model learns from, as tensors, and how they are drawn."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from lerobot_openspm.flow.condition import Conditioning
+from lerobot_openspm.flow.samples import SegmentFrames, action_scale, conditions_and_chunks
+
+
+class TrainingSet:
+    """Conditions and chunks of every frame of every segment.
+
+    Args:
+        frames: The demonstrated frames, each looked up by its dataset index.
+        perturbed: Further copies of them, only ever drawn at random.
+        allowed: Episodes that may be drawn from; a held-out one is only ever looked up.
+        conditioning: What the model is told.
+    """
+
+    def __init__(
+        self,
+        frames: SegmentFrames,
+        perturbed: list[SegmentFrames],
+        allowed: NDArray[np.int64],
+        conditioning: Conditioning,
+    ):
+        copies = [frames, *perturbed]
+        encoded = [conditions_and_chunks(copy, conditioning) for copy in copies]
+        conditions, chunks = (np.concatenate(parts) for parts in zip(*encoded, strict=True))
+        self._conditions = torch.as_tensor(conditions, dtype=torch.float32)
+        self._chunks = torch.as_tensor(chunks, dtype=torch.float32)
+        drawable = np.isin(np.concatenate([copy.episode for copy in copies]), allowed)
+        self.action_scale = torch.as_tensor(action_scale(chunks[drawable]), dtype=torch.float32)
+        # Short phases are where contact is made: they are drawn more often than their frames are many.
+        phase = np.concatenate([copy.query.phase for copy in copies])
+        counts = np.bincount(phase[drawable], minlength=int(phase.max()) + 1)
+        weights = np.where(drawable, 1.0 / np.sqrt(np.maximum(counts[phase], 1)), 0.0)
+        self._weights = torch.as_tensor(weights, dtype=torch.float32)
+        self._row_of_index = torch.full((int(frames.index.max()) + 1,), -1, dtype=torch.long)
+        self._row_of_index[torch.as_tensor(frames.index)] = torch.arange(len(frames))
+
+    def draw(self, index: Tensor, draws: int, training: bool) -> tuple[Tensor, Tensor]:
+        """Samples for a batch of frames: `draws` for each, the first of them the frame itself.
+
+        A frame that belongs to no segment (a pause, or after the last key pose) is replaced by another one.
+
+        Args:
+            index: Dataset index ``(b,)``.
+            draws: Samples per frame.
+            training: Whether replacements may be drawn at random; otherwise they follow from the index.
+
+        Returns:
+            Conditions ``(b * draws, condition_dim)`` and chunks ``(b * draws, H, 7)``, frame by frame.
+        """
+        index = index.cpu().flatten()
+        known = self._row_of_index[index.clamp(max=len(self._row_of_index) - 1)]
+        rows = torch.where(index < len(self._row_of_index), known, -1)
+        spare = self._sample(len(rows)) if training else self._nearest_drawable(index)
+        rows = torch.where(rows < 0, spare, rows)
+        others = self._sample(len(rows) * (draws - 1)).view(len(rows), draws - 1)
+        rows = torch.cat([rows[:, None], others], dim=1).flatten()
+        return self._conditions[rows], self._chunks[rows]
+
+    def _sample(self, n: int) -> Tensor:
+        return torch.multinomial(self._weights, n, replacement=True) if n else torch.zeros(0, dtype=torch.long)
+
+    def _nearest_drawable(self, index: Tensor) -> Tensor:
+        drawable = torch.nonzero(self._weights)[:, 0]
+        return drawable[index % len(drawable)]
