@@ -90,11 +90,11 @@ def retrieve(
 
     Args:
         candidates: Entries with their semantic score.
-        geometric: ``S_geo`` in 0..1 of an entry in the present scene; 0 if it cannot be executed there, because
-            an object was not found or its key poses, carried over, fail the checks.
+        geometric: ``S_geo`` in 0..1 of an entry in the present scene; 0 if it cannot be executed there,
+            because an object was not found or its key poses, carried over, fail the checks.
         weights: The three lambdas.
     """
-    ranked = []
+    ranked: list[Scored] = []
     for entry, semantic in candidates:
         geometry = geometric(entry)
         total = weights.semantic * semantic + weights.geometric * geometry + weights.quality * entry.quality

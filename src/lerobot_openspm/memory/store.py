@@ -14,6 +14,9 @@ from lerobot_openspm.geometry.se3 import Array
 from lerobot_openspm.memory.entry import PHASES, Anchor, MemoryEntry, MemoryKeyPose, RetrievalKey, SubTask
 from lerobot_openspm.memory.robot import RobotModel
 
+# What reading a field of another kind, or a number beyond what Python converts, ends in.
+MALFORMED = (KeyError, TypeError, ValueError, IndexError, AttributeError, OverflowError)
+
 KEY_POSE_ARRAY, LAYOUT_ARRAY = "entries.T_obj_ee", "entries.T_world_obj"
 
 
@@ -57,7 +60,7 @@ def entries_from_parts(
         try:
             k, n = len(row["key_poses"]), len(row["layout"])
             entry = _entry(row, poses[n_poses : n_poses + k], layouts[n_layouts : n_layouts + n])
-        except (KeyError, TypeError, ValueError, IndexError) as error:
+        except MALFORMED as error:
             raise MemoryFormatError(
                 f"{where}: entries[{i}] is malformed: {error!r}; train or pull it again"
             ) from error
@@ -137,7 +140,7 @@ def robot_from_dict(fields: Mapping[str, Any], where: str) -> RobotModel:
             name: float(fields[name]) for name in RobotModel.__dataclass_fields__ if name != "workspace"
         }
         workspace = np.asarray(fields["workspace"], float)
-    except (KeyError, TypeError, ValueError) as error:
+    except MALFORMED as error:
         raise MemoryFormatError(
             f"{where}: 'robot' is malformed: {error!r}; train or pull it again"
         ) from error
