@@ -226,6 +226,7 @@ SPOILT = {
     "opening infinite": (setting(*POSE, "opening", value=float("inf")), r"entries\[0\].*opening"),
     "closed as number": (setting(*POSE, "closed", value=1), r"entries\[0\].*'closed'"),
     "steps beyond integers": (setting(*POSE, "n_steps", value=float("inf")), r"entries\[0\]"),
+    "anchor that is nowhere": (setting(*POSE, "anchor", "place", value="cup"), r"entries\[0\].*'cup'"),
     "anchor as text": (setting(*POSE, "anchor", value="bowl"), r"entries\[0\]"),
     "anchor without axes": (without(*POSE, "anchor", "axes"), r"entries\[0\].*axes"),
 }  # fmt: skip

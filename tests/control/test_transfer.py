@@ -6,7 +6,13 @@ from numpy.testing import assert_allclose
 from tests.geometry.strategies import transforms
 from tests.memory.builders import entry, hand_pose, key_pose, robot
 
-from lerobot_openspm.control.transfer import TransferLimits, check_transfer, transfer, transfer_pose
+from lerobot_openspm.control.transfer import (
+    TransferLimits,
+    check_transfer,
+    shape_deviation,
+    transfer,
+    transfer_pose,
+)
 from lerobot_openspm.geometry import se3
 from lerobot_openspm.memory.entry import WORLD
 
@@ -139,3 +145,24 @@ def test_a_jump_is_measured_from_the_key_pose_before_and_first_from_the_hand():
 def test_every_problem_is_listed():
     found = problems(("approach", hand_pose(0.9, 0, 0.2)), ("grasp", hand_pose(-0.1, 0, -0.1)))
     assert len(found) == 4  # outside, jump; below, jump
+
+
+def test_a_scene_like_the_demonstrations_or_moved_as_a_whole_has_no_shape_deviation():
+    memory, G = entry(), se3.from_yaw([0.1, 0.2, 0.0], 1.0)
+    for layout in (memory.layout, {name: G @ T for name, T in memory.layout.items()}):
+        assert shape_deviation(memory, transfer(memory, layout, {}, HOME)) == pytest.approx(0, abs=1e-6)
+
+
+def test_another_way_through_free_space_counts_less_than_another_way_in_contact():
+    def deviation(phase):
+        poses = [
+            key_pose("bowl", hand_pose(0, 0, 0.1), "approach"),
+            key_pose("plate", hand_pose(0, 0, 0.1), phase),
+        ]
+        layout = {"bowl": np.eye(4), "plate": se3.from_yaw([0.2, 0, 0], 0.0)}
+        memory = entry(key_poses=poses, layout=layout)
+        longer = layout | {"plate": se3.from_yaw([0.3, 0, 0], 0.0)}
+        return shape_deviation(memory, transfer(memory, longer, {}, HOME))
+
+    assert deviation("push") == pytest.approx(0.1)
+    assert 0 < deviation("pre-place") < 0.05

@@ -83,6 +83,8 @@ def _entry(row: Mapping[str, Any], poses: Array, layouts: Array) -> MemoryEntry:
     key = RetrievalKey(sub_tasks, tuple(str(phase) for phase in row["key"]["phases"]))
     key_poses = tuple(_key_pose(fields, T) for fields, T in zip(row["key_poses"], poses, strict=True))
     layout = {str(name): T for name, T in zip(row["layout"], layouts, strict=True)}
+    if unknown := {name for pose in key_poses for name in pose.anchor.objects} - set(layout):
+        raise ValueError(f"anchors {sorted(unknown)} are not in its layout {sorted(layout)}")
     quality = float(row["quality"])
     if not 0 <= quality <= 1:
         raise ValueError(f"quality is {quality}, expected 0 to 1")
