@@ -18,6 +18,15 @@ STEPS = 8
 Frame = dict[str, Any]
 
 
+@pytest.fixture(autouse=True)
+def one_thread():
+    """Several workers share the cores, and threads that wait for one another cost more than they save."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(before)
+
+
 @pytest.fixture
 def load(checkpoint: Path) -> Callable[..., OpenSPMPolicy]:
     """Load the trained policy, with options as the command line would give them."""

@@ -13,7 +13,7 @@ STEPS = 60
 
 
 def run_command(command: str, *options: str, timeout_s: float = 240) -> subprocess.CompletedProcess[str]:
-    """Run a script of this environment from the repository's root; says nothing about whether it succeeded."""
+    """Run a script of this environment from the repository's root; it may fail."""
     return subprocess.run(
         [str(Path(sys.executable).with_name(command)), *options],
         cwd=REPOSITORY,

@@ -1,0 +1,76 @@
+"""Ask a memory what it would do: which demonstration it recalls for an instruction, and where the hand goes.
+
+    python examples/01_record_and_mine.py            # makes the memory that this example looks into
+    python examples/03_look_into_the_memory.py --instruction="put the bowl on the plate"
+
+It prints the scores of the remembered demonstrations in a new scene, and draws the key poses of the best one,
+carried over to where the objects are now, into the camera image.
+"""
+
+import argparse
+from pathlib import Path
+
+import torch
+
+from lerobot_openspm.cli.drawing import draw_key_poses, save_png
+from lerobot_openspm.configuration_openspm import OpenSPMConfig
+from lerobot_openspm.control.row import Knowledge, Row
+from lerobot_openspm.control.transfer import transfer
+from lerobot_openspm.envs.tabletop_env import ACTION_NAMES, STATE_NAMES, TabletopEnv
+from lerobot_openspm.experience import load_experience
+from lerobot_openspm.observation import split_batch
+from lerobot_openspm.perceive import find_objects
+
+CAMERA = "observation.images.front"
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser.add_argument("--memory", type=Path, default=Path("outputs/examples/01/memory"))
+    parser.add_argument("--instruction", default="put the bowl on the plate")
+    parser.add_argument("--seed", type=int, default=2_000_000, help="scene to look at")
+    parser.add_argument("--output", type=Path, default=Path("outputs/examples/03"))
+    options = parser.parse_args()
+
+    # 1. A new scene, and what the cameras and the hand say about it.
+    env = TabletopEnv("bowl_on_plate")
+    seen, _ = env.reset(seed=options.seed)
+    env.close()
+    images = {f"observation.images.{name}": torch.as_tensor(image) for name, image in seen["pixels"].items()}
+    batch = {key: image.permute(2, 0, 1)[None] for key, image in images.items()}
+    batch |= {"observation.state": torch.as_tensor(seen["agent_pos"])[None], "task": [options.instruction]}
+    config = OpenSPMConfig(state_layout=list(STATE_NAMES), action_layout=list(ACTION_NAMES), device="cpu")
+    (observation,) = split_batch(batch, config.layouts()[0])
+
+    # 2. Observing plans: find the objects in the images, rank the entries, carry the best one over.
+    experience = load_experience(options.memory)
+    knowledge = Knowledge(
+        experience.entries, experience.yaw_periods, experience.robot, config.score_weights,
+        config.transfer_limits, config.control_settings,
+    )  # fmt: skip
+    row = Row(knowledge, options.instruction, observation.state, noise_seed=0)
+    row.observe(observation.hand, lambda names: find_objects(names, observation, experience))
+
+    print(f"{options.instruction!r}: {row.status.name.lower()}")
+    for name, T_world_obj in row.layout.items():
+        print(f"  the {name} is at {T_world_obj[:3, 3].round(3).tolist()} m")
+    print("  recalled              semantics  geometry  quality   score")
+    for item in row.ranked:
+        where = item.entry.source.split("/")[-1]
+        print(
+            f"  {where:20s} {item.semantic:10.2f} {item.geometric:9.2f} {item.quality:8.2f} {item.total:7.2f}"
+        )
+
+    # 3. Draw where the hand is to go.
+    best = row.ranked[0].entry
+    if any(name not in row.layout for name in best.objects):
+        raise SystemExit("not all of its objects were found in this scene; try another --seed")
+    targets = transfer(best, row.layout, experience.yaw_periods, observation.hand.T_world_ee)
+    view = observation.views(experience.cameras)[CAMERA]
+    picture = draw_key_poses(view, [t.T_world_ee for t in targets], [t.memory.phase for t in targets])
+    save_png(picture, options.output / "key_poses.png")
+    print(f"  drawn into {options.output / 'key_poses.png'}")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,116 @@
+"""A checkpoint goes to the Hub and comes back with everything that the policy knows."""
+
+import json
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from textwrap import dedent
+from typing import Any
+
+import pytest
+from tests.hub.loopback_hub import LoopbackHub
+
+REPO = "tester/openspm-tabletop"
+MEMORY = ["memory.json", "memory.safetensors", "cameras.json"]
+
+# Acts on recorded observations; what is printed says which actions came out, to the last bit.
+ACT = """
+import hashlib, json, sys
+import torch
+from lerobot.datasets import LeRobotDataset
+from lerobot.policies.factory import make_pre_post_processors
+from lerobot_openspm.configuration_openspm import OpenSPMConfig
+from lerobot_openspm.modeling_openspm import OpenSPMPolicy
+
+def act(policy, pre, post, root):
+    dataset = LeRobotDataset("local/openspm_tabletop", root=root, video_backend="pyav")
+    policy.reset()
+    actions = []
+    for i in range(6):
+        frame = {k: v for k, v in dataset[i].items() if k.startswith("observation.") or k == "task"}
+        with torch.inference_mode():
+            actions.append(post(policy.select_action(pre(frame))))
+    actions = torch.cat(actions)
+    assert torch.isfinite(actions).all() and actions.abs().max() > 0
+    return hashlib.sha256(actions.numpy().tobytes()).hexdigest()
+"""
+
+PUSH = """
+from huggingface_hub import ModelCard
+from lerobot.configs.train import TrainPipelineConfig
+path, root, repo = sys.argv[1:]
+# It asks huggingface.co by name, whatever HF_ENDPOINT says.
+ModelCard.validate = lambda self, repo_type=None: None
+config = OpenSPMConfig.from_pretrained(path)
+# The path of the calibration holds where training ran; the checkpoint has its own copy.
+config.cameras, config.repo_id = None, repo
+policy = OpenSPMPolicy.from_pretrained(path, config=config)
+pre, post = make_pre_post_processors(config, path)
+train_config = TrainPipelineConfig.from_pretrained(path)
+policy.push_model_to_hub(train_config)
+pre.push_to_hub(repo)
+post.push_to_hub(repo)
+print(json.dumps(act(policy, pre, post, root)))
+"""
+
+PULL = """
+root, repo = sys.argv[1:]
+policy = OpenSPMPolicy.from_pretrained(repo)
+pre, post = make_pre_post_processors(policy.config, repo)
+print(json.dumps([act(policy, pre, post, root), len(policy.experience.entries)]))
+"""
+
+Run = Callable[..., subprocess.CompletedProcess[str]]
+
+
+@pytest.fixture
+def run(loopback_hub: LoopbackHub, tmp_path: Path) -> Run:
+    """Run code in a process for which the loopback Hub is the Hub, in a folder that knows nothing of ours."""
+
+    def run(code: str, *arguments: object, home: str, offline: bool = False):
+        return subprocess.run(
+            [sys.executable, "-c", dedent(code), *map(str, arguments)],
+            env=loopback_hub.env(tmp_path / home, offline=offline) | {"OMP_NUM_THREADS": "1"},
+            cwd=tmp_path,
+            capture_output=True,
+            text=True,
+            timeout=180,
+            check=False,
+        )
+
+    return run
+
+
+def answer(done: subprocess.CompletedProcess[str]) -> Any:
+    assert done.returncode == 0, done.stderr[-4000:]
+    return json.loads(done.stdout.splitlines()[-1])
+
+
+def test_what_is_pulled_acts_as_what_was_pushed(
+    run: Run, loopback_hub: LoopbackHub, checkpoint: Path, tiny_dataset: Path
+):
+    actions = answer(run(ACT + PUSH, checkpoint, tiny_dataset, REPO, home="home_a"))
+    files = loopback_hub.files(REPO)
+    assert set(files) >= {
+        "config.json", "model.safetensors", "train_config.json", "README.md", "policy_preprocessor.json",
+        "policy_postprocessor.json", *MEMORY,
+    }  # fmt: skip
+    for name in MEMORY:
+        assert files[name] == (checkpoint / name).read_bytes(), name
+
+    pulled = run(ACT + PULL, tiny_dataset, REPO, home="home_b")
+    assert answer(pulled) == [actions, 6]
+
+    # Everything is in the cache now, and nothing is asked for without a connection.
+    requests = len(loopback_hub.requests)
+    assert answer(run(ACT + PULL, tiny_dataset, REPO, home="home_b", offline=True)) == [actions, 6]
+    assert len(loopback_hub.requests) == requests
+
+    # Whoever deletes the memory is told so, and not given a policy without one.
+    commit = loopback_hub.repo("models", REPO)
+    commit.commit({path: content for path, content in files.items() if path != "memory.safetensors"}, "oops")
+    broken = run(ACT + PULL, tiny_dataset, REPO, home="home_c")
+    assert broken.returncode != 0
+    assert "MemoryFormatError: no memory at" in broken.stderr
+    assert "pull the whole checkpoint" in broken.stderr

@@ -1,0 +1,244 @@
+"""Each mistake is one error of ours that says what was got and what to do."""
+
+import json
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from lerobot.datasets import LeRobotDataset, LeRobotDatasetMetadata
+from tests.policy.conftest import Frame, batch_of
+from tests.policy.lerobot_commands import lerobot_train, training_options
+from tests.policy.test_learning import new_config
+
+from lerobot_openspm.errors import (
+    CalibrationError,
+    DatasetError,
+    InstructionError,
+    LayoutError,
+    MemoryFormatError,
+    ObservationError,
+    OpenSPMError,
+)
+from lerobot_openspm.modeling_openspm import OpenSPMPolicy
+
+FRONT = "observation.images.front"
+
+
+def without(key: str) -> Callable[[dict], dict]:
+    return lambda batch: {k: v for k, v in batch.items() if k != key}
+
+
+def replaced(key: str, change: Callable[[Any], Any]) -> Callable[[dict], dict]:
+    return lambda batch: batch | {key: change(batch[key])}
+
+
+def first_is_nan(values: torch.Tensor) -> torch.Tensor:
+    return torch.where(torch.arange(values.numel()).view(values.shape) == 0, torch.nan, values)
+
+
+@pytest.mark.parametrize(
+    ("spoil", "error", "message"),
+    [
+        (without(FRONT), ObservationError, "no camera 'observation.images.front'.*--policy.cameras"),
+        (replaced(FRONT, lambda x: x[..., :100]), CalibrationError, "128"),
+        (replaced(FRONT, lambda x: x[:, :1]), ObservationError, r"shape \(1, 128, 128\), expected \(3"),
+        (replaced(FRONT, first_is_nan), ObservationError, "camera 'observation.images.front'.*NaN"),
+        (replaced("observation.state", first_is_nan), ObservationError, "'observation.state' is not finite"),
+        (replaced("observation.state", lambda x: x[:, :7]), LayoutError, "expected a last axis of 8"),
+        (without("observation.state"), ObservationError, "no 'observation.state'; it has"),
+        (without("task"), ObservationError, "no 'task', the instruction"),
+        (replaced("task", lambda _: ["juggle the eggs"]), InstructionError, "no verb I know"),
+        (replaced("task", lambda _: [""]), InstructionError, "expected one like"),
+        (
+            replaced("task", lambda _: ["put the fork on the plate"]),
+            InstructionError,
+            "it knows: put the bowl",
+        ),
+    ],
+)
+def test_a_bad_observation_is_refused(
+    policy: OpenSPMPolicy,
+    recorded: list[list[Frame]],
+    spoil: Callable[[dict], dict],
+    error: type[OpenSPMError],
+    message: str,
+):
+    batch = batch_of([recorded[0][0]])
+    with pytest.raises(error, match=message):
+        policy.select_action(spoil(batch))
+    # A mistake leaves nothing behind.
+    policy.reset()
+    assert torch.isfinite(policy.select_action(batch)).all()
+
+
+@pytest.mark.xfail(reason="raises what NumPy and Python raise")
+@pytest.mark.parametrize(
+    "spoil",
+    [
+        replaced("observation.state", lambda x: x[0]),
+        replaced("task", lambda tasks: tasks[:1]),
+        replaced("task", lambda _: [None, None]),
+    ],
+    ids=["no batch axis", "fewer tasks than rows", "a task that is no text"],
+)
+def test_a_malformed_batch_is_refused(
+    policy: OpenSPMPolicy, recorded: list[list[Frame]], spoil: Callable[[dict], dict]
+):
+    with pytest.raises(OpenSPMError):
+        policy.select_action(spoil(batch_of([recorded[0][0], recorded[3][0]])))
+
+
+@pytest.fixture
+def copy(checkpoint: Path, tmp_path: Path) -> Path:
+    """A checkpoint to spoil."""
+    return Path(shutil.copytree(checkpoint, tmp_path / "checkpoint"))
+
+
+@pytest.mark.parametrize("name", ["memory.json", "memory.safetensors"])
+def test_a_checkpoint_without_its_memory_is_refused(
+    load: Callable[..., OpenSPMPolicy], copy: Path, name: str
+):
+    (copy / name).unlink()
+    with pytest.raises(MemoryFormatError, match=f"no memory at .*{name}.*pull the whole checkpoint"):
+        load(copy)
+
+
+def test_a_checkpoint_without_calibration_is_refused(load: Callable[..., OpenSPMPolicy], copy: Path):
+    (copy / "cameras.json").unlink()
+    with pytest.raises(CalibrationError, match="no calibration file at"):
+        load(copy, cameras=None)
+
+
+@pytest.mark.parametrize("name", ["memory.json", "memory.safetensors"])
+def test_a_truncated_memory_is_refused(load: Callable[..., OpenSPMPolicy], copy: Path, name: str):
+    (copy / name).write_bytes((copy / name).read_bytes()[:-100])
+    with pytest.raises(MemoryFormatError, match=f"{name}.*truncated.*train or pull it again"):
+        load(copy)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"version": 2}, "got version 2, this release reads up to 1; upgrade"),
+        ({"version": "1"}, "got version '1'"),
+        ({"format": "something"}, "got format 'something', expected 'openspm-memory'"),
+        ({"entries": {}}, "must be lists"),
+        ({"entries": [{}]}, r"entries\[0\] is malformed"),
+        ({"objects": [3]}, "'objects' must hold JSON objects, got int"),
+        ({"robot": None}, "'robot' is malformed"),
+        ({"arrays": {}}, "field 'sha256' is missing"),
+    ],
+)
+def test_a_changed_memory_is_refused(
+    load: Callable[..., OpenSPMPolicy], copy: Path, change: dict, message: str
+):
+    memory = json.loads((copy / "memory.json").read_text())
+    (copy / "memory.json").write_text(json.dumps(memory | change))
+    with pytest.raises(MemoryFormatError, match=message):
+        load(copy)
+
+
+@pytest.mark.xfail(reason="config.json keeps the relative path of the calibration used in training")
+def test_a_checkpoint_loads_from_any_folder(copy: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.chdir(tmp_path)
+    policy = OpenSPMPolicy.from_pretrained(copy)
+    assert policy.experience is not None
+    assert len(policy.experience.cameras) == 3
+
+
+def test_a_path_that_is_no_checkpoint_is_named():
+    with pytest.raises(FileNotFoundError, match="no checkpoint folder at /nowhere/at/all"):
+        OpenSPMPolicy.from_pretrained("/nowhere/at/all")
+
+
+def test_nothing_is_saved_without_a_memory(policy: OpenSPMPolicy, tmp_path: Path):
+    policy.experience = None
+    with pytest.raises(MemoryFormatError, match="this policy has no memory"):
+        policy.save_pretrained(tmp_path / "out")
+    assert not (tmp_path / "out/memory.json").exists()
+
+
+@pytest.fixture
+def oracle(tiny_meta: LeRobotDatasetMetadata) -> OpenSPMPolicy:
+    return OpenSPMPolicy(new_config(tiny_meta, perception="oracle"), dataset_meta=tiny_meta)
+
+
+def test_the_oracle_needs_the_poses(oracle: OpenSPMPolicy, recorded: list[list[Frame]]):
+    batch = batch_of([recorded[0][0]])
+    with pytest.raises(ObservationError, match=r"perception=oracle needs.*--env\.object_poses=true"):
+        oracle.select_action(batch)
+    oracle.reset()
+    poses = torch.tensor([0.5, 0, 0, 1, 0, 0, 0]).tile(7)[None]
+    assert torch.isfinite(oracle.select_action(batch | {"observation.object_poses": poses})).all()
+
+
+@pytest.mark.slow
+@pytest.mark.xfail(reason="raises what NumPy raises", raises=ValueError)
+def test_the_oracle_needs_as_many_poses_as_were_recorded(oracle: OpenSPMPolicy, recorded: list[list[Frame]]):
+    with pytest.raises(ObservationError, match="object_poses"):
+        oracle.select_action(batch_of([recorded[0][0]]) | {"observation.object_poses": torch.zeros(1, 5)})
+
+
+def test_training_without_a_calibration_says_how_to_give_one(tiny_dataset: Path, tmp_path: Path):
+    output = tmp_path / "run"
+    log = lerobot_train(
+        *training_options(tiny_dataset, output), "--policy.cameras=null", succeeds=False
+    )  # fmt: skip
+    assert (
+        "CalibrationError: mining needs the cameras' calibration, got none; pass --policy.cameras=FILE" in log
+    )
+    assert not list(output.rglob("memory.*"))
+
+
+def record_by_hand(root: Path, task: str, frames: int = 40) -> LeRobotDatasetMetadata:
+    """A hand that comes down, always open, and goes nowhere."""
+    names = ["x", "y", "z", "axis_angle_x", "axis_angle_y", "axis_angle_z"]
+    features = {
+        key: {"dtype": "float32", "shape": (len(n),), "names": n}
+        for key, n in (
+            ("observation.state", [*names, "finger_left", "finger_right"]),
+            ("action", [*names, "gripper"]),
+        )
+    }
+    image = {"dtype": "image", "shape": (128, 128, 3), "names": ["height", "width", "channels"]}
+    cameras = {f"observation.images.{name}": image for name in ("front", "side", "wrist")}
+    dataset = LeRobotDataset.create(
+        "local/hand", fps=20, features=features | cameras, root=root, use_videos=False
+    )
+    for i in range(frames):
+        state = np.array([0.45, 0.0, 0.5 - 0.003 * i, np.pi, 0, 0, 0.04, -0.04], np.float32)
+        action = np.array([0, 0, -0.1, 0, 0, 0, -1], np.float32)
+        pictures = {key: np.zeros((128, 128, 3), np.uint8) for key in cameras}
+        dataset.add_frame({"observation.state": state, "action": action, "task": task} | pictures)
+    dataset.save_episode()
+    dataset.finalize()
+    return LeRobotDatasetMetadata("local/hand", root=root)
+
+
+@pytest.mark.parametrize(
+    ("task", "reason"),
+    [
+        ("put the bowl on the plate", "no key poses in the 1 episodes of dataset local/hand"),
+        ("dance", "no verb"),
+    ],
+)
+def test_a_dataset_in_which_nothing_is_touched_is_refused(tmp_path: Path, task: str, reason: str):
+    meta = record_by_hand(tmp_path / "data", task)
+    with pytest.raises(DatasetError, match=reason):
+        OpenSPMPolicy(new_config(meta), dataset_meta=meta)
+
+
+def test_a_dataset_without_the_calibrated_camera_is_refused(
+    tiny_meta: LeRobotDatasetMetadata, tmp_path: Path, checkpoint: Path
+):
+    data = json.loads((checkpoint / "cameras.json").read_text())
+    data["cameras"]["observation.images.roof"] = data["cameras"].pop(FRONT)
+    (tmp_path / "cameras.json").write_text(json.dumps(data))
+    config = new_config(tiny_meta)
+    config.cameras = str(tmp_path / "cameras.json")
+    with pytest.raises(DatasetError, match=r"no camera 'observation\.images\.roof'.*front"):
+        OpenSPMPolicy(config, dataset_meta=tiny_meta)
