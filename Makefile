@@ -30,8 +30,8 @@ egl: setup
 demo: egl ## collect DEMOS demonstrations, train, evaluate EPISODES episodes; the last line is JSON
 	@$(BIN)/openspm demo --demos=$(DEMOS) --episodes=$(EPISODES) --started_at=$(STARTED_AT)
 
-figures: egl ## draw the figures of the documentation
-	@$(BIN)/openspm figures
+figures: egl ## measure the published figures into benchmarks/results; the last line is JSON
+	@$(BIN)/python benchmarks/figures.py
 
 test: egl ## run the tests, without those marked slow, libero or gpu (PYTEST_ARGS=... adds arguments)
 	@$(BIN)/python -m pytest -n 2 $(PYTEST_ARGS)

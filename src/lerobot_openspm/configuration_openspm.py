@@ -96,7 +96,7 @@ class OpenSPMConfig(PreTrainedConfig):
     conditioning: Conditioning = "equivariant"
     hidden_dim: int = 268
     num_inference_steps: int = 8
-    samples_per_frame: int = 128
+    samples_per_frame: int = 256
     perturbation_m: float = 0.006
     perturbation_rad: float = 0.04
     noise_seed: int = 0
@@ -118,7 +118,7 @@ class OpenSPMConfig(PreTrainedConfig):
     optimizer_lr: float = 2e-3
     optimizer_weight_decay: float = 1e-4
     scheduler_warmup_steps: int = 50
-    scheduler_decay_steps: int = 2000
+    scheduler_decay_steps: int = 3000
 
     def __post_init__(self) -> None:
         super().__post_init__()

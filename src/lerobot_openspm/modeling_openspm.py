@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -34,8 +35,8 @@ logger = logging.getLogger(__name__)
 class OpenSPMPolicy(PreTrainedPolicy):
     """OpenSPM: a memory of key poses, carried over to the scene, and a flow model between them."""
 
-    config_class = OpenSPMConfig
-    name = "openspm"
+    config_class = OpenSPMConfig  # pyright: ignore[reportAssignmentType]  (LeRobot declares None)
+    name = "openspm"  # pyright: ignore[reportAssignmentType]
 
     def __init__(
         self,
@@ -44,12 +45,14 @@ class OpenSPMPolicy(PreTrainedPolicy):
         dataset_meta: Any | None = None,
         **kwargs: Any,
     ):
-        """Args:
-        config: The configuration.
-        dataset_stats: Not used: poses are not normalised.
-        dataset_meta: Metadata of the dataset to mine and to learn from; None for a policy that is about
-            to be loaded.
-        kwargs: What else LeRobot passes to every policy.
+        """Make a policy, and mine its memory if there is a dataset to mine.
+
+        Args:
+            config: The configuration.
+            dataset_stats: Not used: poses are not normalised.
+            dataset_meta: Metadata of the dataset to mine and to learn from; None for a policy that is about
+                to be loaded.
+            kwargs: What else LeRobot passes to every policy.
         """
         super().__init__(config)
         config.validate_features()
@@ -129,9 +132,14 @@ class OpenSPMPolicy(PreTrainedPolicy):
         condition = encode(query, self.config.conditioning)
         noise = row.noise((1, self.config.chunk_size, 7))
         device = self.flow.action_scale.device
-        tensors = [torch.as_tensor(x, dtype=torch.float32, device=device) for x in (condition[None], noise)]
-        chunk = self.flow.sample(*tensors, self.config.num_inference_steps)[0].cpu().numpy().astype(float)
-        actions = to_world_frame(chunk, query.T_world_target, self.config.conditioning)
+        chunk = self.flow.sample(
+            torch.as_tensor(condition[None], dtype=torch.float32, device=device),
+            torch.as_tensor(noise, dtype=torch.float32, device=device),
+            self.config.num_inference_steps,
+        )
+        actions = to_world_frame(
+            chunk[0].cpu().numpy().astype(float), query.T_world_target, self.config.conditioning
+        )
         # The fingers do what the key pose says; the flow model's last number only says it less surely.
         actions[:, 6] = self._require_experience().robot.command(bool(query.closed))
         return actions
@@ -167,6 +175,8 @@ class OpenSPMPolicy(PreTrainedPolicy):
 
     def _save_pretrained(self, save_directory: Path, state_dict: dict[str, Tensor] | None = None) -> None:
         super()._save_pretrained(save_directory, state_dict=state_dict)
+        # The calibration travels as a file of the checkpoint, not as a path that exists on one machine.
+        replace(self.config, cameras=None)._save_pretrained(Path(save_directory))
         save_experience(self._require_experience(), Path(save_directory))
 
     @classmethod
@@ -214,8 +224,7 @@ class OpenSPMPolicy(PreTrainedPolicy):
         """Give a freshly loaded policy its memory, and its training set when training goes on."""
         self.experience = load_experience(directory)
         if self.config.cameras is not None:
-            cameras = load_cameras(Path(self.config.cameras))
-            self.experience = Experience(**{**vars(self.experience), "cameras": cameras})
+            self.experience = replace(self.experience, cameras=load_cameras(Path(self.config.cameras)))
         if dataset_meta is not None:
             if self.config.memory_update != "keep":
                 known = self.experience if self.config.memory_update == "append" else None

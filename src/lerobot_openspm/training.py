@@ -63,7 +63,7 @@ def mine_experience(dataset_meta: Any, config: OpenSPMConfig, known: Experience 
     demonstrations = open_demonstrations(dataset_meta, config)
     mined = mine_key_poses(demonstrations, config.memory_episodes)
     scenes = learn_scenes(demonstrations, mined.mined, cameras)
-    objects = layouts_in_scenes(scenes, known.objects if known else {}, np.random.default_rng(0))
+    objects = layouts_in_scenes(scenes, mined.mined, known.objects if known else {}, np.random.default_rng(0))
     names: tuple[str, ...] = ()
     layouts = objects.layouts
     if config.perception == "oracle":

@@ -20,8 +20,8 @@ ALLOWED = {
     "perception": {"geometry"},
     "memory": {"geometry"},
     "mining": {"geometry", "perception", "memory"},
-    "flow": {"geometry", "mining"},
-    "control": {"geometry", "perception", "memory", "mining", "flow"},
+    "flow": {"geometry", "memory", "mining"},
+    "control": {"geometry", "memory", "flow"},
     "policy": {"geometry", "perception", "memory", "mining", "flow", "control"},
 }
 PURE = ("geometry", "perception", "memory", "control")

@@ -29,6 +29,7 @@ def draw_key_poses(view: View, poses: Sequence[Array], phases: Sequence[str], sc
     """Draw hand poses ``T_world_ee`` ``(4, 4)`` into a view: the way, and the hand's axes at each."""
     height, width = view.image.shape[:2]
     image = cv2.resize(view.image, (width * scale, height * scale), interpolation=cv2.INTER_CUBIC)
+    image = np.asarray(image, np.uint8)
     tips = np.stack([T[:3, 3] for T in poses])
     pixels = _pixels(view, tips, scale)
     cv2.polylines(image, [pixels[:, None]], False, (255, 255, 255), 1, cv2.LINE_AA)
@@ -45,8 +46,9 @@ def draw_key_poses(view: View, poses: Sequence[Array], phases: Sequence[str], sc
 
 def film_strip(video: Path, frames: int = 8) -> Image:
     """Evenly spaced frames of a video, side by side."""
+    pictures = []
     with av.open(str(video)) as container:
-        pictures = [frame.to_ndarray(format="rgb24") for frame in container.decode(video=0)]
+        pictures += [frame.to_ndarray(format="rgb24") for frame in container.decode(video=0)]
     chosen = np.linspace(0, len(pictures) - 1, frames).round().astype(int)
     return np.hstack([cv2.resize(pictures[i], (192, 192), interpolation=cv2.INTER_AREA) for i in chosen])
 

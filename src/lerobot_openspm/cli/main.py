@@ -14,7 +14,6 @@ COMMANDS = {
     "mine": ("lerobot_openspm.cli.mine", "mine a dataset's key poses into a memory"),
     "inspect": ("lerobot_openspm.cli.inspect", "show the memory of a checkpoint"),
     "demo": ("lerobot_openspm.cli.demo", "collect, train, evaluate and write one page about it"),
-    "figures": ("lerobot_openspm.cli.figures", "measure the published figures of the tabletop"),
 }
 
 

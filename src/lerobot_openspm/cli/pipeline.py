@@ -1,4 +1,4 @@
-"""The steps that `openspm demo` and `openspm figures` share: each one a LeRobot command line, run once."""
+"""The steps that `openspm demo` and the benchmarks share: each one a LeRobot command line, run once."""
 
 from __future__ import annotations
 

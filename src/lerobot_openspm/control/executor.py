@@ -27,6 +27,10 @@ EXECUTIONS: tuple[Execution, ...] = ("open_loop", "closed_loop", "closed_loop_tr
 HELD_SHARE = 0.4
 # Where the demonstration's fingers stood further apart than this share of open, they held something.
 HOLDING_SHARE = 0.03
+# A correction that leaves this share of the residual has met something solid ...
+STUCK_SHARE = 0.9
+# ... and the key pose counts as met within this multiple of the tolerance: what is touched is in the way.
+BLOCKED_SHARE = 3.0
 
 
 class Status(StrEnum):
@@ -84,6 +88,8 @@ class Executor:
         self.corrections = 0
         self.replans = 0  # chunks asked for so far; seeds the noise of each
         self._steps = 0
+        self._left = np.inf  # distance from the key pose at the last correction
+        self._blocked = False  # whether that correction brought the hand no closer
         self._start = np.eye(4)
         self._believed = np.eye(4)  # open loop: where the hand should be
         self._queue: deque[Array] = deque()
@@ -125,7 +131,8 @@ class Executor:
             if not self.plan[self.index].precise and self.index + 1 < len(self.plan):
                 self._enter(self.index + 1, hand)
                 return False
-            return self._retry("it does not get closer")
+            metres, radians = se3.distances(hand.T_world_ee, self.plan[self.index].T_world_ee)
+            return self._retry(f"it stays {1000 * metres:.1f} mm and {radians:.3f} rad away")
         return False
 
     def next_action(self) -> Array | None:
@@ -151,6 +158,9 @@ class Executor:
         target = self.plan[self.index]
         if self._steps >= self._nominal_steps():
             self.corrections += 1
+            left = float(se3.distance(hand.T_world_ee, target.T_world_ee))
+            self._blocked = left > STUCK_SHARE * self._left
+            self._left = left
         self.replans += 1
         here = self._believed if self._settings.execution == "open_loop" else hand.T_world_ee
         return Query(
@@ -173,6 +183,7 @@ class Executor:
             self._believed = self.plan[index - 1].T_world_ee
         self._start = self._believed if self._settings.execution == "open_loop" else hand.T_world_ee
         self.index, self._steps, self.corrections = index, 0, 0
+        self._left, self._blocked = np.inf, False
         self._queue.clear()
 
     def _nominal_steps(self) -> int:
@@ -192,7 +203,8 @@ class Executor:
             return True
         metres, radians = se3.distances(hand.T_world_ee, target.T_world_ee)
         if target.precise:
-            return bool(metres <= settings.residual_m and radians <= settings.residual_rad)
+            share = max(float(metres) / settings.residual_m, float(radians) / settings.residual_rad)
+            return share <= 1 or (self._blocked and share <= BLOCKED_SHARE)
         return bool(metres <= settings.passing_m and radians <= settings.passing_rad)
 
     def _lost_grip(self, hand: Hand) -> bool:

@@ -114,7 +114,7 @@ class Row:
         self.executor.begin(self._transfer(entry, hand), hand, index)
 
     def _geometric_score(self, entry: MemoryEntry, hand: Hand) -> float:
-        """``S_geo``: 0 if the entry cannot be executed here, else more the more it is like its demonstration."""
+        """``S_geo``: 0 if an entry cannot be executed here, else how like its demonstration it would be."""
         if any(name not in self.layout for name in entry.objects) or self._problems(entry, hand):
             return 0.0
         deviation = shape_deviation(entry, self._transfer(entry, hand))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -17,6 +17,8 @@ PRECISE_PHASES = ("grasp", "place", "release", "push", "open", "turn")
 
 # Phases in which an object follows the hand along a constraint.
 CONSTRAINED_PHASES = ("push", "open", "turn")
+# How far the hand backs off at the end.
+RETREAT_M = 0.06
 # How much a different way through free space counts beside a different way in contact.
 FREE_SPACE_SHARE = 0.2
 
@@ -69,7 +71,32 @@ def transfer(
             after is not None and (after.dwell or after.phase == "push")
         )
         targets.append(Target(before, pose, precise))
-    return tuple(targets)
+    return tuple(targets) + _retreat(targets)
+
+
+def _retreat(targets: Sequence[Target]) -> tuple[Target, ...]:
+    """Backing off at the end, for a demonstration that was cut when its goal was reached.
+
+    The hand leaves the way it came: against the direction in which it arrived at its last contact, seen from
+    the hand.
+    """
+    arrivals = [
+        i
+        for i, target in enumerate(targets)
+        if i > 0
+        and (target.memory.phase == "place" or (target.memory.phase == "approach" and target.precise))
+    ]
+    contacts = [target for target in targets if target.memory.phase in PRECISE_PHASES]
+    if not arrivals or not contacts:
+        return ()
+    last, contact = targets[-1], contacts[-1]
+    if float(se3.distances(last.T_world_ee, contact.T_world_ee)[0]) >= RETREAT_M:
+        return ()
+    arrival, before = targets[arrivals[-1]], targets[arrivals[-1] - 1]
+    back = (se3.inverse(arrival.T_world_ee) @ before.T_world_ee)[:3, 3]
+    step = se3.transform(np.eye(3), RETREAT_M * back / max(float(np.linalg.norm(back)), 1e-9))
+    memory = replace(last.memory, phase="retreat", n_steps=1, dwell=False, confidence=0.5)
+    return (Target(contact.T_world_ee @ step, memory, precise=False),)
 
 
 def _nearest_equivalent(
@@ -96,7 +123,7 @@ def shape_deviation(entry: MemoryEntry, targets: Sequence[Target]) -> float:
     shown = [pose.anchor.frame(entry.layout) @ pose.T_obj_ee for pose in entry.key_poses]
     now = [target.T_world_ee for target in targets]
     constrained, free = [0.0], [0.0]
-    for i, pose in enumerate(entry.key_poses[1:], start=1):
+    for i, pose in enumerate(entry.key_poses[1:], start=1):  # a retreat of ours has nothing to compare with
         ways = [se3.inverse(poses[i]) @ poses[i - 1] for poses in (shown, now)]
         (constrained if pose.phase in CONSTRAINED_PHASES else free).append(float(se3.distance(*ways)))
     return max(constrained) + FREE_SPACE_SHARE * float(np.mean(free))
@@ -127,7 +154,7 @@ def check_transfer(
     Minimum distance is kept from the support surface: the lowest point that the hand reached in the
     demonstrations bounds how low it may be sent.
     """
-    problems = []
+    problems: list[str] = []
     low, high = robot.workspace
     before = T_world_ee
     for i, target in enumerate(targets):

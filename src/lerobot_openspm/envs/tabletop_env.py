@@ -143,7 +143,7 @@ class TabletopEnv(gym.Env):
         return {"is_success": status == "success", "status": status, "unstable": status == "unstable"}
 
     def _append_to_log(self, status: str) -> None:
-        """One JSON object a line: lerobot-eval keeps success alone, not the steps nor how an episode ended."""
+        """One JSON object a line: lerobot-eval keeps success alone, not steps nor how an episode ended."""
         line = {
             "task": self.task,
             "seed": self._seed,

@@ -66,7 +66,9 @@ class TrainingSet:
         return self._conditions[rows], self._chunks[rows]
 
     def _sample(self, n: int) -> Tensor:
-        return torch.multinomial(self._weights, n, replacement=True) if n else torch.zeros(0, dtype=torch.long)
+        return (
+            torch.multinomial(self._weights, n, replacement=True) if n else torch.zeros(0, dtype=torch.long)
+        )
 
     def _nearest_drawable(self, index: Tensor) -> Tensor:
         drawable = torch.nonzero(self._weights)[:, 0]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 from lerobot.datasets import LeRobotDataset
@@ -44,16 +45,16 @@ class Demonstrations:
 
     def episodes(self, indices: Sequence[int] | None = None) -> list[Episode]:
         """Read the given episodes, or all of them. Raises DatasetError for an index that does not exist."""
-        meta = self._dataset.meta.episodes
+        meta, tasks = self._dataset.meta.episodes, self._dataset.meta.tasks
+        if meta is None or tasks is None:
+            raise DatasetError(f"dataset {self.name} has no episodes; record some")
         n_episodes = self._dataset.meta.total_episodes
         wanted = list(range(n_episodes)) if indices is None else list(indices)
         if bad := [index for index in wanted if not 0 <= index < n_episodes]:
             raise DatasetError(f"dataset {self.name} has episodes 0 to {n_episodes - 1}, got {bad}")
-        columns = self._dataset.hf_dataset.select_columns([OBS_STATE, ACTION, "task_index"]).with_format(
-            "numpy"
-        )
-        table = columns[:]
-        names = {int(row["task_index"]): str(task) for task, row in self._dataset.meta.tasks.iterrows()}
+        columns = self._dataset.hf_dataset.select_columns([OBS_STATE, ACTION, "task_index"])
+        table = columns.with_format("numpy")[:]
+        names = {int(row["task_index"]): str(task) for task, row in tasks.iterrows()}
         episodes = []
         for index in wanted:
             first, last = int(meta["dataset_from_index"][index]), int(meta["dataset_to_index"][index])
@@ -73,7 +74,7 @@ class Demonstrations:
 
     def views(self, episode: Episode, frame: int, cameras: Mapping[str, Camera]) -> dict[str, View]:
         """Decode one frame's images of the calibrated cameras, keyed by camera."""
-        item = self._dataset[episode.from_index + frame]
+        item: dict[str, Any] = self._dataset[episode.from_index + frame]  # pyright: ignore[reportAssignmentType]
         views = {}
         for key, camera in cameras.items():
             if key not in item:

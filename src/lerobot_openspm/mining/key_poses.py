@@ -259,4 +259,4 @@ def _fist(episode: Episode, start: int, end: int) -> bool:
 def _speed(episode: Episode) -> Array:
     """Hand speed ``(n,)`` in metres per step, rotation included, averaged over three steps."""
     step = se3.distance(episode.T_world_ee[:-1], episode.T_world_ee[1:])
-    return np.convolve(np.append(step, step[-1:]), np.ones(3) / 3, mode="same")
+    return np.convolve(np.append(step, step[-1:]), np.ones(3) / 3, mode="same").astype(np.float64)

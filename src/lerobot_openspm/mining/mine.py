@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from tqdm import tqdm
@@ -122,21 +122,29 @@ class LearnedObjects:
 
 
 def layouts_in_scenes(
-    scenes: Sequence[Scene], known: Mapping[str, ObjectModel], rng: np.random.Generator
+    scenes: Sequence[Scene],
+    mined: Sequence[MinedEpisode],
+    known: Mapping[str, ObjectModel],
+    rng: np.random.Generator,
 ) -> LearnedObjects:
-    """Learn the objects that are not known yet, and find all of them in the scenes."""
+    """Learn the objects that are not known yet, and find those that each episode's instruction names."""
     named = sorted({hint.name for scene in scenes for hint in scene.hints} - set(known))
     models = dict(known)
     if named:
         logger.info("learning what these look like: %s", ", ".join(named))
-        learned = learn_objects(scenes, rng)
-        models |= {name: learned[name] for name in named if name in learned}
+        unknown = [
+            replace(scene, hints=tuple(hint for hint in scene.hints if hint.name in named))
+            for scene in scenes
+        ]
+        learned = learn_objects(unknown, rng)
+        models |= learned
         if missing := [name for name in named if name not in learned]:
             logger.warning("could not learn what %s looks like; no key pose will be anchored there", missing)
     layouts = []
-    for scene in tqdm(scenes, desc="Finding objects", unit="episode"):
+    for scene, item in tqdm(zip(scenes, mined, strict=True), "Finding objects", len(scenes), unit="episode"):
         prepared = {key: prepare(view) for key, view in scene.views.items()}
-        estimates = {name: localise(prepared, model) for name, model in models.items()}
+        wanted = dict.fromkeys(name for sub_task in item.sub_tasks for name in sub_task.objects)
+        estimates = {name: localise(prepared, models[name]) for name in wanted if name in models}
         layouts.append({name: e.T_world_obj for name, e in estimates.items() if e.status == "found"})
     return LearnedObjects(models, layouts)
 

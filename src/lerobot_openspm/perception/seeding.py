@@ -75,7 +75,7 @@ class Picture:
 
     def _column(self, hint: Hint) -> list[NDArray[np.float64]]:
         heights = np.arange(hint.point_world[2], self.floor - 1e-9, -0.02)
-        return [np.array([*hint.point_world[:2], z]) for z in heights]
+        return [np.array([*hint.point_world[:2], z], dtype=np.float64) for z in heights]
 
 
 def changed_pixels(first: View, later: View) -> Mask | None:

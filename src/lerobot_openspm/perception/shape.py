@@ -137,7 +137,7 @@ def around(cloud: Cloud, half_size: float) -> NDArray[np.bool_]:
 
 def _largest_body(solid: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """The largest 6-connected component of a solid."""
-    labels, count = label(solid)
+    labels, count = label(solid)  # pyright: ignore[reportGeneralTypeIssues]  (typed as a scalar)
     if count <= 1:
         return solid
     sizes = np.bincount(labels.ravel())
