@@ -45,9 +45,8 @@ def main() -> None:
     by_task = defaultdict(list)
     for entry in experience.entries:
         by_task[entry.language].append(entry)
-    print(
-        f"{meta.total_episodes} demonstrations, {meta.total_frames} frames; objects: {list(experience.objects)}"
-    )
+    names = ", ".join(experience.objects)
+    print(f"{meta.total_episodes} demonstrations, {meta.total_frames} frames; objects: {names}")
     for instruction, entries in by_task.items():
         print(f"\n{instruction!r}, remembered {len(entries)} times")
         for i, pose in enumerate(entries[0].key_poses):
@@ -60,10 +59,9 @@ def main() -> None:
             )
 
     # 4. Keep. The memory is JSON that a person can read, and arrays beside it.
-    save_experience(experience, options.output / "memory")
-    print(
-        f"\nsaved to {options.output / 'memory'}; `openspm inspect --path={options.output / 'memory'}` shows it"
-    )
+    memory = options.output / "memory"
+    save_experience(experience, memory)
+    print(f"\nsaved to {memory}; `openspm inspect --path={memory}` shows it")
 
 
 if __name__ == "__main__":
