@@ -108,7 +108,7 @@ def load_experience(directory: Path) -> Experience:
     if memory.get("format") != FORMAT:
         raise MemoryFormatError(f"{where}: got format {memory.get('format')!r}, expected {FORMAT!r}")
     version = memory.get("version")
-    if not isinstance(version, int) or version > VERSION or version < 1:
+    if type(version) is not int or not 1 <= version <= VERSION:
         raise MemoryFormatError(
             f"{where}: got version {version!r}, this release reads up to {VERSION}; "
             "upgrade lerobot_policy_openspm"
@@ -123,6 +123,8 @@ def load_experience(directory: Path) -> Experience:
         ) from error
     if not isinstance(rows, list) or not isinstance(objects, list):
         raise MemoryFormatError(f"{where}: 'entries' and 'objects' must be lists")
+    if perception not in ("demonstrations", "oracle"):
+        raise MemoryFormatError(f"{where}: perception is {perception!r}, expected demonstrations or oracle")
     arrays = _read_arrays(directory / MEMORY_ARRAYS, checksum)
     models = {}
     for fields in objects:
@@ -158,7 +160,7 @@ def _read_arrays(path: Path, checksum: object) -> dict[str, np.ndarray]:
         )
     try:
         return load_arrays(blob)
-    except SafetensorError as error:
+    except (SafetensorError, KeyError) as error:  # KeyError: a type that NumPy does not have
         raise MemoryFormatError(f"{path}: not safetensors ({error}); train or pull it again") from error
 
 

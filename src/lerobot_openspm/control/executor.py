@@ -100,10 +100,6 @@ class Executor:
         self._believed = hand.T_world_ee
         self._enter(index, hand)
 
-    def revise(self, plan: Sequence[Target]) -> None:
-        """Replace the targets by better estimates of the same key poses, without losing the place."""
-        self.plan = tuple(plan)
-
     @property
     def target(self) -> Target | None:
         """The key pose that is being approached, or None."""

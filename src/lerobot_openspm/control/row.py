@@ -111,7 +111,11 @@ class Row:
         entry, index = self.ranked[0].entry, self.executor.retry_index()
         ahead = list(dict.fromkeys(name for pose in entry.key_poses[index:] for name in pose.anchor.objects))
         self.layout |= look(ahead)
-        self.executor.begin(self._transfer(entry, hand), hand, index)
+        if problems := self._problems(entry, hand):
+            logger.warning("%r: %s", self.instruction, "; ".join(problems))
+            self.executor.status = Status.INFEASIBLE
+        else:
+            self.executor.begin(self._transfer(entry, hand), hand, index)
 
     def _geometric_score(self, entry: MemoryEntry, hand: Hand) -> float:
         """``S_geo``: 0 if an entry cannot be executed here, else how like its demonstration it would be."""

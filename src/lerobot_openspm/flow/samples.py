@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from lerobot_openspm.errors import DatasetError
 from lerobot_openspm.flow.condition import Conditioning, Query, encode, progress, to_model_frame
 from lerobot_openspm.geometry import se3
 from lerobot_openspm.geometry.se3 import Array
@@ -55,6 +56,8 @@ def segment_frames(
         if pose.frame > before
     ]
     parts = [part for part in parts if len(part)]
+    if not parts:
+        raise DatasetError("the key poses of the dataset have no motion between them; record longer episodes")
     stack = {
         name: np.concatenate([getattr(p.query, name) for p in parts]) for name in Query.__dataclass_fields__
     }

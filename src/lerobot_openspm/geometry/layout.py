@@ -121,9 +121,7 @@ class VectorLayout:
         return numbers.reshape(*rotvec.shape[:-1], -1)
 
 
-def parse_layout(
-    names: Sequence[str], what: str, rotation_kind: RotationKind | None = None, *, needs_gripper: bool = True
-) -> VectorLayout:
+def parse_layout(names: Sequence[str], what: str, rotation_kind: RotationKind | None = None) -> VectorLayout:
     """Read a layout from names.
 
     Args:
@@ -131,7 +129,6 @@ def parse_layout(
         what: "state" or "action", for errors.
         rotation_kind: Overrides what the names say about the rotation (the public LIBERO dataset calls its
             axis-angle numbers roll, pitch and yaw). ``"none"`` ignores a rotation.
-        needs_gripper: Whether a layout without a gripper is an error.
 
     Raises:
         LayoutError: x, y or z is missing, a rotation is incomplete, or there is no gripper.
@@ -149,7 +146,7 @@ def parse_layout(
     if partial and not found:
         raise LayoutError(f"{what} names {list(names)} hold an incomplete rotation; {hint}")
     gripper = tuple(i for i, name in enumerate(folded) if name == "gripper")
-    if needs_gripper and not gripper:
+    if not gripper:
         raise LayoutError(f"{what} names {list(names)} hold no gripper or finger; {hint}")
     named: RotationKind = found[0] if found else "none"
     rotation = tuple(folded.index(part) for part in _ROTATIONS[named]) if found else ()

@@ -30,6 +30,8 @@ SETTLED_FRACTION = 0.01
 # A hand slower than this fraction of its usual speed stands still.
 STILL_FRACTION = 0.12
 MAX_DWELL_STEPS = 30
+# An episode in which the hand never moves faster than this, per step, holds no motion at all.
+MOTIONLESS_M = 1e-5
 # Closed fingers that hold something and rise by this much carry it; otherwise they pull or turn it.
 LIFTED_M = 0.03
 TURNED_RAD = np.deg2rad(35)
@@ -82,8 +84,10 @@ class _Mark:
 
 def find_key_poses(episode: Episode, robot: RobotModel) -> list[KeyPose]:
     """Find the key poses of an episode, in order. An empty list means that nothing was touched or pushed."""
+    speed = _speed(episode) if len(episode) > 1 else np.zeros(len(episode))
+    if speed.max(initial=0.0) < MOTIONLESS_M:
+        return []
     closed = _debounced(robot.closed(episode.actions[:, 6]))
-    speed = _speed(episode)
     moving = speed > STILL_FRACTION * np.median(speed[speed > 0.1 * speed.max()])
     events = [(f, _settled(episode, robot, f, moving)) for f in np.flatnonzero(np.diff(closed)) + 1]
     starts = [0] + [end for _, end in events]
@@ -153,7 +157,10 @@ def _carry_marks(episode: Episode, start: int, end: int, contact: int) -> list[_
 def _push_marks(episode: Episode, start: int, end: int, closed: bool, contact: int) -> list[_Mark]:
     """Approach, push and retreat of a hand that holds nothing but travels low."""
     height = episode.T_world_ee[start : end + 1, 2, 3]
-    low = np.flatnonzero(height < height.min() + PUSH_BAND_M)
+    # The lowest stretch: a hand that dips twice and rises in between has pushed nothing from one to the other.
+    lowest = int(np.argmin(height))
+    high = np.flatnonzero(height >= height[lowest] + PUSH_BAND_M)
+    low = np.arange(high[high < lowest].max(initial=-1) + 1, high[high > lowest].min(initial=len(height)))
     first, last = start + _bottom(height, int(low[0]), 1), start + _bottom(height, int(low[-1]), -1)
     metres, _ = se3.distances(episode.T_world_ee[first], episode.T_world_ee[last])
     if metres < 0.04:  # a hand that only passes a low point pushes nothing

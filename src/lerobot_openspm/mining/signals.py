@@ -53,13 +53,14 @@ def observe_robot(episodes: Sequence[Episode]) -> RobotModel:
     opening = np.concatenate([episode.opening for episode in episodes])
     positions = np.concatenate([episode.T_world_ee[:, :3, 3] for episode in episodes])
     speed = np.concatenate([se3.distance(e.T_world_ee[:-1], e.T_world_ee[1:]) for e in episodes])
+    moving = speed[speed > 0.1 * speed.max(initial=0.0)]
     return RobotModel(
         close_command=float(close),
         open_command=float(open_),
         open_width=float(np.percentile(opening, 98)),
         metres_per_action=_gain(episodes, slice(0, 3)),
         radians_per_action=_gain(episodes, slice(3, 6)),
-        metres_per_step=float(np.median(speed[speed > 0.1 * speed.max()])),
+        metres_per_step=float(np.median(moving)) if len(moving) else 0.0,
         workspace=np.stack([positions.min(axis=0), positions.max(axis=0)]),
     )
 
