@@ -43,8 +43,7 @@ path, root, repo = sys.argv[1:]
 # It asks huggingface.co by name, whatever HF_ENDPOINT says.
 ModelCard.validate = lambda self, repo_type=None: None
 config = OpenSPMConfig.from_pretrained(path)
-# The path of the calibration holds where training ran; the checkpoint has its own copy.
-config.cameras, config.repo_id = None, repo
+config.repo_id = repo
 policy = OpenSPMPolicy.from_pretrained(path, config=config)
 pre, post = make_pre_post_processors(config, path)
 train_config = TrainPipelineConfig.from_pretrained(path)

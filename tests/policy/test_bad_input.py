@@ -142,7 +142,6 @@ def test_a_changed_memory_is_refused(
         load(copy)
 
 
-@pytest.mark.xfail(reason="config.json keeps the relative path of the calibration used in training")
 def test_a_checkpoint_loads_from_any_folder(copy: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.chdir(tmp_path)
     policy = OpenSPMPolicy.from_pretrained(copy)
