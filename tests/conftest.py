@@ -1,4 +1,4 @@
-"""Fixtures for every test. The recorded and the trained ones are made once per run, whatever the number of workers."""
+"""Fixtures for every test. What is recorded and trained is made once per run."""
 
 import os
 import shutil
@@ -20,7 +20,7 @@ def loopback_hub() -> Iterator[LoopbackHub]:
 
 @pytest.fixture(scope="session")
 def make_once(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., Path]:
-    """Make a folder once for all workers of a run; the others wait for it. Nobody may change what lies in it."""
+    """Make a folder once for all workers of a run; the others wait. Nobody may change what lies in it."""
     base = tmp_path_factory.getbasetemp()
     base = base.parent if "PYTEST_XDIST_WORKER" in os.environ else base
 
