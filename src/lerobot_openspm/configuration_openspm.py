@@ -138,14 +138,14 @@ class OpenSPMConfig(PreTrainedConfig):
             "passing_m", "passing_rad", "max_jump_m", "max_jump_rad", "optimizer_lr", "scheduler_decay_steps",
         )  # fmt: skip
         for name in positive:
-            if getattr(self, name) <= 0:
+            if not getattr(self, name) > 0:  # NaN is not either
                 raise ValueError(f"{name} is {getattr(self, name)}, expected more than 0")
         not_negative = (
             "perturbation_m", "perturbation_rad", "max_corrections", "max_attempts", "reach_margin_m",
             "min_clearance_m", "weight_semantic", "weight_geometric", "weight_quality",
         )  # fmt: skip
         for name in not_negative:
-            if getattr(self, name) < 0:
+            if not getattr(self, name) >= 0:
                 raise ValueError(f"{name} is {getattr(self, name)}, expected 0 or more")
 
     def set_dataset_feature_metadata(self, features: Mapping[str, Any]) -> None:

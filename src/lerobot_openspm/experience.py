@@ -65,9 +65,21 @@ class Experience:
         Objects that both know keep the newer model only if no entry of ours is anchored to the older one,
         because a key pose means nothing in another model's frame.
         """
-        sources = {entry.source for entry in newer.entries}
-        kept = tuple(entry for entry in self.entries if entry.source not in sources)
+        kept = tuple(
+            entry
+            for entry in self.entries
+            if not any(_same_demonstration(entry, new) for new in newer.entries)
+        )
         return replace(self, entries=kept + newer.entries, objects={**newer.objects, **self.objects})
+
+
+def _same_demonstration(a: MemoryEntry, b: MemoryEntry) -> bool:
+    """Whether two entries were mined from the same episode; datasets of one name may hold different ones."""
+    return (
+        (a.source, a.language, a.key) == (b.source, b.language, b.key)
+        and all(x.n_steps == y.n_steps for x, y in zip(a.key_poses, b.key_poses, strict=True))
+        and all(np.allclose(x.T_obj_ee, y.T_obj_ee) for x, y in zip(a.key_poses, b.key_poses, strict=True))
+    )
 
 
 def save_experience(experience: Experience, directory: Path) -> None:

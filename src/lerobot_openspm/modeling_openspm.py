@@ -223,22 +223,22 @@ class OpenSPMPolicy(PreTrainedPolicy):
     def _attach(self, directory: Path, dataset_meta: Any | None) -> None:
         """Give a freshly loaded policy its memory, and its training set when training goes on."""
         self.experience = load_experience(directory)
-        if self.config.cameras is not None:
-            self.experience = replace(self.experience, cameras=load_cameras(Path(self.config.cameras)))
-        if dataset_meta is not None:
-            if self.config.memory_update != "keep":
-                known = self.experience if self.config.memory_update == "append" else None
-                self.experience = mine_experience(dataset_meta, self.config, known)
-            logger.info(
-                "memory_update=%s: %d entries", self.config.memory_update, len(self.experience.entries)
-            )
-            self._training_set = training_set(dataset_meta, self.config)
         if self.experience.perception != self.config.perception:
             raise MemoryFormatError(
                 f"the memory in {directory} holds key poses in the frames of perception="
                 f"{self.experience.perception}, got --policy.perception={self.config.perception}; the two "
                 "cannot be mixed, train with the one you evaluate"
             )
+        if self.config.cameras is not None:
+            self.experience = replace(self.experience, cameras=load_cameras(Path(self.config.cameras)))
+        if dataset_meta is not None:
+            if self.config.memory_update != "keep":
+                known = self.experience if self.config.memory_update == "append" else None
+                self.experience = mine_experience(dataset_meta, self.config, known, self.experience.cameras)
+            logger.info(
+                "memory_update=%s: %d entries", self.config.memory_update, len(self.experience.entries)
+            )
+            self._training_set = training_set(dataset_meta, self.config)
 
     def _require_experience(self) -> Experience:
         if self.experience is None:

@@ -67,6 +67,11 @@ class Observation:
                 f"perception=oracle needs {OBJECT_POSES!r}, which this environment does not give; pass "
                 "--env.object_poses=true on the tabletop, or use --policy.perception=demonstrations"
             )
+        if self.object_poses.shape != (7 * len(names),):
+            raise ObservationError(
+                f"{OBJECT_POSES!r} has shape {self.object_poses.shape}, expected ({7 * len(names)},): "
+                f"position and quat_wxyz of {', '.join(names)}, as in the demonstrations"
+            )
         rows = self.object_poses.reshape(len(names), 7)
         T = se3.transform(se3.matrix_from_quat_xyzw(rows[:, [4, 5, 6, 3]]), rows[:, :3])
         return dict(zip(names, T, strict=True))
@@ -82,12 +87,18 @@ def split_batch(batch: Mapping[str, Any], state_layout: VectorLayout) -> list[Ob
     if OBS_STATE not in batch:
         raise ObservationError(f"the observation has no {OBS_STATE!r}; it has {sorted(batch)}")
     states = batch[OBS_STATE].detach().cpu().numpy().astype(float)
+    if states.ndim != 2:
+        raise ObservationError(f"{OBS_STATE!r} has shape {states.shape}, expected (environments, numbers)")
     if not np.isfinite(states).all():
         raise ObservationError(f"{OBS_STATE!r} is not finite: {states}")
     tasks = batch.get("task")
     if tasks is None:
         raise ObservationError(f"the observation has no 'task', the instruction; it has {sorted(batch)}")
     tasks = [tasks] * len(states) if isinstance(tasks, str) else list(tasks)
+    if len(tasks) != len(states) or not all(isinstance(task, str) for task in tasks):
+        raise ObservationError(
+            f"'task' is {tasks!r}, expected an instruction for each of {len(states)} states"
+        )
     T_world_ee, openings = state_layout.poses(states), state_layout.openings(states)
     images = {
         k: v for k, v in batch.items() if k.startswith("observation.image") and isinstance(v, torch.Tensor)

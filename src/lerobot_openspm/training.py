@@ -14,7 +14,7 @@ from lerobot_openspm.errors import CalibrationError, DatasetError
 from lerobot_openspm.experience import Experience
 from lerobot_openspm.flow.samples import perturbed, segment_frames
 from lerobot_openspm.flow.training_set import TrainingSet
-from lerobot_openspm.geometry.camera import load_cameras
+from lerobot_openspm.geometry.camera import Camera, load_cameras
 from lerobot_openspm.mining.dataset import Demonstrations
 from lerobot_openspm.mining.mine import (
     build_entries,
@@ -40,7 +40,12 @@ def open_demonstrations(dataset_meta: Any, config: OpenSPMConfig) -> Demonstrati
     return Demonstrations(dataset, *config.layouts())
 
 
-def mine_experience(dataset_meta: Any, config: OpenSPMConfig, known: Experience | None = None) -> Experience:
+def mine_experience(
+    dataset_meta: Any,
+    config: OpenSPMConfig,
+    known: Experience | None = None,
+    cameras: dict[str, Camera] | None = None,
+) -> Experience:
     """Mine a dataset's key poses, learn its objects, and make memory entries of it.
 
     Deterministic: every process of a distributed run mines the same.
@@ -49,17 +54,19 @@ def mine_experience(dataset_meta: Any, config: OpenSPMConfig, known: Experience 
         dataset_meta: LeRobot's metadata of the dataset.
         config: The policy's configuration.
         known: An experience to append to. Its objects are recognised by what is known of them.
+        cameras: Calibration to use where the configuration names no file.
 
     Raises:
         CalibrationError: No calibration is given, or it does not fit.
         DatasetError: The dataset yields no key poses or no anchors.
     """
-    if config.cameras is None and known is None:
+    if config.cameras is not None:
+        cameras = load_cameras(Path(config.cameras))
+    if cameras is None:
         raise CalibrationError(
             "mining needs the cameras' calibration, got none; pass --policy.cameras=FILE, e.g. "
             "configs/cameras/openspm_tabletop.json"
         )
-    cameras = load_cameras(Path(config.cameras)) if config.cameras is not None else known.cameras  # type: ignore[union-attr]
     demonstrations = open_demonstrations(dataset_meta, config)
     mined = mine_key_poses(demonstrations, config.memory_episodes)
     scenes = learn_scenes(demonstrations, mined.mined, cameras)

@@ -75,7 +75,6 @@ def test_a_bad_observation_is_refused(
     assert torch.isfinite(policy.select_action(batch)).all()
 
 
-@pytest.mark.xfail(reason="raises what NumPy and Python raise")
 @pytest.mark.parametrize(
     "spoil",
     [
@@ -176,7 +175,6 @@ def test_the_oracle_needs_the_poses(oracle: OpenSPMPolicy, recorded: list[list[F
 
 
 @pytest.mark.slow
-@pytest.mark.xfail(reason="raises what NumPy raises", raises=ValueError)
 def test_the_oracle_needs_as_many_poses_as_were_recorded(oracle: OpenSPMPolicy, recorded: list[list[Frame]]):
     with pytest.raises(ObservationError, match="object_poses"):
         oracle.select_action(batch_of([recorded[0][0]]) | {"observation.object_poses": torch.zeros(1, 5)})

@@ -123,7 +123,6 @@ def test_every_way_of_writing_a_rotation_gives_the_same_hand(kind: str):
     )
 
 
-@pytest.mark.xfail(reason="NaN is neither less nor more than anything")
 def test_numbers_that_are_not_finite_are_refused():
     with pytest.raises(ValueError, match="residual_m"):
         config(residual_m=float("nan"))

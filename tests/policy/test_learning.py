@@ -182,7 +182,6 @@ def test_fine_tuning_updates_the_memory_as_asked(
     assert sorted(languages(load(tmp_path, dataset_meta=other_meta))) == sorted(expected)
 
 
-@pytest.mark.xfail(reason="the checkpoint's calibration is not handed to mining")
 def test_rebuilding_looks_through_the_cameras_of_the_checkpoint(
     load: Callable[..., OpenSPMPolicy], other_meta: LeRobotDatasetMetadata
 ):
@@ -190,7 +189,6 @@ def test_rebuilding_looks_through_the_cameras_of_the_checkpoint(
     assert languages(tuned) == [PUSH] * 2
 
 
-@pytest.mark.xfail(reason="entries of two datasets of one name replace each other")
 def test_appending_keeps_the_episodes_of_another_dataset_of_the_same_name(
     load: Callable[..., OpenSPMPolicy], other_dataset: Path
 ):

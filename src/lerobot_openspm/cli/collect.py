@@ -11,20 +11,17 @@ from concurrent.futures import Future, ProcessPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
-from unittest import mock
 
 from lerobot_openspm.envs.seeds import DEMO_SEED_START, require_demo_seeds
 from lerobot_openspm.envs.tasks import TASK_NAMES, select_tasks
 
 if TYPE_CHECKING:
-    import numpy as np
     from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
     from lerobot_openspm.envs.recording import RecordedEpisode
 
 SUMMARY_FILE = "meta/openspm_collect.json"
 FPS = 20
-STATISTICS_EVERY = 10
 # Every task has its own stretch of seeds, so that no two tasks show the same initial states.
 SEEDS_PER_TASK = 10_000
 # An expert that fails more often than this is broken, and collecting on would only hide it.
@@ -75,7 +72,7 @@ def collect(config: CollectConfig) -> dict[str, Any]:
     partial = root.with_name(root.name + ".partial")
     shutil.rmtree(partial, ignore_errors=True)
     root.parent.mkdir(parents=True, exist_ok=True)
-    with _quiet_libraries(), _sampled_image_statistics():
+    with _quiet_libraries():
         dataset = _create_dataset(config, partial)
         try:
             episodes, discarded = _record_all(config, dataset)
@@ -176,28 +173,6 @@ def _quiet_libraries() -> Generator[None]:
         av.logging.set_libav_level(level if level is not None else av.logging.INFO)
         if not bars:
             datasets.enable_progress_bars()
-
-
-@contextlib.contextmanager
-def _sampled_image_statistics() -> Generator[None]:
-    """Take image statistics from every tenth frame while recording.
-
-    LeRobot samples frames when it encodes afterwards, but when it encodes while recording it puts every
-    pixel of every frame into a histogram, which costs more than simulating, rendering and encoding together.
-    """
-    from lerobot.datasets import compute_stats
-
-    class SampledStatistics(compute_stats.RunningQuantileStats):
-        _batches_seen = 0
-
-        def update(self, batch: "np.ndarray") -> None:
-            # States and actions come as one batch per episode, images as one per frame.
-            if self._batches_seen % STATISTICS_EVERY == 0:
-                super().update(batch)
-            self._batches_seen += 1
-
-    with mock.patch.object(compute_stats, "RunningQuantileStats", SampledStatistics):
-        yield
 
 
 def _record_all(config: CollectConfig, dataset: "LeRobotDataset") -> tuple[list[dict], list[dict]]:

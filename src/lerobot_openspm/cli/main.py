@@ -6,6 +6,8 @@ import importlib
 import logging
 import sys
 
+from draccus.utils import ParsingError
+
 from lerobot_openspm.errors import OpenSPMError
 
 # Command -> module with `main(args)`, and what it is for. Modules are imported when they are asked for.
@@ -30,6 +32,6 @@ def main() -> None:
     logging.basicConfig(level=logging.INFO, format="%(levelname)s %(message)s", stream=sys.stderr)
     try:
         importlib.import_module(COMMANDS[command][0]).main(args)
-    except (OpenSPMError, FileExistsError, FileNotFoundError) as error:
+    except (OpenSPMError, ParsingError, FileExistsError, FileNotFoundError) as error:
         print(f"openspm {command}: {error}", file=sys.stderr)
         sys.exit(2)

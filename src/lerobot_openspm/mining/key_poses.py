@@ -157,7 +157,7 @@ def _carry_marks(episode: Episode, start: int, end: int, contact: int) -> list[_
 def _push_marks(episode: Episode, start: int, end: int, closed: bool, contact: int) -> list[_Mark]:
     """Approach, push and retreat of a hand that holds nothing but travels low."""
     height = episode.T_world_ee[start : end + 1, 2, 3]
-    # The lowest stretch: a hand that dips twice and rises in between has pushed nothing from one to the other.
+    # The lowest stretch: a hand that dips twice and rises in between has pushed nothing on the way.
     lowest = int(np.argmin(height))
     high = np.flatnonzero(height >= height[lowest] + PUSH_BAND_M)
     low = np.arange(high[high < lowest].max(initial=-1) + 1, high[high > lowest].min(initial=len(height)))
