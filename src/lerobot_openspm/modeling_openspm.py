@@ -122,7 +122,7 @@ class OpenSPMPolicy(PreTrainedPolicy):
             experience.entries, experience.yaw_periods, experience.robot, config.score_weights,
             config.transfer_limits, config.control_settings,
         )  # fmt: skip
-        return Row(knowledge, observation.instruction, observation.state, config.noise_seed)
+        return Row(knowledge, observation.instruction, observation.fingerprint(), config.noise_seed)
 
     def _find(self, names: Sequence[str], observation: Observation) -> Mapping[str, np.ndarray]:
         return find_objects(names, observation, self._require_experience())

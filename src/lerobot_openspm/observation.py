@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import zlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -40,6 +41,14 @@ class Observation:
     hand: Hand
     images: Mapping[str, torch.Tensor]
     object_poses: Array | None
+
+    def fingerprint(self) -> int:
+        """A number that tells this observation from others, by its state and images."""
+        parts = [
+            self.state.tobytes(),
+            *(self.images[key].cpu().numpy().tobytes() for key in sorted(self.images)),
+        ]
+        return zlib.crc32(b"".join(parts))
 
     def views(self, cameras: Mapping[str, Camera]) -> dict[str, View]:
         """Images of the calibrated cameras with the cameras' present poses.

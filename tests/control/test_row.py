@@ -10,7 +10,6 @@ from lerobot_openspm.errors import InstructionError
 from lerobot_openspm.memory.retrieval import ScoreWeights
 
 HAND = Hand(hand_pose(0.0, 0.0, 0.3), OPEN_WIDTH)
-STATE = np.arange(8.0)
 INSTRUCTION = "put the bowl on the plate"
 
 
@@ -31,8 +30,8 @@ class Eyes:
         return {name: self.layout[name] for name in names if name in self.layout}
 
 
-def row(*entries, instruction=INSTRUCTION, seed=0, state=STATE, limits=None):
-    return Row(knowledge(*entries, limits=limits), instruction, state, seed)
+def row(*entries, instruction=INSTRUCTION, seed=0, shown=7, limits=None):
+    return Row(knowledge(*entries, limits=limits), instruction, shown, seed)
 
 
 def test_the_first_observation_makes_a_plan():
@@ -104,7 +103,7 @@ def test_an_unknown_instruction_raises():
 
 def test_noise_is_a_function_of_seed_episode_and_chunk_alone():
     shape, eyes = (5, 7), Eyes(entry().layout)
-    others = [row(state=STATE + i) for i in range(1, 4)]  # made before: no shared generator moves on
+    others = [row(shown=8 + i) for i in range(1, 4)]  # made before: no shared generator moves on
     first, again = row(), row()
     noise = first.noise(shape)
     for other in others:

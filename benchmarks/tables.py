@@ -1,0 +1,96 @@
+"""Writes ``docs/results.md`` from the JSON files under ``benchmarks/results``; measures nothing itself."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+RESULTS = Path(__file__).parent / "results"
+INTRODUCTION = """# Results on the tabletop
+
+Made by `python benchmarks/tables.py` from `benchmarks/results`; each file there says on what commit and machine it
+was measured. Ten demonstrations a task; the evaluation seeds were used for these figures alone. Rates come with
+95 % Wilson intervals."""
+PAGE = Path(__file__).parent.parent / "docs" / "results.md"
+
+
+def main() -> None:
+    """Write the page; a table whose JSON is missing says so."""
+    parts = [
+        INTRODUCTION,
+        _part("How key poses are followed, from pixels", "execution", _execution),
+        _part("Object poses from the simulator (oracle)", "oracle", _oracle),
+        _part("What the flow model is told, from pixels", "conditioning", _conditioning),
+        _part("Error of the object poses on unseen scenes", "perception", _perception),
+    ]
+    PAGE.write_text("\n\n".join(parts) + "\n")
+    print(PAGE)
+
+
+def _part(title: str, name: str, table: Any) -> str:
+    path = RESULTS / f"{name}.json"
+    if not path.exists():
+        return f"## {title}\n\nNot measured: `{path.name}` is missing; run `make figures`."
+    result = json.loads(path.read_text())
+    note = (
+        f"Commit `{result['commit']}`, {result['machine']['cores']} cores ({result['machine']['processor']})."
+    )
+    return f"## {title}\n\n{table(result)}\n\n{note}"
+
+
+def _execution(result: dict[str, Any]) -> str:
+    note = f"The demonstrations take {result['expert_steps']} steps on average; mining and training took "
+    return f"{_rates(result['runs'])}\n\n{note}{result['train_s']:.0f} s.\n\n{_per_task(result['runs'])}"
+
+
+def _oracle(result: dict[str, Any]) -> str:
+    runs = {"oracle": result["oracle"]}
+    return f"{_rates(runs)}\n\n{_per_task(runs)}"
+
+
+def _conditioning(result: dict[str, Any]) -> str:
+    return _rates({name: result[name] for name in ("equivariant", "paper")})
+
+
+def _perception(result: dict[str, Any]) -> str:
+    rows = [
+        [
+            name,
+            row["n"],
+            row["not_found"],
+            row["position_mm_mean"],
+            row["position_mm_p95"],
+            "round" if row["yaw_deg_mean"] is None else row["yaw_deg_mean"],
+        ]
+        for name, row in result["objects"].items()
+    ]
+    heads = ["Object", "Scenes", "Not found", "Mean, mm", "95th percentile, mm", "Yaw, degrees"]
+    return _table(heads, rows)
+
+
+def _rates(runs: dict[str, Any]) -> str:
+    rows = [
+        [
+            name.replace("_", " "),
+            f"{100 * run['success']:.1f} %",
+            f"{100 * run['interval'][0]:.1f} to {100 * run['interval'][1]:.1f} %",
+            run["n"],
+            run["mean_steps"],
+        ]
+        for name, run in runs.items()
+    ]
+    return _table(["", "Success", "95 % interval", "Episodes", "Mean steps of successes"], rows)
+
+
+def _per_task(runs: dict[str, Any]) -> str:
+    tasks = next(iter(runs.values()))["per_task"]
+    rows = [[task, *(f"{100 * run['per_task'][task]:.0f} %" for run in runs.values())] for task in tasks]
+    return _table(["Task", *(name.replace("_", " ") for name in runs)], rows)
+
+
+def _table(heads: list[str], rows: list[list[Any]]) -> str:
+    lines = [heads, ["---"] * len(heads), *rows]
+    return "\n".join("| " + " | ".join(str(cell) for cell in line) + " |" for line in lines)
+
+
+if __name__ == "__main__":
+    main()
