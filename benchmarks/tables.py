@@ -7,9 +7,9 @@ from typing import Any
 RESULTS = Path(__file__).parent / "results"
 INTRODUCTION = """# Results on the tabletop
 
-Made by `python benchmarks/tables.py` from `benchmarks/results`; each file there says on what commit and machine it
-was measured. Ten demonstrations a task; the evaluation seeds were used for these figures alone. Rates come with
-95 % Wilson intervals."""
+Made by `python benchmarks/tables.py` from `benchmarks/results`; each file there says on what commit and
+machine it was measured. Ten demonstrations a task; the evaluation seeds were used for these figures alone.
+Rates come with 95 % Wilson intervals."""
 PAGE = Path(__file__).parent.parent / "docs" / "results.md"
 
 
