@@ -6,6 +6,7 @@ import logging
 import conditioning
 import execution
 import oracle
+import tables
 
 import perception
 
@@ -15,6 +16,7 @@ def main() -> None:
     logging.basicConfig(level=logging.INFO, format="%(levelname)s %(message)s")
     followed, errors = execution.main(), perception.main()
     truth, _ = oracle.main(), conditioning.main()
+    tables.write_page()
     runs = followed["runs"]
     summary = {
         "oracle_success": truth["oracle"]["success"],

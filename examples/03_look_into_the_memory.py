@@ -48,7 +48,7 @@ def main() -> None:
         experience.entries, experience.yaw_periods, experience.robot, config.score_weights,
         config.transfer_limits, config.control_settings,
     )  # fmt: skip
-    row = Row(knowledge, options.instruction, observation.state, noise_seed=0)
+    row = Row(knowledge, options.instruction, observation.fingerprint(), noise_seed=0)
     row.observe(observation.hand, lambda names: find_objects(names, observation, experience))
 
     print(f"{options.instruction!r}: {row.status.name.lower()}")

@@ -62,15 +62,24 @@ class Experience:
     def appended(self, newer: Experience) -> Experience:
         """This experience with the entries of another one added.
 
-        Objects that both know keep the newer model only if no entry of ours is anchored to the older one,
-        because a key pose means nothing in another model's frame.
+        An episode that both hold is taken from the newer one, its version counted up. Objects that both know
+        keep the older model, because a key pose means nothing in another model's frame.
+
+        Raises:
+            MemoryFormatError: The newer one comes from another robot.
         """
-        kept = tuple(
-            entry
-            for entry in self.entries
-            if not any(_same_demonstration(entry, new) for new in newer.entries)
+        kept, added = list(self.entries), []
+        for new in newer.entries:
+            old = next((entry for entry in kept if _same_demonstration(entry, new)), None)
+            if old is not None:
+                kept.remove(old)
+            added.append(new if old is None else replace(new, version=old.version + 1))
+        return replace(
+            self,
+            entries=(*kept, *added),
+            objects={**newer.objects, **self.objects},
+            robot=self.robot.covering(newer.robot),
         )
-        return replace(self, entries=kept + newer.entries, objects={**newer.objects, **self.objects})
 
 
 def _same_demonstration(a: MemoryEntry, b: MemoryEntry) -> bool:

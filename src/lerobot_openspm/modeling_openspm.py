@@ -93,16 +93,20 @@ class OpenSPMPolicy(PreTrainedPolicy):
 
     @torch.no_grad()
     def predict_action_chunk(self, batch: dict[str, Tensor], **kwargs: Any) -> Tensor:
-        """Generate a chunk ``(b, chunk_size, action_dim)`` for every environment, queueing none of it."""
+        """Generate a chunk ``(b, chunk_size, action_dim)`` for every environment; the caller executes it."""
         self.eval()
         state_layout, action_layout = self.config.layouts()
         observations = split_batch(batch, state_layout)
         chunks = []
         for row, observation in zip(self._rows_of(observations), observations, strict=True):
             row.observe(observation.hand, lambda names, seen=observation: self._find(names, seen))
-            moving = row.executor.target is not None
-            hold = np.tile(row.executor.hold(), (self.config.chunk_size, 1))
-            chunks.append(self._chunk(row, row.query(observation.hand)) if moving else hold)
+            chunk = np.tile(row.executor.hold(), (self.config.chunk_size, 1))
+            if row.executor.target is not None:
+                chunk = self._chunk(row, row.query(observation.hand))
+                row.executor.push_chunk(chunk)
+                while row.next_action() is not None:  # count them as done
+                    pass
+            chunks.append(chunk)
         vectors = action_layout.encode_actions(np.stack(chunks))
         return torch.as_tensor(vectors, dtype=torch.float32, device=self.config.device)
 
@@ -174,10 +178,11 @@ class OpenSPMPolicy(PreTrainedPolicy):
     # Persistence: the memory travels with the weights.
 
     def _save_pretrained(self, save_directory: Path, state_dict: dict[str, Tensor] | None = None) -> None:
+        experience = self._require_experience()  # before anything is written
         super()._save_pretrained(save_directory, state_dict=state_dict)
         # The calibration travels as a file of the checkpoint, not as a path that exists on one machine.
         replace(self.config, cameras=None)._save_pretrained(Path(save_directory))
-        save_experience(self._require_experience(), Path(save_directory))
+        save_experience(experience, Path(save_directory))
 
     @classmethod
     def from_pretrained(
@@ -223,6 +228,10 @@ class OpenSPMPolicy(PreTrainedPolicy):
     def _attach(self, directory: Path, dataset_meta: Any | None) -> None:
         """Give a freshly loaded policy its memory, and its training set when training goes on."""
         self.experience = load_experience(directory)
+        if not self.experience.entries:
+            raise MemoryFormatError(
+                f"the memory in {directory} holds no entries, so nothing can be done with it; train again"
+            )
         if self.experience.perception != self.config.perception:
             raise MemoryFormatError(
                 f"the memory in {directory} holds key poses in the frames of perception="

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from lerobot_openspm.envs import scene
-from lerobot_openspm.envs.calibration import calibration_document, camera_calibration, project
+from lerobot_openspm.envs.calibration import calibration_document, camera_calibration
+from lerobot_openspm.geometry.camera import cameras_from_dict, project
 
 CAMERA_FILE = Path(__file__).parents[2] / "configs/cameras/openspm_tabletop.json"
 
@@ -50,7 +51,10 @@ def test_projection_hits_the_coloured_pixels(make_env, camera):
         )
         edge = np.vstack([xy, np.full(360, scene.BURNER_TOP), np.ones(360)])
         points = (env.object_poses()["stove"] @ edge).T[:, :3]
-        outline = project(camera_calibration(camera), _world_from_camera(env, camera), points)
+        calibrated = cameras_from_dict(calibration_document(), "the simulator")[
+            f"observation.images.{camera}"
+        ]
+        outline, _ = project(calibrated, _world_from_camera(env, camera), points)
         moments = cv2.moments(outline.astype(np.float32))
         expected = np.array([moments["m10"], moments["m01"]]) / moments["m00"]
         assert np.linalg.norm(pixels.mean(axis=0) - expected) < 0.5

@@ -67,8 +67,10 @@ def collect(config: CollectConfig) -> dict[str, Any]:
     """
     start_s = time.monotonic()
     root = _root(config)
+    if root.exists() and not (root / SUMMARY_FILE).is_file():
+        raise FileExistsError(f"{root} exists and was not written by openspm collect; choose another --root")
     if root.exists() and not config.overwrite:
-        return _keep_existing(root)
+        return _keep_existing(config, root)
     partial = root.with_name(root.name + ".partial")
     shutil.rmtree(partial, ignore_errors=True)
     root.parent.mkdir(parents=True, exist_ok=True)
@@ -100,12 +102,16 @@ def _root(config: CollectConfig) -> Path:
     return (HF_LEROBOT_HOME / config.repo_id).resolve()
 
 
-def _keep_existing(root: Path) -> dict[str, Any]:
+def _keep_existing(config: CollectConfig, root: Path) -> dict[str, Any]:
     """Leave a complete dataset alone and say what is there."""
-    summary_file = root / SUMMARY_FILE
-    if not summary_file.is_file():
-        raise FileExistsError(f"{root} exists and was not written by openspm collect; choose another --root")
-    summary = json.loads(summary_file.read_text(encoding="utf-8"))["summary"]
+    recorded = json.loads((root / SUMMARY_FILE).read_text(encoding="utf-8"))
+    summary = recorded["summary"]
+    tasks, wanted = {e["task"] for e in recorded["episodes"]}, set(select_tasks(config.task))
+    if tasks != wanted or summary["episodes"] != config.episodes * len(wanted):
+        raise FileExistsError(
+            f"{root} holds {summary['episodes']} episodes of {sorted(tasks)}, asked were {config.episodes} "
+            f"of each of {sorted(wanted)}; choose another --root, or pass --overwrite=true"
+        )
     print(
         f"{root} already holds {summary['episodes']} episodes; left alone "
         "(pass --overwrite=true to record again)"

@@ -62,7 +62,7 @@ def main(args: list[str]) -> None:
         "machine": f"{platform.machine()}, {os.cpu_count()} cores",
         "expert_steps": collected["frames"] / collected["episodes"],
     }
-    report = write_report(run / "report", result, episodes, dataset, checkpoint, evaluation / "lerobot_eval")
+    report = write_report(run / "report", result, episodes, dataset, checkpoint, evaluation)
     failed = Counter(e.task for e in episodes if not e.success)
     logger.info("failures per task: %s", dict(failed) or "none")
     summary = {

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 import logging
+import subprocess
 import sys
 
 from draccus.utils import ParsingError
@@ -32,6 +33,9 @@ def main() -> None:
     logging.basicConfig(level=logging.INFO, format="%(levelname)s %(message)s", stream=sys.stderr)
     try:
         importlib.import_module(COMMANDS[command][0]).main(args)
-    except (OpenSPMError, ParsingError, FileExistsError, FileNotFoundError) as error:
+    except (OpenSPMError, ParsingError, FileExistsError, FileNotFoundError, RuntimeError) as error:
         print(f"openspm {command}: {error}", file=sys.stderr)
         sys.exit(2)
+    except subprocess.CalledProcessError as error:
+        print(f"openspm {command}: {error.cmd[0]} failed with exit code {error.returncode}", file=sys.stderr)
+        sys.exit(error.returncode)

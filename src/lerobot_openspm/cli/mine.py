@@ -44,6 +44,7 @@ def main(args: list[str]) -> None:
         "entries": len(experience.entries),
         "episodes": int(meta.total_episodes),
         "key_poses": sum(len(entry.key_poses) for entry in experience.entries),
+        "skipped": int(meta.total_episodes) - len(experience.entries),
         "objects": sorted(experience.objects),
         "output": config.output,
         "seconds": round(time.monotonic() - start_s, 1),

@@ -75,8 +75,8 @@ def _key_pose_picture(entry: MemoryEntry, experience: Experience, dataset: LeRob
 
 def _films(episodes: Sequence[Episode], evaluation: Path, folder: Path) -> list[dict[str, Any]]:
     """Film strips of a few rollouts; lerobot-eval films the first ten of a task, in the order of seeds."""
-    suite = "openspm_tabletop"
-    videos = evaluation / "videos" / f"{suite}_{list(TASKS).index(episodes[0].task)}"
+    task_id = list(TASKS).index(episodes[0].task)
+    videos = next(evaluation.glob(f"lerobot_eval_*/videos/openspm_tabletop_{task_id}"), evaluation)
     filmed = [
         (episode, video)
         for i, episode in enumerate(sorted(episodes, key=lambda e: e.seed))

@@ -12,6 +12,7 @@ from typing import Literal
 import numpy as np
 
 from lerobot_openspm.control.transfer import Target
+from lerobot_openspm.errors import OpenSPMError
 from lerobot_openspm.flow.condition import Query, progress
 from lerobot_openspm.geometry import se3
 from lerobot_openspm.geometry.se3 import Array
@@ -21,7 +22,6 @@ from lerobot_openspm.memory.robot import RobotModel
 logger = logging.getLogger(__name__)
 
 Execution = Literal["open_loop", "closed_loop", "closed_loop_trc"]
-EXECUTIONS: tuple[Execution, ...] = ("open_loop", "closed_loop", "closed_loop_trc")
 
 # An opening below this share of the demonstrated one means that the fingers hold nothing.
 HELD_SHARE = 0.4
@@ -171,7 +171,10 @@ class Executor:
     def push_chunk(self, actions: Array) -> None:
         """Queue a chunk of canonical actions ``(H, 7)``; non-finite numbers never reach the robot."""
         if not np.isfinite(actions).all():
-            raise FloatingPointError(f"the flow model gave non-finite actions {actions}")
+            raise OpenSPMError(
+                f"the flow model gave actions that are not finite: {actions}; its weights are "
+                "damaged, train again"
+            )
         self._queue.extend(actions)
 
     def _enter(self, index: int, hand: Hand) -> None:

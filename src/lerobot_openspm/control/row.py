@@ -70,7 +70,7 @@ class Row:
 
     def observe(self, hand: Hand, look: Look) -> None:
         """Take in a new observation: plan at the start, advance, and plan again when something went wrong."""
-        if self.status in (Status.WAITING, Status.OBJECT_NOT_FOUND):
+        if self.status in (Status.WAITING, Status.OBJECT_NOT_FOUND, Status.INFEASIBLE):
             if self._idle_steps % LOOK_AGAIN_STEPS == 0:
                 self._plan(hand, look)
             self._idle_steps += 1
@@ -110,7 +110,10 @@ class Row:
         """Find the objects of the remaining key poses again and go back to the approach of this contact."""
         entry, index = self.ranked[0].entry, self.executor.retry_index()
         ahead = list(dict.fromkeys(name for pose in entry.key_poses[index:] for name in pose.anchor.objects))
-        self.layout |= look(ahead)
+        found = look(ahead)
+        if stale := [name for name in ahead if name not in found]:
+            logger.info("%r: %s not found again, taken to be where it was", self.instruction, stale)
+        self.layout |= found
         if problems := self._problems(entry, hand):
             logger.warning("%r: %s", self.instruction, "; ".join(problems))
             self.executor.status = Status.INFEASIBLE

@@ -60,13 +60,5 @@ def write_calibration(path: Path, height: int = 256, width: int = 256) -> None:
     path.write_text(json.dumps(calibration_document(height, width), indent=2) + "\n", encoding="utf-8")
 
 
-def project(calibration: dict[str, Any], T_world_cam: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """Project world points (n, 3) to pixels (n, 2), given where the camera is."""
-    local = (np.linalg.inv(T_world_cam) @ np.c_[points, np.ones(len(points))].T).T
-    u = calibration["fx"] * local[:, 0] / local[:, 2] + calibration["cx"]
-    v = calibration["fy"] * local[:, 1] / local[:, 2] + calibration["cy"]
-    return np.stack([u, v], axis=1)
-
-
 def _matrix(quat_wxyz: np.ndarray) -> np.ndarray:
     return Rotation.from_quat(np.roll(quat_wxyz, -1)).as_matrix()

@@ -38,7 +38,6 @@ BURNER_X = -0.030
 BURNER_RADIUS = 0.070
 BURNER_TOP = 0.030
 KNOB_X = 0.080
-KNOB_BAR_TOP = 0.061
 KNOB_RANGE = 2.0
 PLATE_GOAL_X = 0.220
 FINGER_TRAVEL = 0.040
@@ -286,7 +285,7 @@ def build_mjcf() -> str:
   <compiler angle="radian"/>
   <option timestep="{TIMESTEP_S}" integrator="implicitfast" cone="elliptic" impratio="10"
     noslip_iterations="3"/>
-  <size memory="16M"/>
+  <size memory="64M"/>
   <statistic extent="1" center="0 0 0"/>
   <visual>
     <headlight ambient="0.55 0.55 0.55" diffuse="0.10 0.10 0.10" specular="0 0 0"/>

@@ -38,11 +38,6 @@ WORKSPACE_LOW = np.array([-0.40, -0.46, 0.010])
 WORKSPACE_HIGH = np.array([0.50, 0.46, 0.58])
 SETTLE_STEPS = 120
 HOME_ROTATION = np.diag([1.0, -1.0, -1.0])
-WARNINGS = (
-    mujoco.mjtWarning.mjWARN_BADQPOS,
-    mujoco.mjtWarning.mjWARN_BADQVEL,
-    mujoco.mjtWarning.mjWARN_BADQACC,
-)
 FINGER_OPEN_M = scene.FINGER_TRAVEL
 # Beyond closed, so that the position drive keeps pressing on whatever is between the fingers.
 FINGER_CLOSED_M = -0.02
@@ -183,8 +178,8 @@ class TabletopSimulator:
         return touched
 
     def is_unstable(self) -> bool:
-        """Whether the state is not finite, or MuJoCo warned about it and reset itself."""
-        warned = any(self.data.warning[w].number > 0 for w in WARNINGS)
+        """Whether the state is not finite, or MuJoCo warned: of a bad state, or of contacts left out."""
+        warned = any(warning.number > 0 for warning in self.data.warning)
         return warned or not bool(np.isfinite(self.data.qpos).all() and np.isfinite(self.data.qvel).all())
 
     def render(self, camera: str, height: int, width: int) -> np.ndarray:

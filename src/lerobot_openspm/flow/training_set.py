@@ -59,7 +59,7 @@ class TrainingSet:
         index = index.cpu().flatten()
         known = self._row_of_index[index.clamp(max=len(self._row_of_index) - 1)]
         rows = torch.where(index < len(self._row_of_index), known, -1)
-        spare = self._sample(len(rows)) if training else self._nearest_drawable(index)
+        spare = self._sample(len(rows)) if training else self._fixed_drawable(index)
         rows = torch.where(rows < 0, spare, rows)
         others = self._sample(len(rows) * (draws - 1)).view(len(rows), draws - 1)
         rows = torch.cat([rows[:, None], others], dim=1).flatten()
@@ -70,6 +70,6 @@ class TrainingSet:
             torch.multinomial(self._weights, n, replacement=True) if n else torch.zeros(0, dtype=torch.long)
         )
 
-    def _nearest_drawable(self, index: Tensor) -> Tensor:
+    def _fixed_drawable(self, index: Tensor) -> Tensor:
         drawable = torch.nonzero(self._weights)[:, 0]
         return drawable[index % len(drawable)]

@@ -34,22 +34,21 @@ class Scored:
 
 
 def semantic_candidates(instruction: str, entries: Sequence[MemoryEntry]) -> list[tuple[MemoryEntry, float]]:
-    """Entries that are about what the instruction says, with ``S_sem``, best first.
+    """Entries that are about what the instruction says, with their ``S_sem``.
 
     Raises:
         InstructionError: No entry is. The error lists the instructions the memory knows.
     """
     sub_tasks = parse_instruction(instruction)
     scored = [(entry, semantic_score(sub_tasks, entry.key.sub_tasks)) for entry in entries]
-    best = max((score for _, score in scored), default=0.0)
-    if best < MIN_SEMANTIC:
+    close = [(entry, score) for entry, score in scored if score >= MIN_SEMANTIC]
+    if not close:
         known = "; ".join(sorted({entry.language for entry in entries})) or "nothing yet"
         raise InstructionError(
             f"the memory holds no experience for the instruction {instruction!r}; it knows: {known}. "
             "Record demonstrations of it and train again, or use one of these instructions"
         )
-    close = [(entry, score) for entry, score in scored if score >= best - 1e-9]
-    return sorted(close, key=lambda item: -item[1])
+    return close
 
 
 def semantic_score(asked: Sequence[SubTask], known: Sequence[SubTask]) -> float:
@@ -64,9 +63,9 @@ def _sub_task_score(asked: SubTask, known: SubTask) -> float:
     if asked.operation != known.operation:
         return 0.0
     terms = [
-        (0.35, _names_agree(asked.target, known.target)),
-        (0.35, _names_agree(asked.landmark, known.landmark)),
-        (0.2, _names_agree(asked.part, known.part)),
+        (0.3, _names_agree(asked.target, known.target)),
+        (0.3, _names_agree(asked.landmark, known.landmark)),
+        (0.3, _names_agree(asked.part, known.part)),
         (0.1, float(asked.relation == known.relation)),
     ]
     return 0.0 if min(terms[0][1], terms[1][1]) == 0.0 else sum(weight * value for weight, value in terms)

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
+from lerobot_openspm.errors import MemoryFormatError
 from lerobot_openspm.geometry.se3 import Array
 
 
@@ -31,6 +32,23 @@ class RobotModel:
     radians_per_action: float
     metres_per_step: float
     workspace: Array
+
+    def covering(self, other: RobotModel) -> RobotModel:
+        """This robot with the workspace of both.
+
+        Raises:
+            MemoryFormatError: The other one's gripper or gains differ, so it is another robot.
+        """
+        for name in ("close_command", "open_command", "metres_per_action", "radians_per_action"):
+            ours, theirs = getattr(self, name), getattr(other, name)
+            if not np.isclose(ours, theirs, rtol=0.5, atol=1e-3):
+                raise MemoryFormatError(
+                    f"the dataset's {name} is {theirs:.4g}, the memory's {ours:.4g}: it was recorded with "
+                    "another robot or controller and cannot be appended; use --policy.memory_update=rebuild"
+                )
+        low = np.minimum(self.workspace[0], other.workspace[0])
+        high = np.maximum(self.workspace[1], other.workspace[1])
+        return replace(self, workspace=np.stack([low, high]))
 
     def closed(self, gripper_commands: Array) -> NDArray[np.bool_]:
         """Which of the commands ``(...)`` close the gripper."""

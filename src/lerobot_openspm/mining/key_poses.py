@@ -205,12 +205,15 @@ def _corner_marks(
 
 
 def _corner_confidence(points: Array, corner: int, reach: int = 4) -> float:
-    """How sharply the path turns and slows at a corner: 0.5 for a straight fast pass, 1 for a full stop."""
+    """How sharply the path turns or slows at a corner: 0.5 for a straight fast pass, 1 for a full stop."""
     before = points[corner] - points[max(corner - reach, 0)]
     after = points[min(corner + reach, len(points) - 1)] - points[corner]
     norms = np.linalg.norm(before) * np.linalg.norm(after)
     turning = 0.5 * (1 - float(before @ after) / norms) if norms > 1e-9 else 1.0
-    return float(np.clip(0.5 + turning, 0.5, 1.0))
+    steps = np.linalg.norm(np.diff(points, axis=0), axis=1)
+    usual = float(np.median(steps))
+    slowing = 1 - float(steps[max(corner - 1, 0) : corner + 1].mean()) / usual if usual > 1e-9 else 0.0
+    return float(np.clip(0.5 + max(turning, 0.5 * slowing), 0.5, 1.0))
 
 
 def _measure(episode: Episode, marks: list[_Mark], moving: NDArray[np.bool_]) -> list[KeyPose]:
