@@ -378,3 +378,19 @@ def test_appending_the_same_episode_again_replaces_its_entry():
     newer = replace(old, entries=(entry(quality=0.3, source="local/demos#0"),))
     both = old.appended(newer)
     assert [(e.source, e.quality) for e in both.entries] == [("local/demos#1", 0.9), ("local/demos#0", 0.3)]
+
+
+def test_appending_widens_the_workspace_and_counts_versions_up():
+    low, high = np.array([-0.1, -0.2, 0.1]), np.array([0.9, 0.2, 0.4])
+    old = experience()
+    both = old.appended(replace(old, entries=old.entries[:1], robot=robot(workspace=np.stack([low, high]))))
+    assert_array_equal(both.robot.workspace[0], np.minimum(old.robot.workspace[0], low))
+    assert_array_equal(both.robot.workspace[1], np.maximum(old.robot.workspace[1], high))
+    assert [e.version for e in both.entries] == [1, 2]
+
+
+def test_appending_from_another_robot_is_refused():
+    old = experience()
+    other = replace(old, robot=robot(close_command=-1.0, open_command=1.0))
+    with pytest.raises(MemoryFormatError, match=r"close_command is -1, the memory's 1.*rebuild"):
+        old.appended(other)

@@ -62,7 +62,7 @@ class OpenSPMPolicy(PreTrainedPolicy):
         self._training_set: TrainingSet | None = None
         if dataset_meta is not None:
             self.experience = mine_experience(dataset_meta, config)
-            self._training_set = training_set(dataset_meta, config)
+            self._training_set = training_set(dataset_meta, config, self.experience.robot)
             self.flow.action_scale.copy_(self._training_set.action_scale)
         self.reset()
 
@@ -247,7 +247,7 @@ class OpenSPMPolicy(PreTrainedPolicy):
             logger.info(
                 "memory_update=%s: %d entries", self.config.memory_update, len(self.experience.entries)
             )
-            self._training_set = training_set(dataset_meta, self.config)
+            self._training_set = training_set(dataset_meta, self.config, self.experience.robot)
 
     def _require_experience(self) -> Experience:
         if self.experience is None:

@@ -15,6 +15,7 @@ from lerobot_openspm.experience import Experience
 from lerobot_openspm.flow.samples import perturbed, segment_frames
 from lerobot_openspm.flow.training_set import TrainingSet
 from lerobot_openspm.geometry.camera import Camera, load_cameras
+from lerobot_openspm.memory.robot import RobotModel
 from lerobot_openspm.mining.dataset import Demonstrations
 from lerobot_openspm.mining.mine import (
     build_entries,
@@ -23,6 +24,7 @@ from lerobot_openspm.mining.mine import (
     mine_key_poses,
     oracle_layouts,
 )
+from lerobot_openspm.mining.signals import observe_robot
 
 logger = logging.getLogger(__name__)
 
@@ -68,7 +70,9 @@ def mine_experience(
             "configs/cameras/openspm_tabletop.json"
         )
     demonstrations = open_demonstrations(dataset_meta, config)
-    mined = mine_key_poses(demonstrations, config.memory_episodes)
+    episodes = demonstrations.episodes(config.memory_episodes)
+    robot = observe_robot(episodes, known.robot if known else None)
+    mined = mine_key_poses(demonstrations, robot, config.memory_episodes)
     scenes = learn_scenes(demonstrations, mined.mined, cameras)
     objects = layouts_in_scenes(scenes, mined.mined, known.objects if known else {}, np.random.default_rng(0))
     names: tuple[str, ...] = ()
@@ -87,19 +91,18 @@ def mine_experience(
         "mined %d entries from %d episodes (%d skipped); objects: %s",
         len(entries), len(mined.mined), len(mined.skipped), ", ".join(sorted(objects.models)),
     )  # fmt: skip
-    experience = Experience(entries, objects.models, mined.robot, dict(cameras), config.perception, names)
+    experience = Experience(entries, objects.models, robot, dict(cameras), config.perception, names)
     return known.appended(experience) if known else experience
 
 
-def training_set(dataset_meta: Any, config: OpenSPMConfig) -> TrainingSet:
+def training_set(dataset_meta: Any, config: OpenSPMConfig, robot: RobotModel) -> TrainingSet:
     """Cut all episodes of a dataset into training samples. Reads no image.
 
     Held-out episodes can be looked up, for a validation loss, but nothing is measured on them or drawn from
     them.
     """
     demonstrations = open_demonstrations(dataset_meta, config)
-    robot = mine_key_poses(demonstrations, config.memory_episodes).robot
-    mined = mine_key_poses(demonstrations, robot=robot).mined
+    mined = mine_key_poses(demonstrations, robot).mined
     episodes = [item.episode for item in mined]
     frames = segment_frames(episodes, [item.key_poses for item in mined], robot, config.chunk_size)
     allowed = [e.index for e in episodes] if config.memory_episodes is None else config.memory_episodes

@@ -124,11 +124,25 @@ def test_inspecting_what_holds_no_memory_is_one_line(openspm: Openspm, tmp_path:
 
 def test_collecting_into_a_recorded_folder_leaves_it_alone(openspm: Openspm, tiny_dataset: Path):
     before = {path: path.stat().st_mtime_ns for path in tiny_dataset.rglob("*") if path.is_file()}
-    code, out, _ = openspm("collect", f"--root={tiny_dataset}")
+    same = ("--task=bowl_on_plate,turn_on_stove", "--episodes=3")
+    code, out, _ = openspm("collect", f"--root={tiny_dataset}", *same)
     assert code == 0
     assert "already holds 6 episodes; left alone" in out
     assert set(last_line(out)) == {"episodes", "frames", "discarded", "root", "seconds"}
     assert {path: path.stat().st_mtime_ns for path in tiny_dataset.rglob("*") if path.is_file()} == before
+
+
+def test_collecting_something_else_into_a_recorded_folder_is_refused(openspm: Openspm, tiny_dataset: Path):
+    error = one_line_error(openspm("collect", f"--root={tiny_dataset}", "--episodes=4"), "collect")
+    assert "holds 6 episodes" in error
+    assert "--overwrite=true" in error
+
+
+def test_overwriting_a_foreign_folder_is_refused(openspm: Openspm, tmp_path: Path):
+    (tmp_path / "precious.txt").write_text("keep")
+    error = one_line_error(openspm("collect", f"--root={tmp_path}", "--overwrite=true"), "collect")
+    assert "was not written by openspm collect" in error
+    assert (tmp_path / "precious.txt").read_text() == "keep"
 
 
 def test_collecting_into_a_foreign_folder_is_one_line(openspm: Openspm, tmp_path: Path):

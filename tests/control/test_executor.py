@@ -292,3 +292,14 @@ def test_holding_still_keeps_the_fingers_as_they_are():
     done.advance(Hand(done.plan[0].T_world_ee, 0.03))
     assert done.status is Status.DONE
     assert done.next_action().tolist() == [0] * 6 + [ROBOT.close_command]
+
+
+@pytest.mark.parametrize(("gap", "retries_wanted"), [(0.008, 0), (0.03, 1)])
+def test_what_is_in_the_way_counts_as_met_when_the_key_pose_is_near(gap, retries_wanted):
+    """Something solid holds the hand up above the place: within three tolerances it has arrived."""
+    executor = make()
+    floor = executor.plan[1].T_world_ee[2, 3] + gap
+    world = World(stuck=lambda T: T[2, 3] < floor and executor.index <= 1)
+    _, retries, _ = run(executor, world, n_steps=150, until=lambda e: e.index > 1)
+    assert (executor.index > 1) == (retries_wanted == 0)
+    assert (retries > 0) == (retries_wanted > 0)

@@ -7,6 +7,7 @@ from tests.geometry.strategies import transforms
 from tests.memory.builders import entry, hand_pose, key_pose, robot
 
 from lerobot_openspm.control.transfer import (
+    RETREAT_M,
     TransferLimits,
     check_transfer,
     shape_deviation,
@@ -166,3 +167,15 @@ def test_another_way_through_free_space_counts_less_than_another_way_in_contact(
 
     assert deviation("push") == pytest.approx(0.1)
     assert 0 < deviation("pre-place") < 0.05
+
+
+def test_a_cut_demonstration_ends_with_a_retreat_against_its_arrival():
+    whole = entry()
+    cut = entry(key_poses=whole.key_poses[:-1])
+    targets = transfer(cut, cut.layout, {}, HOME)
+    assert [target.memory.phase for target in targets[-2:]] == ["release", "retreat"]
+    released, left = targets[-2].T_world_ee, targets[-1].T_world_ee
+    # It came down from above, so it leaves upwards, turned as it was.
+    assert_allclose(left[:3, 3] - released[:3, 3], [0, 0, RETREAT_M], atol=1e-9)
+    assert_allclose(left[:3, :3], released[:3, :3], atol=1e-9)
+    assert len(transfer(whole, whole.layout, {}, HOME)) == len(whole.key_poses)

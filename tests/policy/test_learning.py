@@ -11,8 +11,10 @@ from tests.policy.lerobot_commands import CALIBRATION
 
 from lerobot_openspm.configuration_openspm import OpenSPMConfig
 from lerobot_openspm.errors import DatasetError, InstructionError, MemoryFormatError
+from lerobot_openspm.flow.training_set import TrainingSet
+from lerobot_openspm.mining.signals import observe_robot
 from lerobot_openspm.modeling_openspm import OpenSPMPolicy
-from lerobot_openspm.training import training_set
+from lerobot_openspm.training import open_demonstrations, training_set
 
 BOWL, STOVE = "put the bowl on the plate", "turn on the stove"
 PUSH = "push the plate to the front of the stove"
@@ -44,6 +46,11 @@ def trainable(load: Callable[..., OpenSPMPolicy], tiny_meta: LeRobotDatasetMetad
 
 def batch(*index: int) -> dict[str, torch.Tensor]:
     return {"index": torch.tensor(index)}
+
+
+def samples_of(meta: LeRobotDatasetMetadata, config: OpenSPMConfig) -> TrainingSet:
+    episodes = open_demonstrations(meta, config).episodes(config.memory_episodes)
+    return training_set(meta, config, observe_robot(episodes))
 
 
 def test_the_loss_of_every_frame_has_the_mean_loss_as_its_mean(trainable: OpenSPMPolicy):
@@ -97,7 +104,7 @@ def test_the_evaluation_loss_repeats_with_the_seed(trainable: OpenSPMPolicy):
 def test_evaluation_looks_at_the_same_samples_whatever_the_seed(
     tiny_meta: LeRobotDatasetMetadata,
 ):
-    samples = training_set(tiny_meta, new_config(tiny_meta, memory_episodes=[0, 1, 3, 4]))
+    samples = samples_of(tiny_meta, new_config(tiny_meta, memory_episodes=[0, 1, 3, 4]))
     everything = torch.arange(tiny_meta.total_frames)
     torch.manual_seed(1)
     first = samples.draw(everything, 1, training=False)
@@ -119,7 +126,7 @@ def test_held_out_episodes_are_neither_remembered_nor_drawn(tiny_meta: LeRobotDa
 
     # Unperturbed, every sample is known by its numbers.
     plain = {"perturbation_m": 0.0, "perturbation_rad": 0.0}
-    samples = training_set(tiny_meta, new_config(tiny_meta, memory_episodes=kept, **plain))
+    samples = samples_of(tiny_meta, new_config(tiny_meta, memory_episodes=kept, **plain))
     starts, ends = tiny_meta.episodes["dataset_from_index"], tiny_meta.episodes["dataset_to_index"]
     held_out, remembered = (
         torch.cat([torch.arange(starts[i], ends[i]) for i in indices]) for indices in ((2, 5), kept)

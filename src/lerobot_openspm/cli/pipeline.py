@@ -95,8 +95,9 @@ def _start_evaluation(
 ) -> subprocess.Popen[bytes]:
     command = [
         "lerobot-eval", f"--policy.path={checkpoint}", "--env.type=openspm_tabletop",
-        f"--env.task={','.join(tasks)}", f"--env.episode_log={log.resolve()}", f"--eval.n_episodes={episodes}",
-        "--eval.batch_size=1", "--policy.device=cpu", f"--seed={seed}", f"--output_dir={folder}", *options,
+        f"--env.task={','.join(tasks)}", f"--env.episode_log={log.resolve()}",
+        f"--eval.n_episodes={episodes}", "--eval.batch_size=1", "--policy.device=cpu",
+        f"--seed={seed}", f"--output_dir={folder}", *options,
     ]  # fmt: skip
     logger.info("%s", " ".join(command))
     folder.mkdir()

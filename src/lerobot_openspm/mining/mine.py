@@ -29,7 +29,7 @@ from lerobot_openspm.mining.anchors import (
 )
 from lerobot_openspm.mining.dataset import Demonstrations
 from lerobot_openspm.mining.key_poses import KeyPose, find_key_poses
-from lerobot_openspm.mining.signals import Episode, observe_robot
+from lerobot_openspm.mining.signals import Episode
 from lerobot_openspm.perception.learning import learn_objects
 from lerobot_openspm.perception.localise import localise, prepare
 from lerobot_openspm.perception.model import ObjectModel
@@ -52,31 +52,28 @@ class MinedKeyPoses:
     """What the parquet columns alone tell.
 
     Attributes:
-        robot: The robot that gave the demonstrations.
         mined: Episodes with key poses.
         skipped: Reason by episode index for those without.
     """
 
-    robot: RobotModel
     mined: tuple[MinedEpisode, ...]
     skipped: dict[int, str]
 
 
 def mine_key_poses(
-    demonstrations: Demonstrations, indices: Sequence[int] | None = None, robot: RobotModel | None = None
+    demonstrations: Demonstrations, robot: RobotModel, indices: Sequence[int] | None = None
 ) -> MinedKeyPoses:
     """Find the key poses of episodes. Reads no image.
 
     Args:
         demonstrations: The dataset.
+        robot: The robot that gave them.
         indices: The episodes; all if not given.
-        robot: What is known of the robot; observed in the same episodes if not given.
 
     Raises:
         DatasetError: No episode has any. The error gives the reasons.
     """
     episodes = demonstrations.episodes(indices)
-    robot = robot or observe_robot(episodes)
     mined, skipped = [], {}
     for episode in episodes:
         try:
@@ -97,7 +94,7 @@ def mine_key_poses(
             f"no key poses in the {len(episodes)} episodes of dataset {demonstrations.name}: {reasons}. "
             "OpenSPM needs demonstrations in which the gripper grasps, pushes or turns something"
         )
-    return MinedKeyPoses(robot, tuple(mined), skipped)
+    return MinedKeyPoses(tuple(mined), skipped)
 
 
 def learn_scenes(

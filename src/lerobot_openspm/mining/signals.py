@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -14,6 +15,10 @@ from lerobot_openspm.memory.robot import RobotModel
 # Commanded and achieved motion are compared over windows this long, because an operational-space
 # controller answers a command over several steps.
 GAIN_WINDOW_STEPS = 5
+# Gripper commands that differ by less than this are one command.
+MIN_COMMAND_RANGE = 1e-3
+
+logger = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -40,29 +45,48 @@ class Episode:
         return len(self.opening)
 
 
-def observe_robot(episodes: Sequence[Episode]) -> RobotModel:
-    """Fit the gripper's convention and the gain from action to motion over all episodes."""
-    commands = np.concatenate([episode.actions[:, 6] for episode in episodes])
-    low, high = np.percentile(commands, [2, 98]) if len(commands) else (-1.0, 1.0)
-    middle = (low + high) / 2
-    # Under the command that closes, the opening shrinks from one step to the next.
-    trend = sum(
-        float(((episode.actions[:-1, 6] - middle) * np.diff(episode.opening)).sum()) for episode in episodes
-    )
-    close, open_ = (high, low) if trend <= 0 else (low, high)
+def observe_robot(episodes: Sequence[Episode], known: RobotModel | None = None) -> RobotModel:
+    """Fit the gripper's convention and the gain from action to motion over all episodes.
+
+    Args:
+        episodes: The demonstrations.
+        known: The same robot as seen before; tells the gripper's convention where these episodes do not.
+    """
+    close, open_ = _gripper_commands(episodes, known)
     opening = np.concatenate([episode.opening for episode in episodes])
     positions = np.concatenate([episode.T_world_ee[:, :3, 3] for episode in episodes])
     speed = np.concatenate([se3.distance(e.T_world_ee[:-1], e.T_world_ee[1:]) for e in episodes])
     moving = speed[speed > 0.1 * speed.max(initial=0.0)]
     return RobotModel(
-        close_command=float(close),
-        open_command=float(open_),
+        close_command=close,
+        open_command=open_,
         open_width=float(np.percentile(opening, 98)),
         metres_per_action=_gain(episodes, slice(0, 3)),
         radians_per_action=_gain(episodes, slice(3, 6)),
         metres_per_step=float(np.median(moving)) if len(moving) else 0.0,
         workspace=np.stack([positions.min(axis=0), positions.max(axis=0)]),
     )
+
+
+def _gripper_commands(episodes: Sequence[Episode], known: RobotModel | None) -> tuple[float, float]:
+    """The commands that close and that open."""
+    commands = np.concatenate([episode.actions[:, 6] for episode in episodes])
+    low, high = (float(c) for c in np.percentile(commands, [2, 98]))
+    if high - low > MIN_COMMAND_RANGE:
+        # Under the command that closes, the opening shrinks from one step to the next.
+        middle = (low + high) / 2
+        trends = [((e.actions[:-1, 6] - middle) * np.diff(e.opening)).sum() for e in episodes]
+        return (high, low) if sum(trends) <= 0 else (low, high)
+    if known is not None:
+        return known.close_command, known.open_command
+    other = -low if abs(low) > MIN_COMMAND_RANGE else 1.0
+    ends = float(np.median([e.opening[-1] for e in episodes]))
+    closing = ends < 0.5 * max(float(e.opening.max()) for e in episodes)
+    logger.warning(
+        "the gripper command is %.3g in every frame; taken to be the one that %s, and %.3g the other",
+        low, "closes" if closing else "opens", other,
+    )  # fmt: skip
+    return (low, other) if closing else (other, low)
 
 
 def _gain(episodes: Sequence[Episode], part: slice) -> float:
