@@ -127,10 +127,14 @@ def split_batch(batch: Mapping[str, Any], state_layout: VectorLayout) -> list[Ob
 
 def _as_uint8(image: torch.Tensor, key: str) -> NDArray[np.uint8]:
     if image.ndim != 3 or image.shape[0] != 3:
-        raise ObservationError(f"camera {key!r} gave shape {tuple(image.shape)}, expected (3, height, width)")
+        raise ObservationError(
+            f"camera {key!r} gave shape {tuple(image.shape)}, expected (3, height, width); give RGB images"
+        )
     array = image.detach().cpu().numpy().transpose(1, 2, 0)
     if array.dtype == np.uint8:
         return array
     if not np.isfinite(array).all():
-        raise ObservationError(f"camera {key!r} gave an image with NaN or infinite values")
+        raise ObservationError(
+            f"camera {key!r} gave an image with NaN or infinite values, expected 0 to 1; check the camera"
+        )
     return np.round(np.clip(array, 0, 1) * 255).astype(np.uint8)
