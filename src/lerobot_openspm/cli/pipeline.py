@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import logging
 import os
@@ -9,6 +10,7 @@ import shutil
 import subprocess
 import sys
 import time
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,7 +20,7 @@ import numpy as np
 from scipy.stats import binomtest
 from tqdm import tqdm
 
-from lerobot_openspm.cli.collect import CollectConfig, collect
+from lerobot_openspm.cli.collect import SUMMARY_FILE, CollectConfig, collect
 from lerobot_openspm.envs.tasks import TASK_NAMES
 
 logger = logging.getLogger(__name__)
@@ -46,17 +48,27 @@ def collect_dataset(root: Path, demos: int) -> dict[str, Any]:
 
 
 def train(dataset: Path, output: Path, options: Sequence[str] = ()) -> tuple[Path, float]:
-    """Run lerobot-train, unless its checkpoint is there. Returns the checkpoint and the seconds it took."""
+    """Run lerobot-train, unless its checkpoint is there. Returns the checkpoint and the seconds it took.
+
+    An interrupted run is resumed from its last checkpoint.
+    """
     checkpoint, done = output / "checkpoints" / "last" / "pretrained_model", output / DONE
     if not TRAIN_CONFIG.is_file():
         raise FileNotFoundError(f"no {TRAIN_CONFIG} here: run this from a checkout of the project")
+    made_of = _digest([TRAIN_CONFIG, dataset / "meta" / "info.json", dataset / SUMMARY_FILE], options)
+    _discard_unless(output, made_of)
     if not done.exists():
-        shutil.rmtree(output, ignore_errors=True)  # an interrupted run
         start_s = time.monotonic()
-        run_lerobot(
-            "lerobot-train", f"--config_path={TRAIN_CONFIG}", f"--dataset.root={dataset}",
-            f"--output_dir={output}", *options,
-        )  # fmt: skip
+        config = checkpoint / "train_config.json"
+        if config.exists():
+            run_lerobot("lerobot-train", f"--config_path={config}", "--resume=true")
+        else:
+            # lerobot-train wants to make its folder itself.
+            shutil.rmtree(output, ignore_errors=True)
+            run_lerobot(
+                "lerobot-train", f"--config_path={TRAIN_CONFIG}", f"--dataset.root={dataset}",
+                f"--output_dir={output}", *options,
+            )  # fmt: skip
         done.write_text(json.dumps({"seconds": round(time.monotonic() - start_s, 1)}))
     return checkpoint, float(json.loads(done.read_text())["seconds"])
 
@@ -67,21 +79,47 @@ def evaluate(
     """Run lerobot-eval on all tasks, unless it is done. Returns its episodes.
 
     Two runs share the tasks, one environment each: on two cores that is twice as fast as one run with a batch
-    of environments, whose images all pass through one process. An episode is the same either way.
+    of environments, whose images all pass through one process. An episode is the same either way. Tasks that
+    were finished before an interruption are not run again.
     """
-    done, log = output / DONE, output / "episodes.jsonl"
-    if not done.exists():
-        shutil.rmtree(output, ignore_errors=True)
-        output.mkdir(parents=True)
-        runs = [
-            _start_evaluation(
-                checkpoint, output / f"lerobot_eval_{half}", tasks, log, episodes, seed, options
-            )
-            for half, tasks in enumerate((TASK_NAMES[::2], TASK_NAMES[1::2]))
-        ]
-        _wait(runs, log, episodes * len(TASK_NAMES))
-        done.write_text("{}")
-    return read_episodes(log, range(seed, seed + episodes))
+    log, seeds = output / "episodes.jsonl", range(seed, seed + episodes)
+    made_of = _digest([checkpoint / name for name in ("model.safetensors", "memory.json")], options)
+    _discard_unless(output, made_of)
+    output.mkdir(parents=True, exist_ok=True)
+    finished = Counter(e.task for e in read_episodes(log, seeds))
+    left = [task for task in TASK_NAMES if finished[task] < episodes]
+    runs = [
+        _start_evaluation(checkpoint, output / f"lerobot_eval_{half}", tasks, log, episodes, seed, options)
+        for half, tasks in enumerate((left[::2], left[1::2]))
+        if tasks
+    ]
+    _wait(runs, log, len(left) * episodes)
+    found = read_episodes(log, seeds)
+    if len(found) != len(TASK_NAMES) * episodes:
+        raise RuntimeError(
+            f"{log} holds {len(found)} episodes, expected {len(TASK_NAMES)} tasks x {episodes} seeds; "
+            f"delete {output} and run again"
+        )
+    return found
+
+
+def _digest(files: Sequence[Path], options: Sequence[str]) -> str:
+    """What a result is made of, so that a kept one is only used again for the same."""
+    digest = hashlib.sha256("\n".join(options).encode())
+    for file in files:
+        digest.update(file.read_bytes())
+    return digest.hexdigest()
+
+
+def _discard_unless(output: Path, made_of: str) -> None:
+    """Remove a kept result, finished or not, that was made of something else; note what comes next."""
+    # Beside the folder, because lerobot-train insists on making that itself.
+    kept = output.with_name(f"{output.name}.sha256")
+    if output.exists() and (not kept.exists() or kept.read_text() != made_of):
+        logger.info("%s was made of something else; making it anew", output)
+        shutil.rmtree(output)
+    output.parent.mkdir(parents=True, exist_ok=True)
+    kept.write_text(made_of)
 
 
 def _start_evaluation(
@@ -100,36 +138,34 @@ def _start_evaluation(
         f"--seed={seed}", f"--output_dir={folder}", *options,
     ]  # fmt: skip
     logger.info("%s", " ".join(command))
-    folder.mkdir()
+    folder.mkdir(exist_ok=True)
     with (folder / LOG).open("wb") as file:
         return subprocess.Popen(_line(command), env=_environment(), stdout=file, stderr=subprocess.STDOUT)
 
 
 def _wait(runs: Sequence[subprocess.Popen[bytes]], log: Path, total: int) -> None:
     """Show how many episodes are done until all runs are. A failed run stops the others and raises."""
-    with tqdm(total=total, desc="Evaluating", unit="episode") as bar:
+    before = _lines_in(log)
+    with tqdm(total=total, desc="Evaluating", unit="episode", disable=not runs) as bar:
         while any(run.poll() is None for run in runs):
             time.sleep(1)
-            bar.update((log.read_text().count("\n") if log.exists() else 0) - bar.n)
-            if failed := [run for run in runs if run.poll() not in (None, 0)]:
-                for run in runs:
-                    run.kill()
-                raise RuntimeError(
-                    f"lerobot-eval failed with exit code {failed[0].returncode}; see {LOG} in {log.parent}/*"
-                )
+            bar.update(_lines_in(log) - before - bar.n)
+        bar.update(_lines_in(log) - before - bar.n)
+    if failed := [run for run in runs if run.returncode != 0]:
+        raise RuntimeError(
+            f"lerobot-eval failed with exit code {failed[0].returncode}; see {LOG} under {log.parent}"
+        )
+
+
+def _lines_in(log: Path) -> int:
+    return log.read_text().count("\n") if log.exists() else 0
 
 
 def read_episodes(log: Path, seeds: Sequence[int]) -> list[Episode]:
-    """Episodes of the environment's log, one per task and seed."""
-    rows = [json.loads(line) for line in log.read_text().splitlines()]
+    """Episodes of the environment's log, one per task and seed; none if there is no log yet."""
+    rows = [json.loads(line) for line in log.read_text().splitlines()] if log.exists() else []
     episodes = {(row["task"], row["seed"]): Episode(**row) for row in rows}
-    kept = [episode for (_, seed), episode in episodes.items() if seed in set(seeds)]
-    if len(kept) != len(TASK_NAMES) * len(seeds):
-        raise RuntimeError(
-            f"{log} holds {len(kept)} episodes, expected {len(TASK_NAMES)} tasks x {len(seeds)} "
-            f"seeds; delete {log.parent} and run again"
-        )
-    return kept
+    return [episode for (_, seed), episode in episodes.items() if seed in set(seeds)]
 
 
 def run_lerobot(*command: str) -> None:
