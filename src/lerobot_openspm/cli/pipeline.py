@@ -185,7 +185,11 @@ def _environment() -> dict[str, str]:
 def rate(successes: int, n: int) -> dict[str, Any]:
     """A success rate with its 95 % Wilson interval."""
     interval = binomtest(successes, n).proportion_ci(method="wilson")
-    return {"success": successes / n, "n": n, "interval": [round(interval.low, 4), round(interval.high, 4)]}
+    return {
+        "success": successes / n,
+        "n": n,
+        "interval": [round(float(interval.low), 4), round(float(interval.high), 4)],
+    }
 
 
 def mean_steps(episodes: Sequence[Episode]) -> float:
