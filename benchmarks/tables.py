@@ -33,6 +33,8 @@ def _part(title: str, name: str, table: Any) -> str:
     note = (
         f"Commit `{result['commit']}`, {result['machine']['cores']} cores ({result['machine']['processor']})."
     )
+    if provenance := result.get("provenance"):
+        note = f"{note} {provenance}"
     return f"## {title}\n\n{table(result)}\n\n{note}"
 
 
