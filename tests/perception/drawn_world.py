@@ -1,5 +1,7 @@
 """A small world drawn with convex polygons: boxes and cylinders on a plane, two cameras, no simulator."""
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 
@@ -80,3 +82,17 @@ def demonstration(rng: np.random.Generator, wrong: bool = False) -> Scene:
     later = poses | {"cup": se3.from_yaw(poses["block"][:3, 3] + [0, 0, 0.05], 0.0)}
     hints = (Hint("cup", grasp, "grasp"), Hint("block", release, "release"))
     return Scene(views_of(poses), hints, views_of(later))
+
+
+def partly_hidden(scene: Scene, name: str, camera: str, share: float) -> Scene:
+    """The same scene with a grey bar over the right-hand `share` of an object's place in one view."""
+    view = scene.views[camera]
+    (hint,) = (hint for hint in scene.hints if hint.name == name)
+    (half, height, *_), foot = SHAPES[name], hint.point_world * [1, 1, 0]
+    corners = foot + np.array([[x, y, z] for x in half for y in half for z in (0, height)]) * [-1, -1, 1]
+    uv, _ = project(view.camera, view.T_world_cam, np.vstack([corners, 2 * foot - corners * [1, 1, -1]]))
+    low, high = uv.min(axis=0), uv.max(axis=0)
+    image = view.image.copy()
+    start = round(float(high[0] - share * (high[0] - low[0])))
+    image[:, start : round(float(high[0])) + 4] = (90, 90, 95)
+    return replace(scene, views=scene.views | {camera: replace(view, image=image)})

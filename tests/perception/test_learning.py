@@ -5,7 +5,7 @@ import json
 
 import numpy as np
 import pytest
-from tests.perception.drawn_world import SHAPES, demonstration, draw_poses, render, views_of
+from tests.perception.drawn_world import SHAPES, demonstration, draw_poses, partly_hidden, render, views_of
 
 from lerobot_openspm.errors import DatasetError, MemoryFormatError, ObservationError
 from lerobot_openspm.geometry import se3
@@ -65,6 +65,14 @@ def test_support_plane_and_size_are_learned(models):
         assert models[name].points[:, 2].min() >= 0
         assert models[name].points[:, 2].max() == pytest.approx(height, abs=0.02)
     assert models["cup"].radius == pytest.approx(0.04, abs=0.006)
+
+
+def test_what_often_hides_a_part_does_not_shrink_the_shape():
+    rng = np.random.default_rng(1)
+    scenes = [partly_hidden(demonstration(rng), "block", "side", 0.3) for _ in range(10)]
+    block = learn_objects(scenes, np.random.default_rng(0))["block"]
+    half = np.sort(np.abs(block.points[:, :2]).max(axis=0))[::-1] + block.spacing / 2
+    assert half == pytest.approx(SHAPES["block"][0], abs=0.008)
 
 
 def test_absent_object_is_not_found(models, unseen):

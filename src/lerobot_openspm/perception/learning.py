@@ -50,6 +50,9 @@ SYMMETRY_LOSS = 0.006
 # A yaw read into a round body does more harm than a body with corners taken for round, which costs far more.
 REVOLUTION_LOSS = 0.035
 BODY_OF_REVOLUTION = 24
+# A view that fits worse than this share of the scene's best is taken for hidden: what a finger covers in it
+# would be carved away from the shape.
+CLEAR_VIEW = 0.8
 # What may be lost for a shape without the cones above and below that no camera sees.
 TRIM_LOSS = 0.0007
 NEAR_YAWS = np.deg2rad([-30.0, -10.0, 10.0, 30.0])
@@ -336,7 +339,7 @@ def _reliable(posed: Sequence[Posed], cloud: Cloud) -> list[Posed]:
     for scene in posed:
         overlaps = measure(scene.evidence, cloud, scene.T_world_obj)
         best = np.nanmax(overlaps, initial=0.0)
-        good = [one for one, value in zip(scene.evidence, overlaps, strict=True) if value > 0.6 * best]
+        good = [one for one, value in zip(scene.evidence, overlaps, strict=True) if value > CLEAR_VIEW * best]
         kept.append((best, Posed(tuple(good), scene.T_world_obj)))
     level = 0.8 * float(np.median([best for best, _ in kept]))
     return [scene for best, scene in kept if best >= level and scene.evidence]
