@@ -1,3 +1,4 @@
+import dataclasses
 import json
 
 import numpy as np
@@ -42,6 +43,47 @@ def test_collects_a_dataset_that_can_be_opened_again(tmp_path, capsys):
     assert "left alone" in lines[-2]
     assert json.loads(lines[-1]) == summary
     assert (root / "meta/info.json").stat().st_mtime_ns == before
+
+
+def test_an_interrupted_recording_goes_on_where_it_stopped(tmp_path, monkeypatch):
+    root, part = tmp_path / "demos", tmp_path / "demos.partial/turn_on_stove"
+    config = CollectConfig(
+        task="turn_on_stove,bowl_on_plate", episodes=1, root=str(root), height=128, width=128, workers=0
+    )
+
+    def interrupted(task, *rest):
+        if task == "bowl_on_plate":
+            raise KeyboardInterrupt
+        return record_episode(task, *rest)
+
+    monkeypatch.setattr("lerobot_openspm.envs.recording.record_episode", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        collect(config)
+    assert (part / "meta/info.json").is_file()
+    assert not root.exists()
+
+    def only_the_rest(task, *rest):
+        assert task == "bowl_on_plate"
+        return record_episode(task, *rest)
+
+    monkeypatch.setattr("lerobot_openspm.envs.recording.record_episode", only_the_rest)
+    assert collect(config)["episodes"] == 2
+    assert not part.parent.exists()
+    recorded = json.loads((root / "meta/openspm_collect.json").read_text())
+    assert [e["task"] for e in recorded["episodes"]] == ["turn_on_stove", "bowl_on_plate"]
+
+
+def test_a_broken_expert_stops_the_recording(tmp_path, monkeypatch):
+    def failing(*arguments):
+        return dataclasses.replace(record_episode(*arguments), success=False)
+
+    monkeypatch.setattr("lerobot_openspm.envs.recording.record_episode", failing)
+    root = tmp_path / "demos"
+    with pytest.raises(RuntimeError, match="failed 4 times on turn_on_stove"):
+        collect(
+            CollectConfig(task="turn_on_stove", episodes=1, root=str(root), height=64, width=64, workers=0)
+        )
+    assert not root.exists()
 
 
 def test_a_foreign_folder_is_not_touched(tmp_path):

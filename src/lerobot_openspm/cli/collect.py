@@ -2,13 +2,14 @@
 
 import contextlib
 import json
+import logging
 import multiprocessing
+import queue
 import shutil
 import time
-from collections import deque
-from collections.abc import Callable, Generator, Iterator, Sequence
-from concurrent.futures import Future, ProcessPoolExecutor
-from dataclasses import dataclass
+from collections.abc import Callable, Generator, Mapping, Sequence
+from concurrent.futures import FIRST_EXCEPTION, Future, ProcessPoolExecutor, wait
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -21,6 +22,8 @@ if TYPE_CHECKING:
     from lerobot_openspm.envs.recording import RecordedEpisode
 
 SUMMARY_FILE = "meta/openspm_collect.json"
+# Marks a task's part as complete, and what a folder of parts is being made for.
+PART_FILE, PARTS_FILE = "meta/openspm_part.json", "openspm_collect.json"
 FPS = 20
 # Every task has its own stretch of seeds, so that no two tasks show the same initial states.
 SEEDS_PER_TASK = 10_000
@@ -44,7 +47,7 @@ class CollectConfig:
         "yuv444p"  # full colour resolution; yuv420p plays in every browser but smears colours at edges
     )
     crf: int = 16  # lower keeps colours better
-    workers: int = 2  # processes that simulate; 0 simulates in this one
+    workers: int = 2  # processes that record, a task each at a time; 0 records in this one
     overwrite: bool = False  # replace an existing dataset at `root`
 
     def __post_init__(self) -> None:
@@ -59,7 +62,8 @@ class CollectConfig:
 def collect(config: CollectConfig) -> dict[str, Any]:
     """Record the demonstrations and return {"episodes", "frames", "discarded", "root", "seconds"}.
 
-    The dataset is written beside its place and moved there when it is complete.
+    Every task is recorded as a dataset of its own beside `root`; when all are there they are merged and moved
+    to their place. An interrupted recording goes on with the tasks that were not complete.
 
     Raises:
         FileExistsError: `root` holds something that this command did not write.
@@ -72,14 +76,11 @@ def collect(config: CollectConfig) -> dict[str, Any]:
     if root.exists() and not config.overwrite:
         return _keep_existing(config, root)
     partial = root.with_name(root.name + ".partial")
-    shutil.rmtree(partial, ignore_errors=True)
-    root.parent.mkdir(parents=True, exist_ok=True)
-    with _quiet_libraries():
-        dataset = _create_dataset(config, partial)
-        try:
-            episodes, discarded = _record_all(config, dataset)
-        finally:
-            dataset.finalize()
+    parts = _open_parts(config, partial)
+    _record_parts(config, {task: part for task, part in parts.items() if not (part / PART_FILE).is_file()})
+    records = [json.loads((part / PART_FILE).read_text(encoding="utf-8")) for part in parts.values()]
+    merged = _merge(config, list(parts.values()), partial / "merged")
+    episodes, discarded = ([e for r in records for e in r[kind]] for kind in ("episodes", "discarded"))
     summary = {
         "episodes": len(episodes),
         "frames": sum(e["steps"] for e in episodes),
@@ -87,10 +88,11 @@ def collect(config: CollectConfig) -> dict[str, Any]:
         "root": str(root),
         "seconds": round(time.monotonic() - start_s, 1),
     }
-    _write_meta(config, partial, {"summary": summary, "episodes": episodes, "discarded": discarded})
+    _write_meta(config, merged, {"summary": summary, "episodes": episodes, "discarded": discarded})
     if root.exists():
         shutil.rmtree(root)
-    partial.rename(root)
+    merged.rename(root)
+    shutil.rmtree(partial)
     return summary
 
 
@@ -166,116 +168,123 @@ def _create_dataset(config: CollectConfig, root: Path) -> "LeRobotDataset":
 
 @contextlib.contextmanager
 def _quiet_libraries() -> Generator[None]:
-    """Keep the encoder's and the table writer's messages per episode away from the progress bar."""
+    """Keep the encoder's, the table writer's and the merging's messages away from the progress bar."""
     import av.logging
     import datasets
 
-    level, bars = av.logging.get_level(), datasets.are_progress_bars_disabled()
+    merging = logging.getLogger("lerobot.datasets.aggregate")
+    merging_level, level, bars = merging.level, av.logging.get_level(), datasets.are_progress_bars_disabled()
+    merging.setLevel(logging.WARNING)
     av.logging.set_libav_level(av.logging.ERROR)
     datasets.disable_progress_bars()
     try:
         yield
     finally:
+        merging.setLevel(merging_level)
         av.logging.set_libav_level(level if level is not None else av.logging.INFO)
         if not bars:
             datasets.enable_progress_bars()
 
 
-def _record_all(config: CollectConfig, dataset: "LeRobotDataset") -> tuple[list[dict], list[dict]]:
+def _open_parts(config: CollectConfig, partial: Path) -> dict[str, Path]:
+    """Folders of the tasks' parts, by task; what other settings left there is discarded."""
+    settings = {key: value for key, value in asdict(config).items() if key not in ("workers", "overwrite")}
+    made_for = partial / PARTS_FILE
+    if not made_for.is_file() or json.loads(made_for.read_text(encoding="utf-8")) != settings:
+        shutil.rmtree(partial, ignore_errors=True)
+        partial.mkdir(parents=True)
+        made_for.write_text(json.dumps(settings), encoding="utf-8")
+    return {task: partial / task for task in select_tasks(config.task)}
+
+
+def _record_parts(config: CollectConfig, parts: Mapping[str, Path]) -> None:
+    """Record tasks, several at a time, with a progress bar over their episodes."""
     from tqdm import tqdm
 
-    tasks = select_tasks(config.task)
+    with tqdm(total=len(parts) * config.episodes, desc="episodes", unit="ep") as bar:
+
+        def show(task: str) -> None:
+            bar.set_postfix(task=task)
+            bar.update()
+
+        if config.workers == 0:
+            for task, part in parts.items():
+                record_part(config, task, part, show)
+            return
+        context = multiprocessing.get_context("spawn")
+        with context.Manager() as manager, ProcessPoolExecutor(config.workers, context) as pool:
+            recorded = manager.Queue()
+            running = [
+                pool.submit(record_part, config, task, part, recorded.put) for task, part in parts.items()
+            ]
+            try:
+                _watch(running, recorded, show)
+            finally:
+                pool.shutdown(cancel_futures=True)
+
+
+def _watch(running: Sequence[Future], recorded: "queue.Queue[str]", show: Callable[[str], None]) -> None:
+    """Show recorded episodes until every part is done. Raises what the first failed part raised."""
+    left = True
+    while left:
+        done, left = wait(running, timeout=0.5, return_when=FIRST_EXCEPTION)
+        for future in done:
+            future.result()
+        with contextlib.suppress(queue.Empty):
+            while True:
+                show(recorded.get_nowait())
+
+
+def record_part(config: CollectConfig, task: str, root: Path, recorded: Callable[[str], None]) -> None:
+    """Record one task's demonstrations as a dataset; ``recorded`` is called with the task after each.
+
+    Failed attempts are made up for with further seeds.
+
+    Raises:
+        RuntimeError: The expert failed too often.
+    """
+    from lerobot_openspm.envs.recording import record_episode
+
+    shutil.rmtree(root, ignore_errors=True)
     kept: list[dict] = []
     discarded: list[dict] = []
-    with tqdm(total=len(tasks) * config.episodes, desc="episodes", unit="ep") as bar:
-        for episode in _episodes(config, tasks):
+    seed = config.seed + SEEDS_PER_TASK * TASK_NAMES.index(task)
+    with _quiet_libraries():
+        dataset = _create_dataset(config, root)
+        while len(kept) < config.episodes:
+            episode = record_episode(task, seed, config.height, config.width)
+            seed += 1
             record = {
-                "task": episode.task,
+                "task": task,
                 "seed": episode.seed,
                 "steps": len(episode.action),
                 "success": episode.success,
                 "status": episode.status,
             }
-            if not episode.success:
-                discarded.append(record)
+            if episode.success:
+                _write_episode(dataset, episode)
+                kept.append(record)
+                recorded(task)
                 continue
-            _write_episode(dataset, episode)
-            kept.append(record)
-            bar.set_postfix(task=episode.task, discarded=len(discarded))
-            bar.update()
-    return kept, discarded
+            discarded.append(record)
+            if len(discarded) > 3 + MAX_DISCARDED_SHARE * config.episodes:
+                raise RuntimeError(
+                    f"the expert failed {len(discarded)} times on {task}, where {config.episodes} episodes "
+                    "were wanted; this task was not kept"
+                )
+        dataset.finalize()
+    document = {"episodes": kept, "discarded": discarded}
+    (root / PART_FILE).write_text(json.dumps(document), encoding="utf-8")
 
 
-def _episodes(config: CollectConfig, tasks: list[str]) -> Iterator["RecordedEpisode"]:
-    """Yield episodes task by task in the order of their seeds; a failed one is made up for at once."""
-    with _Recorder(config) as submit:
-        for task in tasks:
-            seeds = iter(range(_first_seed(config, task), _first_seed(config, task) + SEEDS_PER_TASK))
-            submit.enqueue(task, [next(seeds) for _ in range(config.episodes)])
-            submit.spare_seeds[task] = seeds
-        yield from submit.results()
+def _merge(config: CollectConfig, parts: Sequence[Path], merged: Path) -> Path:
+    """One dataset of all parts, in their order."""
+    from lerobot.datasets.aggregate import aggregate_datasets
 
-
-def _first_seed(config: CollectConfig, task: str) -> int:
-    return config.seed + SEEDS_PER_TASK * TASK_NAMES.index(task)
-
-
-class _Recorder:
-    """Runs episodes in worker processes, few at a time (they are large), and hands them out in order."""
-
-    def __init__(self, config: CollectConfig) -> None:
-        self._config = config
-        self._waiting: deque[tuple[str, int]] = deque()
-        self._running: deque[tuple[str, Callable[[], RecordedEpisode]]] = deque()
-        self._pool: ProcessPoolExecutor | None = None
-        self._failures: dict[str, int] = {}
-        self.spare_seeds: dict[str, Iterator[int]] = {}
-
-    def __enter__(self) -> "_Recorder":
-        if self._config.workers:
-            context = multiprocessing.get_context("spawn")
-            self._pool = ProcessPoolExecutor(self._config.workers, mp_context=context)
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        if self._pool is not None:
-            self._pool.shutdown(cancel_futures=True)
-
-    def enqueue(self, task: str, seeds: list[int]) -> None:
-        """Add episodes to the end of the queue."""
-        self._waiting.extend((task, seed) for seed in seeds)
-
-    def results(self) -> Iterator["RecordedEpisode"]:
-        """Yield every queued episode, and one more for each that failed."""
-        ahead = self._config.workers + 1 if self._pool is not None else 1
-        while self._waiting or self._running:
-            while self._waiting and len(self._running) < ahead:
-                task, seed = self._waiting.popleft()
-                self._running.append((task, self._start(task, seed)))
-            task, result = self._running.popleft()
-            episode = result()
-            if not episode.success:
-                self._count_failure(task)
-                self._running.appendleft((task, self._start(task, next(self.spare_seeds[task]))))
-            yield episode
-
-    def _start(self, task: str, seed: int) -> Callable[[], "RecordedEpisode"]:
-        from lerobot_openspm.envs.recording import record_episode
-
-        arguments = (task, seed, self._config.height, self._config.width)
-        if self._pool is None:
-            return lambda: record_episode(*arguments)
-        future: Future[RecordedEpisode] = self._pool.submit(record_episode, *arguments)
-        return future.result
-
-    def _count_failure(self, task: str) -> None:
-        self._failures[task] = self._failures.get(task, 0) + 1
-        if self._failures[task] > 3 + MAX_DISCARDED_SHARE * self._config.episodes:
-            raise RuntimeError(
-                f"the expert failed {self._failures[task]} times on {task}, "
-                f"where {self._config.episodes} episodes were wanted; "
-                "nothing was kept"
-            )
+    shutil.rmtree(merged, ignore_errors=True)
+    with _quiet_libraries():
+        aggregate_datasets([config.repo_id] * len(parts), config.repo_id, list(parts), merged)
+    return merged
 
 
 def _write_episode(dataset: "LeRobotDataset", episode: "RecordedEpisode") -> None:
