@@ -142,7 +142,7 @@ class OpenSPMConfig(PreTrainedConfig):
                 raise ValueError(f"{name} is {getattr(self, name)}, expected more than 0")
         not_negative = (
             "perturbation_m", "perturbation_rad", "max_corrections", "max_attempts", "reach_margin_m",
-            "min_clearance_m", "weight_semantic", "weight_geometric", "weight_quality",
+            "min_clearance_m", "weight_semantic", "weight_geometric", "weight_quality", "noise_seed",
         )  # fmt: skip
         for name in not_negative:
             if not getattr(self, name) >= 0:
@@ -178,17 +178,20 @@ class OpenSPMConfig(PreTrainedConfig):
         """Check that there are images, a state and an action, of the sizes that the layouts name."""
         if not self.image_features:
             raise ValueError(
-                f"OpenSPM needs at least one camera, got input features {sorted(self.input_features or {})}"
+                f"OpenSPM needs at least one camera, got input features {sorted(self.input_features or {})}; "
+                "record with a camera, or name its images observation.images.<name>"
             )
         for name, feature, layout in (
             (OBS_STATE, self.robot_state_feature, self.state_layout),
             (ACTION, self.action_feature, self.action_layout),
         ):
             if feature is None:
-                raise ValueError(f"OpenSPM needs {name!r}, got features {sorted(self.input_features or {})}")
+                got = sorted({**(self.input_features or {}), **(self.output_features or {})})
+                raise ValueError(f"OpenSPM needs {name!r}, got features {got}; rename with --rename_map")
             if layout is not None and len(layout) != feature.shape[0]:
                 raise ValueError(
-                    f"{name} has {feature.shape[0]} numbers, but its layout names {len(layout)}: {layout}"
+                    f"{name} has {feature.shape[0]} numbers, but its layout names {len(layout)}: {layout}; "
+                    "give one name per number in --policy.state_layout and --policy.action_layout"
                 )
 
     def get_optimizer_preset(self) -> AdamWConfig:

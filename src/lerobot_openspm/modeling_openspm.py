@@ -76,11 +76,8 @@ class OpenSPMPolicy(PreTrainedPolicy):
     def select_action(self, batch: dict[str, Tensor], **kwargs: Any) -> Tensor:
         """Choose one action ``(b, action_dim)`` for every environment of a batch of observations."""
         self.eval()
-        state_layout, action_layout = self.config.layouts()
-        observations = split_batch(batch, state_layout)
         actions = []
-        for row, observation in zip(self._rows_of(observations), observations, strict=True):
-            row.observe(observation.hand, lambda names, seen=observation: self._find(names, seen))
+        for row, observation in self._observe(batch):
             action = row.next_action()
             if action is None:
                 row.executor.push_chunk(
@@ -88,18 +85,14 @@ class OpenSPMPolicy(PreTrainedPolicy):
                 )
                 action = row.next_action()
             actions.append(action)
-        vectors = action_layout.encode_actions(np.stack(actions))
-        return torch.as_tensor(vectors, dtype=torch.float32, device=self.config.device)
+        return self._encode(np.stack(actions))
 
     @torch.no_grad()
     def predict_action_chunk(self, batch: dict[str, Tensor], **kwargs: Any) -> Tensor:
         """Generate a chunk ``(b, chunk_size, action_dim)`` for every environment; the caller executes it."""
         self.eval()
-        state_layout, action_layout = self.config.layouts()
-        observations = split_batch(batch, state_layout)
         chunks = []
-        for row, observation in zip(self._rows_of(observations), observations, strict=True):
-            row.observe(observation.hand, lambda names, seen=observation: self._find(names, seen))
+        for row, observation in self._observe(batch):
             chunk = np.tile(row.executor.hold(), (self.config.chunk_size, 1))
             if row.executor.target is not None:
                 chunk = self._chunk(row, row.query(observation.hand))
@@ -107,7 +100,19 @@ class OpenSPMPolicy(PreTrainedPolicy):
                 while row.next_action() is not None:  # count them as done
                     pass
             chunks.append(chunk)
-        vectors = action_layout.encode_actions(np.stack(chunks))
+        return self._encode(np.stack(chunks))
+
+    def _observe(self, batch: dict[str, Tensor]) -> list[tuple[Row, Observation]]:
+        """Each environment's state, brought up to its observation."""
+        observations = split_batch(batch, self.config.layouts()[0])
+        pairs = list(zip(self._rows_of(observations), observations, strict=True))
+        for row, observation in pairs:
+            row.observe(observation.hand, lambda names, seen=observation: self._find(names, seen))
+        return pairs
+
+    def _encode(self, actions: np.ndarray) -> Tensor:
+        """Actions ``(..., 7)`` in the robot's own layout."""
+        vectors = self.config.layouts()[1].encode_actions(actions)
         return torch.as_tensor(vectors, dtype=torch.float32, device=self.config.device)
 
     def _rows_of(self, observations: Sequence[Observation]) -> list[Row]:

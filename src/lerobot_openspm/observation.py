@@ -94,15 +94,25 @@ def split_batch(batch: Mapping[str, Any], state_layout: VectorLayout) -> list[Ob
         LayoutError: The state has another size than its layout.
     """
     if OBS_STATE not in batch:
-        raise ObservationError(f"the observation has no {OBS_STATE!r}; it has {sorted(batch)}")
+        raise ObservationError(
+            f"the observation has no {OBS_STATE!r}; it has {sorted(batch)}. Rename with --rename_map"
+        )
     states = batch[OBS_STATE].detach().cpu().numpy().astype(float)
     if states.ndim != 2:
-        raise ObservationError(f"{OBS_STATE!r} has shape {states.shape}, expected (environments, numbers)")
+        raise ObservationError(
+            f"{OBS_STATE!r} has shape {states.shape}, expected (environments, numbers); pass batches through "
+            "the policy's preprocessor"
+        )
     if not np.isfinite(states).all():
-        raise ObservationError(f"{OBS_STATE!r} is not finite: {states}")
+        raise ObservationError(
+            f"{OBS_STATE!r} is not finite: {states}; stop the robot and check its driver or the simulation"
+        )
     tasks = batch.get("task")
     if tasks is None:
-        raise ObservationError(f"the observation has no 'task', the instruction; it has {sorted(batch)}")
+        raise ObservationError(
+            f"the observation has no 'task', the instruction; it has {sorted(batch)}. Add one string an "
+            "environment under 'task'"
+        )
     tasks = [tasks] * len(states) if isinstance(tasks, str) else list(tasks)
     if len(tasks) != len(states) or not all(isinstance(task, str) for task in tasks):
         raise ObservationError(

@@ -81,7 +81,7 @@ def test_a_broken_expert_stops_the_recording(tmp_path, monkeypatch):
     root = tmp_path / "demos"
     with pytest.raises(RuntimeError, match="failed 4 times on turn_on_stove"):
         collect(
-            CollectConfig(task="turn_on_stove", episodes=1, root=str(root), height=64, width=64, workers=0)
+            CollectConfig(task="turn_on_stove", episodes=1, root=str(root), height=128, width=128, workers=0)
         )
     assert not root.exists()
 

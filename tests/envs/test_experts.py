@@ -6,11 +6,8 @@ from lerobot_openspm.envs.experts import expert_actions
 from lerobot_openspm.envs.seeds import TUNING_SEED_START
 from lerobot_openspm.envs.tasks import TASK_NAMES
 
-QUICK = ("turn_on_stove", "bowl_on_plate")
-MARKED = [name if name in QUICK else pytest.param(name, marks=pytest.mark.slow) for name in TASK_NAMES]
 
-
-@pytest.mark.parametrize("task", MARKED)
+@pytest.mark.parametrize("task", TASK_NAMES)
 def test_expert_solves_its_task(make_env, task):
     info, steps = run_expert(make_env(task), TUNING_SEED_START)
     assert info["is_success"], f"{task} after {steps} steps: {info}"

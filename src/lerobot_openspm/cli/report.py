@@ -51,7 +51,7 @@ def write_report(
                 "mean_steps": _rounded(mean_steps(own)),
                 "entries": len(entries),
                 "anchors": ", ".join(best.objects) if best else "",
-                "poses": poses.name,
+                "poses": poses.name if best else None,
                 "films": _films(own, evaluation, folder),
             }
         )
