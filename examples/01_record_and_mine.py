@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 from lerobot.datasets import LeRobotDatasetMetadata
 
-from lerobot_openspm.cli.collect import CollectConfig, collect
+from lerobot_openspm.cli.collect import CollectConfig, SimulatorConfig, collect
 from lerobot_openspm.configuration_openspm import OpenSPMConfig
 from lerobot_openspm.experience import save_experience
 from lerobot_openspm.training import mine_experience
@@ -33,7 +33,11 @@ def main() -> None:
     # 1. Record. The result is an ordinary LeRobotDataset: videos, states, actions, instructions.
     root = options.dataset or options.output / "dataset"
     if options.dataset is None:
-        collect(CollectConfig(task=options.tasks, episodes=options.demonstrations, root=str(root)))
+        collect(
+            CollectConfig(
+                SimulatorConfig(task=options.tasks), episodes=options.demonstrations, root=str(root)
+            )
+        )
 
     # 2. Mine. All that has to be known of the robot is where its cameras are; what the objects look like is
     #    learned from the demonstrations themselves.

@@ -12,7 +12,7 @@ import subprocess
 import sys
 from pathlib import Path
 
-from lerobot_openspm.cli.collect import CollectConfig, collect
+from lerobot_openspm.cli.collect import CollectConfig, SimulatorConfig, collect
 
 REPOSITORY = Path(__file__).parents[1]
 
@@ -40,7 +40,11 @@ def main() -> None:
 
     dataset = (options.dataset or output / "dataset").resolve()
     if options.dataset is None:
-        collect(CollectConfig(task=options.task, episodes=options.demonstrations, root=str(dataset)))
+        collect(
+            CollectConfig(
+                SimulatorConfig(task=options.task), episodes=options.demonstrations, root=str(dataset)
+            )
+        )
 
     # The ready-made configuration names the policy, the cameras and sensible settings; the rest is ours.
     run(

@@ -38,9 +38,10 @@ def make_once(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., Path]:
 
 def record(root: Path, task: str, episodes: int) -> None:
     """Record demonstrations in small images."""
-    from lerobot_openspm.cli.collect import CollectConfig, collect
+    from lerobot_openspm.cli.collect import CollectConfig, SimulatorConfig, collect
 
-    collect(CollectConfig(task=task, episodes=episodes, root=str(root), height=128, width=128, workers=0))
+    env = SimulatorConfig(task=task)
+    collect(CollectConfig(env, episodes, str(root), height=128, width=128, workers=0))
 
 
 @pytest.fixture(scope="session")

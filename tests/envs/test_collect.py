@@ -4,12 +4,12 @@ import json
 import numpy as np
 import pytest
 
-from lerobot_openspm.cli.collect import CollectConfig, collect, main
-from lerobot_openspm.envs.recording import record_episode
+from lerobot_openspm.cli.collect import CollectConfig, SimulatorConfig, collect, main
 from lerobot_openspm.envs.seeds import DEMO_SEED_START, TUNING_SEED_START
+from lerobot_openspm.envs.tabletop_recording import TabletopSource
 from lerobot_openspm.envs.tasks import TASK_NAMES
 
-ARGUMENTS = ["--task=turn_on_stove", "--episodes=2", "--height=128", "--width=128", "--workers=0"]
+ARGUMENTS = ["--env.task=turn_on_stove", "--episodes=2", "--height=128", "--width=128", "--workers=0"]
 
 
 def test_collects_a_dataset_that_can_be_opened_again(tmp_path, capsys):
@@ -27,12 +27,14 @@ def test_collects_a_dataset_that_can_be_opened_again(tmp_path, capsys):
     assert [r["seed"] for r in records] == [
         DEMO_SEED_START + 10_000 * TASK_NAMES.index("turn_on_stove") + i for i in (0, 1)
     ]
-    episode = record_episode("turn_on_stove", records[0]["seed"], 128, 128)
+    episode = TabletopSource().record("turn_on_stove", records[0]["seed"], 128, 128)
     frame = dataset[5]
     assert frame["task"] == "turn on the stove"
-    np.testing.assert_array_equal(frame["action"], episode.action[5])
-    np.testing.assert_array_equal(frame["observation.state"], episode.state[5])
-    np.testing.assert_array_equal(frame["simulator.object_poses"], episode.object_poses[5])
+    np.testing.assert_array_equal(frame["action"], episode.columns["action"][5])
+    np.testing.assert_array_equal(frame["observation.state"], episode.columns["observation.state"][5])
+    np.testing.assert_array_equal(
+        frame["simulator.object_poses"], episode.columns["simulator.object_poses"][5]
+    )
     shown = frame["observation.images.front"].numpy().transpose(1, 2, 0) * 255
     assert np.abs(shown - episode.images["front"][5]).mean() < 1.5
 
@@ -47,26 +49,26 @@ def test_collects_a_dataset_that_can_be_opened_again(tmp_path, capsys):
 
 def test_an_interrupted_recording_goes_on_where_it_stopped(tmp_path, monkeypatch):
     root, part = tmp_path / "demos", tmp_path / "demos.partial/turn_on_stove"
-    config = CollectConfig(
-        task="turn_on_stove,bowl_on_plate", episodes=1, root=str(root), height=128, width=128, workers=0
-    )
+    env = SimulatorConfig(task="turn_on_stove,bowl_on_plate")
+    config = CollectConfig(env, 1, str(root), height=128, width=128, workers=0)
+    record = TabletopSource.record
 
-    def interrupted(task, *rest):
+    def interrupted(self, task, *rest):
         if task == "bowl_on_plate":
             raise KeyboardInterrupt
-        return record_episode(task, *rest)
+        return record(self, task, *rest)
 
-    monkeypatch.setattr("lerobot_openspm.envs.recording.record_episode", interrupted)
+    monkeypatch.setattr(TabletopSource, "record", interrupted)
     with pytest.raises(KeyboardInterrupt):
         collect(config)
     assert (part / "meta/info.json").is_file()
     assert not root.exists()
 
-    def only_the_rest(task, *rest):
+    def only_the_rest(self, task, *rest):
         assert task == "bowl_on_plate"
-        return record_episode(task, *rest)
+        return record(self, task, *rest)
 
-    monkeypatch.setattr("lerobot_openspm.envs.recording.record_episode", only_the_rest)
+    monkeypatch.setattr(TabletopSource, "record", only_the_rest)
     assert collect(config)["episodes"] == 2
     assert not part.parent.exists()
     recorded = json.loads((root / "meta/openspm_collect.json").read_text())
@@ -74,14 +76,18 @@ def test_an_interrupted_recording_goes_on_where_it_stopped(tmp_path, monkeypatch
 
 
 def test_a_broken_expert_stops_the_recording(tmp_path, monkeypatch):
-    def failing(*arguments):
-        return dataclasses.replace(record_episode(*arguments), success=False)
+    record = TabletopSource.record
 
-    monkeypatch.setattr("lerobot_openspm.envs.recording.record_episode", failing)
+    def failing(self, *arguments):
+        return dataclasses.replace(record(self, *arguments), success=False)
+
+    monkeypatch.setattr(TabletopSource, "record", failing)
     root = tmp_path / "demos"
     with pytest.raises(RuntimeError, match="failed 4 times on turn_on_stove"):
         collect(
-            CollectConfig(task="turn_on_stove", episodes=1, root=str(root), height=128, width=128, workers=0)
+            CollectConfig(
+                SimulatorConfig(task="turn_on_stove"), 1, str(root), height=128, width=128, workers=0
+            )
         )
     assert not root.exists()
 

@@ -98,6 +98,24 @@ def test_one_view_is_enough_and_none_is_an_error(models, unseen):
         localise({}, models["cup"])
 
 
+def test_mirrored_images_of_a_mirrored_camera_give_the_same_pose(models, unseen):
+    for name in ("block", "cup"):
+        views = views_of(unseen[0])
+        mirrored = {
+            key: dataclasses.replace(
+                view,
+                image=np.ascontiguousarray(view.image[:, ::-1]),
+                camera=dataclasses.replace(
+                    view.camera, fx=-view.camera.fx, cx=view.camera.width - 1 - view.camera.cx
+                ),
+            )
+            for key, view in views.items()
+        }
+        plain, turned = localise(views, models[name]), localise(mirrored, models[name])
+        assert turned.status == plain.status == "found"
+        np.testing.assert_allclose(turned.T_world_obj, plain.T_world_obj, atol=2e-3)
+
+
 def test_covariance_is_positive_and_knows_what_cannot_be_seen(models, unseen):
     for name in ("block", "cup"):
         estimate = localise(views_of(unseen[2]), models[name])

@@ -1,4 +1,4 @@
-"""`openspm collect`: record scripted demonstrations on the tabletop as a LeRobotDataset."""
+"""`openspm collect`: record scripted demonstrations on the tabletop or on LIBERO as a LeRobotDataset."""
 
 import contextlib
 import json
@@ -9,12 +9,12 @@ import shutil
 import time
 from collections.abc import Callable, Generator, Mapping, Sequence
 from concurrent.futures import FIRST_EXCEPTION, Future, ProcessPoolExecutor, wait
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from lerobot_openspm.envs.recording import source
 from lerobot_openspm.envs.seeds import DEMO_SEED_START, require_demo_seeds
-from lerobot_openspm.envs.tasks import TASK_NAMES, select_tasks
 
 if TYPE_CHECKING:
     from lerobot.datasets.lerobot_dataset import LeRobotDataset
@@ -32,13 +32,21 @@ MAX_DISCARDED_SHARE = 0.5
 
 
 @dataclass
-class CollectConfig:
-    """Record scripted demonstrations on the tabletop as a LeRobotDataset."""
+class SimulatorConfig:
+    """Which simulator, and which of its tasks."""
 
+    type: str = "openspm_tabletop"  # openspm_tabletop, or libero (its suite libero_goal)
     task: str = "all"  # a task name, a comma list of them, or "all"
+
+
+@dataclass
+class CollectConfig:
+    """Record scripted demonstrations on the tabletop or on LIBERO as a LeRobotDataset."""
+
+    env: SimulatorConfig = field(default_factory=SimulatorConfig)
     episodes: int = 10  # per task
     root: str | None = None  # output folder; default: LeRobot's home folder / repo_id
-    repo_id: str = "local/openspm_tabletop"
+    repo_id: str = ""  # default: local/ and the name of the simulator
     seed: int = DEMO_SEED_START  # first demonstration seed; each task takes its own stretch from here on
     height: int = 256
     width: int = 256
@@ -55,8 +63,10 @@ class CollectConfig:
             raise ValueError(f"episodes must be at least 1, got {self.episodes}")
         if self.workers < 0:
             raise ValueError(f"workers must not be negative, got {self.workers}")
-        select_tasks(self.task)
-        require_demo_seeds(self.seed, SEEDS_PER_TASK * len(TASK_NAMES))
+        recorded = source(self.env.type)
+        recorded.tasks(self.env.task)
+        require_demo_seeds(self.seed, SEEDS_PER_TASK * len(recorded.all_tasks()))
+        self.repo_id = self.repo_id or f"local/{self.env.type}"
 
 
 def collect(config: CollectConfig) -> dict[str, Any]:
@@ -108,7 +118,10 @@ def _keep_existing(config: CollectConfig, root: Path) -> dict[str, Any]:
     """Leave a complete dataset alone and say what is there."""
     recorded = json.loads((root / SUMMARY_FILE).read_text(encoding="utf-8"))
     summary = recorded["summary"]
-    tasks, wanted = {e["task"] for e in recorded["episodes"]}, set(select_tasks(config.task))
+    tasks, wanted = (
+        {e["task"] for e in recorded["episodes"]},
+        set(source(config.env.type).tasks(config.env.task)),
+    )
     if tasks != wanted or summary["episodes"] != config.episodes * len(wanted):
         raise FileExistsError(
             f"{root} holds {summary['episodes']} episodes of {sorted(tasks)}, asked were {config.episodes} "
@@ -122,11 +135,10 @@ def _keep_existing(config: CollectConfig, root: Path) -> dict[str, Any]:
 
 
 def _features(config: CollectConfig) -> dict[str, dict]:
-    from lerobot_openspm.envs.scene import CAMERA_NAMES
-    from lerobot_openspm.envs.tabletop_env import ACTION_NAMES, OBJECT_POSE_NAMES, STATE_NAMES
+    recorded = source(config.env.type)
 
-    def vector(names: Sequence[str]) -> dict:
-        return {"dtype": "float32", "shape": (len(names),), "names": list(names)}
+    def count(names: Any) -> int:
+        return sum(map(len, names.values())) if isinstance(names, Mapping) else len(names)
 
     video = {
         "dtype": "video",
@@ -134,11 +146,11 @@ def _features(config: CollectConfig) -> dict[str, dict]:
         "names": ["height", "width", "channels"],
     }
     return {
-        **{f"observation.images.{name}": dict(video) for name in CAMERA_NAMES},
-        "observation.state": vector(STATE_NAMES),
-        "action": vector(ACTION_NAMES),
-        # Not under "observation.": no policy is ever handed the true poses by accident.
-        "simulator.object_poses": vector(OBJECT_POSE_NAMES),
+        **{f"observation.images.{name}": dict(video) for name in recorded.cameras},
+        **{
+            key: {"dtype": "float32", "shape": (count(names),), "names": names}
+            for key, names in recorded.names.items()
+        },
     }
 
 
@@ -152,7 +164,7 @@ def _create_dataset(config: CollectConfig, root: Path) -> "LeRobotDataset":
         fps=FPS,
         features=_features(config),
         root=root,
-        robot_type="openspm_tabletop",
+        robot_type=source(config.env.type).robot_type,
         use_videos=True,
         # Nothing is read back here; naming a decoder spares the search for another one.
         video_backend="pyav",
@@ -194,7 +206,7 @@ def _open_parts(config: CollectConfig, partial: Path) -> dict[str, Path]:
         shutil.rmtree(partial, ignore_errors=True)
         partial.mkdir(parents=True)
         made_for.write_text(json.dumps(settings), encoding="utf-8")
-    return {task: partial / task for task in select_tasks(config.task)}
+    return {task: partial / task for task in source(config.env.type).tasks(config.env.task)}
 
 
 def _record_parts(config: CollectConfig, parts: Mapping[str, Path]) -> None:
@@ -235,36 +247,35 @@ def _watch(running: Sequence[Future], recorded: "queue.Queue[str]", show: Callab
                 show(recorded.get_nowait())
 
 
-def record_part(config: CollectConfig, task: str, root: Path, recorded: Callable[[str], None]) -> None:
-    """Record one task's demonstrations as a dataset; ``recorded`` is called with the task after each.
+def record_part(config: CollectConfig, task: str, root: Path, done: Callable[[str], None]) -> None:
+    """Record one task's demonstrations as a dataset; ``done`` is called with the task after each.
 
     Failed attempts are made up for with further seeds.
 
     Raises:
         RuntimeError: The expert failed too often.
     """
-    from lerobot_openspm.envs.recording import record_episode
-
+    recorded = source(config.env.type)
     shutil.rmtree(root, ignore_errors=True)
     kept: list[dict] = []
     discarded: list[dict] = []
-    seed = config.seed + SEEDS_PER_TASK * TASK_NAMES.index(task)
+    seed = config.seed + SEEDS_PER_TASK * list(recorded.all_tasks()).index(task)
     with _quiet_libraries():
         dataset = _create_dataset(config, root)
         while len(kept) < config.episodes:
-            episode = record_episode(task, seed, config.height, config.width)
+            episode = recorded.record(task, seed, config.height, config.width)
             seed += 1
             record = {
                 "task": task,
                 "seed": episode.seed,
-                "steps": len(episode.action),
+                "steps": len(episode),
                 "success": episode.success,
                 "status": episode.status,
             }
             if episode.success:
                 _write_episode(dataset, episode)
                 kept.append(record)
-                recorded(task)
+                done(task)
                 continue
             discarded.append(record)
             if len(discarded) > 3 + MAX_DISCARDED_SHARE * config.episodes:
@@ -288,13 +299,11 @@ def _merge(config: CollectConfig, parts: Sequence[Path], merged: Path) -> Path:
 
 
 def _write_episode(dataset: "LeRobotDataset", episode: "RecordedEpisode") -> None:
-    for i in range(len(episode.action)):
+    for i in range(len(episode)):
         dataset.add_frame(
             {
                 **{f"observation.images.{name}": frames[i] for name, frames in episode.images.items()},
-                "observation.state": episode.state[i],
-                "action": episode.action[i],
-                "simulator.object_poses": episode.object_poses[i],
+                **{key: rows[i] for key, rows in episode.columns.items()},
                 "task": episode.instruction,
             }
         )
@@ -302,10 +311,11 @@ def _write_episode(dataset: "LeRobotDataset", episode: "RecordedEpisode") -> Non
 
 
 def _write_meta(config: CollectConfig, root: Path, document: dict) -> None:
-    from lerobot_openspm.envs.calibration import write_calibration
-
     (root / SUMMARY_FILE).write_text(json.dumps(document, indent=1) + "\n", encoding="utf-8")
-    write_calibration(root / "meta/openspm_cameras.json", config.height, config.width)
+    calibration = source(config.env.type).calibration(config.height, config.width)
+    (root / "meta/openspm_cameras.json").write_text(
+        json.dumps(calibration, indent=2) + "\n", encoding="utf-8"
+    )
 
 
 def main(args: Sequence[str] | None = None) -> None:

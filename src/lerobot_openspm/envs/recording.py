@@ -1,24 +1,29 @@
-"""One expert episode as arrays: what `openspm collect` runs in its worker processes."""
+"""Expert episodes as arrays, and what a simulator has to offer so that `openspm collect` can record them."""
 
-import functools
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any, Protocol
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
-from lerobot_openspm.envs.experts import expert_actions
-from lerobot_openspm.envs.scene import CAMERA_NAMES
-from lerobot_openspm.envs.tabletop_env import TabletopEnv
+# Not under "observation.": no policy is ever handed the true poses by accident.
+OBJECT_POSES = "simulator.object_poses"
+# A list, or the grouped form that some LeRobot datasets use.
+Names = list[str] | dict[str, list[str]]
+POSE_COMPONENTS = ("x", "y", "z", "qw", "qx", "qy", "qz")
 
 
 @dataclass(frozen=True)
 class RecordedEpisode:
-    """Observations are those before the action of the same frame.
+    """One attempt of an expert, `n` frames long. Observations are those before the action of their frame.
 
     Attributes:
         images: Per camera (n, height, width, 3) uint8.
-        state: (n, 8) float32, as in `STATE_NAMES`.
-        action: (n, 7) float32, as in `ACTION_NAMES`.
-        object_poses: (n, 49) float32, as in `OBJECT_POSE_NAMES`.
+        columns: By feature name (n, numbers) float32: observation.state, action, the true object poses.
+        status: What the environment said when it ended.
     """
 
     task: str
@@ -26,40 +31,92 @@ class RecordedEpisode:
     seed: int
     success: bool
     status: str
-    images: dict[str, np.ndarray]
-    state: np.ndarray
-    action: np.ndarray
-    object_poses: np.ndarray
+    images: Mapping[str, np.ndarray]
+    columns: Mapping[str, np.ndarray]
+
+    def __len__(self) -> int:
+        return len(self.columns["action"])
 
 
-@functools.lru_cache(maxsize=1)
-def _environment(task: str, height: int, width: int) -> TabletopEnv:
-    return TabletopEnv(task, observation_height=height, observation_width=width)
+class Source(Protocol):
+    """A simulator with an expert for each of its tasks."""
+
+    @property
+    def robot_type(self) -> str:
+        """What the dataset calls the robot."""
+        ...
+
+    @property
+    def cameras(self) -> Sequence[str]:
+        """The cameras' names; their images are ``observation.images.<name>``."""
+        ...
+
+    @property
+    def names(self) -> Mapping[str, Names]:
+        """Names of the numbers of ``observation.state``, ``action`` and the true object poses."""
+        ...
+
+    def tasks(self, selection: str) -> list[str]:
+        """Names of the tasks that a selection ("all", or names with commas) stands for."""
+        ...
+
+    def all_tasks(self) -> Sequence[str]:
+        """All tasks in their fixed order, which decides who takes which seeds."""
+        ...
+
+    def record(self, task: str, seed: int, height: int, width: int) -> RecordedEpisode:
+        """Let the expert act from the initial state of `seed` until the episode ends."""
+        ...
+
+    def calibration(self, height: int, width: int) -> dict[str, Any]:
+        """The cameras in the calibration file's format."""
+        ...
 
 
-def record_episode(task: str, seed: int, height: int, width: int) -> RecordedEpisode:
-    """Let the expert act from the initial state of `seed` until the episode ends."""
-    env = _environment(task, height, width)
-    observation, info = env.reset(seed=seed)
-    images: dict[str, list] = {name: [] for name in CAMERA_NAMES}
-    states, actions, poses = [], [], []
-    for action in expert_actions(env.simulator, task, np.random.default_rng(seed)):
-        for name in CAMERA_NAMES:
-            images[name].append(observation["pixels"][name])
-        states.append(observation["agent_pos"])
-        poses.append(env.object_pose_vector())
-        actions.append(action)
-        observation, _, terminated, truncated, info = env.step(action)
-        if terminated or truncated:
-            break
-    return RecordedEpisode(
-        task=task,
-        instruction=env.task_description,
-        seed=seed,
-        success=info["is_success"],
-        status=info["status"],
-        images={name: np.stack(frames) for name, frames in images.items()},
-        state=np.stack(states),
-        action=np.stack(actions),
-        object_poses=np.stack(poses),
-    )
+class Recorder:
+    """Collects the frames of one episode."""
+
+    def __init__(self) -> None:
+        self._images: dict[str, list[np.ndarray]] = {}
+        self._columns: dict[str, list[np.ndarray]] = {}
+
+    def add(self, images: Mapping[str, np.ndarray], columns: Mapping[str, np.ndarray]) -> None:
+        """Add one frame."""
+        for kept, new in ((self._images, images), (self._columns, columns)):
+            for key, value in new.items():
+                kept.setdefault(key, []).append(value)
+
+    def episode(self, task: str, instruction: str, seed: int, success: bool, status: str) -> RecordedEpisode:
+        """What was added so far."""
+        images = {key: np.stack(frames) for key, frames in self._images.items()}
+        columns = {key: np.stack(rows).astype(np.float32) for key, rows in self._columns.items()}
+        return RecordedEpisode(task, instruction, seed, success, status, images, columns)
+
+
+def pose_vector(poses: Mapping[str, np.ndarray]) -> np.ndarray:
+    """Position and quat_wxyz of every object, in their order, (7 * n,)."""
+    quats = {name: np.roll(Rotation.from_matrix(T[:3, :3]).as_quat(), 1) for name, T in poses.items()}
+    return np.concatenate([np.append(T[:3, 3], quats[name]) for name, T in poses.items()])
+
+
+def pose_names(objects: Sequence[str]) -> list[str]:
+    """Names of the numbers of :func:`pose_vector`."""
+    return [f"{name}.{component}" for name in objects for component in POSE_COMPONENTS]
+
+
+def source(env_type: str) -> Source:
+    """The source of an environment type.
+
+    Raises:
+        ValueError: There is no such source.
+        ImportError: LIBERO is not installed.
+    """
+    if env_type == "openspm_tabletop":
+        from lerobot_openspm.envs.tabletop_recording import TabletopSource
+
+        return TabletopSource()
+    if env_type == "libero":
+        from lerobot_openspm.envs.libero.recording import LiberoSource
+
+        return LiberoSource()
+    raise ValueError(f"env.type is {env_type!r}, expected openspm_tabletop or libero")

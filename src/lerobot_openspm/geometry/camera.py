@@ -30,7 +30,8 @@ class Camera:
     Attributes:
         width: Image width in pixels.
         height: Image height in pixels.
-        fx: Focal length in pixels, horizontally.
+        fx: Focal length in pixels, horizontally; negative where images are mirrored left to right, as
+            LeRobot shows LIBERO.
         fy: Focal length in pixels, vertically.
         cx: Optical centre, horizontal pixel coordinate.
         cy: Optical centre, vertical pixel coordinate.
@@ -46,6 +47,11 @@ class Camera:
     cy: float
     mount: Literal["world", "ee"]
     T_mount_cam: Array
+
+    @property
+    def focal_px(self) -> float:
+        """Pixels per radian near the optical centre, for sizes."""
+        return abs(self.fx)
 
     def scaled(self, width: int, height: int) -> Camera:
         """The same camera read out at another resolution. Raises CalibrationError on another aspect ratio."""
@@ -135,8 +141,11 @@ def _camera_from_dict(fields: Mapping[str, Any], where: str) -> Camera:
         raise CalibrationError(f"{where}: 'mount' is {mount!r}, expected 'world' or 'ee'")
     if T_mount_cam.shape != (4, 4) or not se3.is_rigid(T_mount_cam):
         raise CalibrationError(f"{where}: 'T_mount_cam' is not a rigid (4, 4) transform")
-    if not (np.isfinite([fx, fy, cx, cy]).all() and min(fx, fy, width, height) > 0):
-        raise CalibrationError(f"{where}: sizes and focal lengths must be positive and finite")
+    if not (np.isfinite([fx, fy, cx, cy]).all() and min(abs(fx), fy, width, height) > 0):
+        raise CalibrationError(
+            f"{where}: sizes and focal lengths must be positive and finite (fx may be negative: mirrored); "
+            f"got width {width}, height {height}, fx {fx}, fy {fy}"
+        )
     return Camera(width, height, fx, fy, cx, cy, mount, T_mount_cam)
 
 

@@ -70,7 +70,7 @@ def disc(view: View, point_world: Array, radius: float) -> Mask:
     if p_cam[2] > 0.01:
         u = view.camera.fx * p_cam[0] / p_cam[2] + view.camera.cx
         v = view.camera.fy * p_cam[1] / p_cam[2] + view.camera.cy
-        radius_px = view.camera.fx * radius / p_cam[2]
+        radius_px = view.camera.focal_px * radius / p_cam[2]
         if max(abs(u), abs(v)) < 1e4:
             cv2.circle(mask, (round(u), round(v)), max(1, round(radius_px)), 1, -1)
     return mask.astype(bool)

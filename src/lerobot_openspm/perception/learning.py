@@ -157,7 +157,7 @@ def _reach(view: View, blob: Blob, point_world: Array) -> float:
     """Distance in metres, at a point's depth, from a patch's centre to its furthest pixel."""
     v, u = np.nonzero(blob.mask)
     distance = float(np.linalg.norm(point_world - view.T_world_cam[:3, 3]))
-    return float(np.hypot(u - blob.centre[0], v - blob.centre[1]).max()) * distance / view.camera.fx
+    return float(np.hypot(u - blob.centre[0], v - blob.centre[1]).max()) * distance / view.camera.focal_px
 
 
 def _bootstrap(posed: list[Posed], half_size: float) -> tuple[Cloud, list[Posed]] | None:

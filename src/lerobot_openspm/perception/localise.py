@@ -116,7 +116,7 @@ def candidates(evidence: Sequence[Evidence], model: ObjectModel) -> list[Array]:
         for blob in find_blobs(one.probability, 12, BLOBS_PER_VIEW):
             point = intersect_plane(one.view.camera, one.view.T_world_cam, blob.centre, middle)
             distance = float(np.linalg.norm(point - one.view.T_world_cam[:3, 3]))
-            expected = (one.view.camera.fx / distance) ** 2 * model.points.std(axis=0)[:2].prod() * 12
+            expected = (one.view.camera.focal_px / distance) ** 2 * model.points.std(axis=0)[:2].prod() * 12
             # The pixel that the plane's point comes from must lie ahead of the camera, not behind it.
             if (point - one.view.T_world_cam[:3, 3]) @ one.view.T_world_cam[:3, 2] > 0:
                 votes.append((point, min(blob.area / max(expected, 1.0), 1.0) * (1.0 if blob.whole else 0.3)))

@@ -96,7 +96,7 @@ def draw(
     mask = np.zeros((shape[1], shape[0]), np.uint8)
     cells = np.rint((uv - corner) * scale).astype(int)
     mask[cells[:, 1], cells[:, 0]] = 1
-    spacing_px = spacing * view.camera.fx / float(depth.mean())
+    spacing_px = spacing * view.camera.focal_px / float(depth.mean())
     kernel = 2 * int(np.ceil(spacing_px * scale)) + 1
     mask = cv2.morphologyEx(
         mask, cv2.MORPH_CLOSE, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (kernel, kernel))
