@@ -46,11 +46,15 @@ def success(episodes: list[Episode]) -> dict[str, Any]:
     }
 
 
+def _git(*arguments: str) -> str:
+    return subprocess.run(["git", *arguments], capture_output=True, text=True, check=False).stdout.strip()
+
+
 def write(name: str, result: dict[str, Any]) -> dict[str, Any]:
     """Write one result beside what it was measured on, and return it."""
-    commit = subprocess.run(
-        ["git", "describe", "--always", "--dirty", "--abbrev=12"], capture_output=True, text=True, check=False
-    ).stdout.strip()
+    commit = _git("rev-parse", "--short=12", "HEAD")
+    if _git("status", "--porcelain", "--", "src", "configs"):
+        commit += "-dirty"
     machine = {"processor": platform.machine(), "cores": os.cpu_count(), "python": platform.python_version()}
     RESULTS.mkdir(exist_ok=True)
     content = {"commit": commit, "machine": machine, **result}

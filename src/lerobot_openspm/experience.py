@@ -24,7 +24,7 @@ from lerobot_openspm.geometry.camera import Camera, cameras_to_dict, load_camera
 from lerobot_openspm.memory.entry import MemoryEntry
 from lerobot_openspm.memory.robot import RobotModel
 from lerobot_openspm.memory.store import entries_from_parts, entries_to_parts, robot_from_dict, robot_to_dict
-from lerobot_openspm.perception.model import ObjectModel
+from lerobot_openspm.perception.model import KnownObject
 from lerobot_openspm.perception.store import from_parts as object_from_parts
 from lerobot_openspm.perception.store import to_parts as object_to_parts
 
@@ -48,7 +48,7 @@ class Experience:
     """
 
     entries: tuple[MemoryEntry, ...]
-    objects: dict[str, ObjectModel]
+    objects: dict[str, KnownObject]
     robot: RobotModel
     cameras: dict[str, Camera]
     perception: str

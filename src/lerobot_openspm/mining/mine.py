@@ -32,7 +32,7 @@ from lerobot_openspm.mining.key_poses import KeyPose, find_key_poses
 from lerobot_openspm.mining.signals import Episode
 from lerobot_openspm.perception.learning import learn_objects
 from lerobot_openspm.perception.localise import localise, prepare
-from lerobot_openspm.perception.model import ObjectModel
+from lerobot_openspm.perception.model import KnownObject
 from lerobot_openspm.perception.types import Hint, Scene
 
 logger = logging.getLogger(__name__)
@@ -114,14 +114,14 @@ def learn_scenes(
 class LearnedObjects:
     """Object models by name, and per scene the poses ``T_world_obj`` of the objects found in it."""
 
-    models: dict[str, ObjectModel]
+    models: dict[str, KnownObject]
     layouts: list[dict[str, Array]]
 
 
 def layouts_in_scenes(
     scenes: Sequence[Scene],
     mined: Sequence[MinedEpisode],
-    known: Mapping[str, ObjectModel],
+    known: Mapping[str, KnownObject],
     rng: np.random.Generator,
 ) -> LearnedObjects:
     """Learn the objects that are not known yet, and find those that each episode's instruction names."""
@@ -147,7 +147,7 @@ def layouts_in_scenes(
 
 
 def oracle_layouts(
-    demonstrations: Demonstrations, mined: Sequence[MinedEpisode], models: Mapping[str, ObjectModel]
+    demonstrations: Demonstrations, mined: Sequence[MinedEpisode], models: Mapping[str, KnownObject]
 ) -> tuple[list[dict[str, Array]], tuple[str, ...]]:
     """The simulator's poses of the named objects instead of perception's (oracle ablation only).
 
@@ -164,7 +164,7 @@ def oracle_layouts(
 
 
 def name_simulator_poses(
-    poses: Mapping[str, Array], nouns: Sequence[str], models: Mapping[str, ObjectModel]
+    poses: Mapping[str, Array], nouns: Sequence[str], models: Mapping[str, KnownObject]
 ) -> dict[str, Array]:
     """Simulator poses under the nouns of the instructions: "bottle" is the "wine bottle".
 
@@ -187,14 +187,15 @@ def hints(item: MinedEpisode) -> tuple[Hint, ...]:
     for pose in item.key_poses:
         sub_task, point = sub_task_of(pose, item.sub_tasks), pose.T_world_ee[:3, 3]
         if pose.phase == "grasp":
-            found.append(Hint(sub_task.target, point, "grasp"))
+            found.append(Hint(sub_task.target, point, "grasp", f"{item.episode.task}: {len(found)}"))
         elif pose.phase == "release" and sub_task.landmark and not sub_task.part:
             # What goes into an opened part lies where nothing was to be seen in the first frame.
-            found.append(Hint(sub_task.landmark, point, "release"))
+            found.append(Hint(sub_task.landmark, point, "release", f"{item.episode.task}: {len(found)}"))
     for before, pose in zip(item.key_poses[:-1], item.key_poses[1:], strict=True):
         if pose.phase == "push":
             target = sub_task_of(pose, item.sub_tasks).target
-            found.append(Hint(target, before.T_world_ee[:3, 3], "contact"))
+            place = f"{item.episode.task}: {len(found)}"
+            found.append(Hint(target, before.T_world_ee[:3, 3], "contact", place))
     return tuple(found)
 
 

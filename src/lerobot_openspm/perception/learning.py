@@ -28,7 +28,8 @@ from lerobot_openspm.perception.fitting import (
     score,
 )
 from lerobot_openspm.perception.localise import COARSE_CUTS_PX, FINE_CUTS_PX, prepare
-from lerobot_openspm.perception.model import ObjectModel
+from lerobot_openspm.perception.model import KnownObject, ObjectModel
+from lerobot_openspm.perception.patches import MAX_SPREAD_M, learn_patches, spread
 from lerobot_openspm.perception.seeding import Picture
 from lerobot_openspm.perception.shape import Posed, Votes
 from lerobot_openspm.perception.types import Scene, View
@@ -60,7 +61,7 @@ TURN_GAIN = 0.008
 YAW_MARGIN = np.deg2rad(20)
 
 
-def learn_objects(scenes: Sequence[Scene], rng: Generator) -> dict[str, ObjectModel]:
+def learn_objects(scenes: Sequence[Scene], rng: Generator) -> dict[str, KnownObject]:
     """Learn every object that some scene hints at.
 
     Args:
@@ -88,11 +89,14 @@ def learn_objects(scenes: Sequence[Scene], rng: Generator) -> dict[str, ObjectMo
     return models
 
 
-def learn_object(name: str, scenes: Sequence[Scene], floor: float, rng: Generator) -> ObjectModel | None:
+def learn_object(name: str, scenes: Sequence[Scene], floor: float, rng: Generator) -> KnownObject | None:
     """Learn one object from the scenes that hint at it; None, with a warning, if it cannot be learned."""
     hinted = [i for i, scene in enumerate(scenes) if any(hint.name == name for hint in scene.hints)]
     if len(hinted) > MAX_SCENES:
         hinted = sorted(rng.choice(hinted, MAX_SCENES, replace=False).tolist())
+    shown = [scenes[i] for i in hinted]
+    if spread(shown, name) < MAX_SPREAD_M and (patches := learn_patches(name, shown)) is not None:
+        return patches
     pictures = [picture for i in hinted for picture in _pictures(i, name, scenes[i], floor)]
     log_odds = seeding.learn_colours(pictures)
     posed, half_size = _first_poses(pictures, log_odds)

@@ -15,7 +15,8 @@ from lerobot_openspm.geometry.se3 import Array
 from lerobot_openspm.perception import colour
 from lerobot_openspm.perception.blobs import find_blobs
 from lerobot_openspm.perception.fitting import COARSE_PX, Cloud, Evidence, Fit, Freedom, fit
-from lerobot_openspm.perception.model import ObjectModel
+from lerobot_openspm.perception.model import KnownObject, ObjectModel, PatchModel
+from lerobot_openspm.perception.patches import localise_patches
 from lerobot_openspm.perception.types import UNKNOWN_YAW_STD, PoseEstimate, View
 
 COARSE_CUTS_PX = (30.0, 30.0, 20.0, 12.0)
@@ -57,7 +58,7 @@ def prepare(view: View) -> Prepared:
 
 
 def localise(
-    views: Mapping[str, View | Prepared], model: ObjectModel, freedom: Freedom | None = None
+    views: Mapping[str, View | Prepared], model: KnownObject, freedom: Freedom | None = None
 ) -> PoseEstimate:
     """Find an object in the views of one moment.
 
@@ -65,7 +66,8 @@ def localise(
         views: Views, or prepared views, by camera name.
         model: The object.
         freedom: Prior around the start poses; by default the object stands on its support plane, at any place
-            and any yaw within the range that its demonstrations showed.
+            and any yaw within the range that its demonstrations showed. An object known by patches is sought
+            near its demonstrated places, whatever this says.
 
     Raises:
         ObservationError: There is no view, or one is malformed.
@@ -73,6 +75,8 @@ def localise(
     if not views:
         raise ObservationError("no camera views to look for an object in; pass at least one")
     prepared = [view if isinstance(view, Prepared) else prepare(view) for view in views.values()]
+    if isinstance(model, PatchModel):
+        return localise_patches({name: one.view for name, one in zip(views, prepared, strict=True)}, model)
     evidence = [Evidence(one.view, colour.foreground(one.bins, model.log_odds)) for one in prepared]
     masks = {name: one.probability > 0.5 for name, one in zip(views, evidence, strict=True)}
     fits = search(evidence, model, freedom or Freedom())

@@ -1,4 +1,4 @@
-"""What is known of one object after learning: its colours, its shape, how it stands and is turned."""
+"""What is known of one object after learning: colours and a shape, or patches of the images around it."""
 
 from __future__ import annotations
 
@@ -7,12 +7,15 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from lerobot_openspm.geometry.camera import Camera
 from lerobot_openspm.geometry.se3 import Array
+
+Picture = NDArray[np.uint8]
 
 
 @dataclass(frozen=True)
 class ObjectModel:
-    """A learned object.
+    """An object known by its colours and its shape.
 
     Attributes:
         name: The noun phrase.
@@ -54,3 +57,60 @@ class ObjectModel:
         count = max(1, int(np.ceil(2 * self.yaw_halfwidth / np.deg2rad(46))))
         steps = (np.arange(count) + 0.5) / count * 2 - 1
         return self.yaw_centre + steps * self.yaw_halfwidth
+
+
+@dataclass(frozen=True)
+class Patch:
+    """A piece of a demonstration's first frame.
+
+    Attributes:
+        image: CIELAB pixels ``(h, w, 3)``, uint8.
+        corner: Pixel ``(2,)`` of its upper left corner, horizontal first.
+        point_world: The object's reference point ``(3,)`` in that frame.
+    """
+
+    image: Picture
+    corner: Array
+    point_world: Array
+
+
+@dataclass(frozen=True)
+class Probe:
+    """Patches of one camera and size.
+
+    Attributes:
+        camera: Name of the camera.
+        calibration: The camera as the patches were seen with it.
+        T_world_cam: Its pose ``(4, 4)`` then.
+        patches: One per reference demonstration.
+        std_m: Spread of its estimates against the other probes', metres.
+    """
+
+    camera: str
+    calibration: Camera
+    T_world_cam: Array
+    patches: tuple[Patch, ...]
+    std_m: float
+
+
+@dataclass(frozen=True)
+class PatchModel:
+    """An object known by patches. Its frame has the world's axes and stands where the hand touched it.
+
+    Attributes:
+        name: The noun phrase.
+        probes: What to look for where.
+        typical_correlation: Of the patches in the demonstrations.
+    """
+
+    name: str
+    probes: tuple[Probe, ...]
+    typical_correlation: float
+
+    @property
+    def yaw_period(self) -> float:
+        """A full turn: the object is not known to look alike from any two sides."""
+        return 2 * np.pi
+
+
+KnownObject = ObjectModel | PatchModel

@@ -1,4 +1,4 @@
-"""Object models as JSON-able numbers and NumPy arrays, and back, with everything that was read checked."""
+"""Known objects as JSON-able fields and NumPy arrays, and back, with everything that was read checked."""
 
 from __future__ import annotations
 
@@ -9,11 +9,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lerobot_openspm.errors import MemoryFormatError
+from lerobot_openspm.geometry import se3
+from lerobot_openspm.geometry.camera import Camera
 from lerobot_openspm.perception.colour import N_BINS
-from lerobot_openspm.perception.model import ObjectModel
+from lerobot_openspm.perception.model import KnownObject, ObjectModel, Patch, PatchModel, Probe
 
 VERSION = 1
 MAX_POINTS = 200_000
+MAX_PROBES, MAX_PIXELS = 64, 10_000
+INTRINSICS = ("width", "height", "fx", "fy", "cx", "cy")
 # Name -> lowest and highest value that makes sense.
 NUMBERS = {
     "spacing": (1e-6, 1.0),
@@ -25,14 +29,16 @@ NUMBERS = {
 }
 
 
-def to_parts(model: ObjectModel) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
+def to_parts(model: KnownObject) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
     """Split a model into what belongs in JSON and what belongs in a safetensors file."""
+    if isinstance(model, PatchModel):
+        return _patches_to_parts(model)
     numbers = {name: float(getattr(model, name)) for name in NUMBERS}
     arrays = {"log_odds": model.log_odds.astype(np.float32), "points": model.points.astype(np.float32)}
-    return {"version": VERSION, "name": model.name, **numbers}, arrays
+    return {"version": VERSION, "kind": "shape", "name": model.name, **numbers}, arrays
 
 
-def from_parts(data: Mapping[str, Any], arrays: Mapping[str, NDArray[Any]], where: str) -> ObjectModel:
+def from_parts(data: Mapping[str, Any], arrays: Mapping[str, NDArray[Any]], where: str) -> KnownObject:
     """Put a model together again; ``where`` names its origin in errors.
 
     Raises:
@@ -46,7 +52,14 @@ def from_parts(data: Mapping[str, Any], arrays: Mapping[str, NDArray[Any]], wher
     name = data.get("name")
     if not isinstance(name, str) or not name:
         raise MemoryFormatError(f"{where}: 'name' is {name!r}, expected a noun phrase")
-    numbers = {key: _number(data, key, where) for key in NUMBERS}
+    kind = data.get("kind", "shape")
+    if kind == "patches":
+        return _patches_from_parts(name, data, arrays, where)
+    if kind != "shape":
+        raise MemoryFormatError(
+            f"{where}: object {name!r} is of kind {kind!r}, expected shape or patches; learn it again"
+        )
+    numbers = {key: _number(data, key, *NUMBERS[key], where) for key in NUMBERS}
     log_odds = _array(arrays, "log_odds", (N_BINS,), where)
     points = _array(arrays, "points", (-1, 3), where)
     if not 8 <= len(points) <= MAX_POINTS:
@@ -54,8 +67,58 @@ def from_parts(data: Mapping[str, Any], arrays: Mapping[str, NDArray[Any]], wher
     return ObjectModel(name=name, log_odds=log_odds, points=points, **numbers)
 
 
-def _number(data: Mapping[str, Any], key: str, where: str) -> float:
-    value, (low, high) = data.get(key), NUMBERS[key]
+def _patches_to_parts(model: PatchModel) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
+    probes, arrays = [], {}
+    for i, probe in enumerate(model.probes):
+        probes.append({"camera": probe.camera, "std_m": probe.std_m})
+        arrays[f"{i}.calibration"] = np.array(
+            [getattr(probe.calibration, name) for name in INTRINSICS], float
+        )
+        arrays[f"{i}.T_world_cam"] = probe.T_world_cam.astype(float)
+        arrays[f"{i}.corners"] = np.stack([patch.corner for patch in probe.patches]).astype(float)
+        arrays[f"{i}.points"] = np.stack([patch.point_world for patch in probe.patches]).astype(float)
+        for j, patch in enumerate(probe.patches):
+            arrays[f"{i}.patch.{j}"] = patch.image
+    fields = {"typical_correlation": model.typical_correlation, "probes": probes}
+    return {"version": VERSION, "kind": "patches", "name": model.name, **fields}, arrays
+
+
+def _patches_from_parts(
+    name: str, data: Mapping[str, Any], arrays: Mapping[str, NDArray[Any]], where: str
+) -> PatchModel:
+    rows = data.get("probes")
+    if not isinstance(rows, list) or not 1 <= len(rows) <= MAX_PROBES:
+        raise MemoryFormatError(f"{where}: 'probes' of {name!r} must be a list of 1 to {MAX_PROBES} objects")
+    probes = tuple(_probe(row, i, arrays, where) for i, row in enumerate(rows))
+    return PatchModel(name, probes, _number(data, "typical_correlation", 0.0, 1.0, where))
+
+
+def _probe(row: Any, index: int, arrays: Mapping[str, NDArray[Any]], where: str) -> Probe:
+    if not isinstance(row, Mapping) or not isinstance(row.get("camera"), str):
+        raise MemoryFormatError(f"{where}: probe {index} has no 'camera'; learn the objects again")
+    width, height, fx, fy, cx, cy = _array(arrays, f"{index}.calibration", (6,), where, np.float64)
+    T_world_cam = _array(arrays, f"{index}.T_world_cam", (4, 4), where, np.float64)
+    if not (1 <= width <= MAX_PIXELS and 1 <= height <= MAX_PIXELS and fx != 0 and fy > 0):
+        raise MemoryFormatError(f"{where}: the camera of probe {index} has impossible intrinsics")
+    if not se3.is_rigid(T_world_cam):
+        raise MemoryFormatError(f"{where}: the camera of probe {index} has no rigid pose")
+    camera = Camera(int(width), int(height), fx, fy, cx, cy, "world", T_world_cam)
+    corners = _array(arrays, f"{index}.corners", (-1, 2), where, np.float64)
+    points = _array(arrays, f"{index}.points", (len(corners), 3), where, np.float64)
+    if len(corners) == 0:
+        raise MemoryFormatError(f"{where}: probe {index} has no patches; learn the objects again")
+    patches = []
+    for j, (corner, point) in enumerate(zip(corners, points, strict=True)):
+        image = _array(arrays, f"{index}.patch.{j}", (-1, -1, 3), where, np.uint8)
+        end = np.add(corner, [image.shape[1], image.shape[0]])
+        if min(image.shape) < 1 or (corner < 0).any() or (end > [width, height]).any():
+            raise MemoryFormatError(f"{where}: patch {j} of probe {index} does not lie in its image")
+        patches.append(Patch(image, corner, point))
+    return Probe(row["camera"], camera, T_world_cam, tuple(patches), _number(row, "std_m", 1e-9, 1.0, where))
+
+
+def _number(data: Mapping[str, Any], key: str, low: float, high: float, where: str) -> float:
+    value = data.get(key)
     # bool is an int to Python but no number in a file.
     if isinstance(value, bool) or not isinstance(value, (int, float)) or not low <= value <= high:
         raise MemoryFormatError(f"{where}: {key!r} is {value!r}, expected a number from {low:g} to {high:g}")
@@ -63,8 +126,12 @@ def _number(data: Mapping[str, Any], key: str, where: str) -> float:
 
 
 def _array(
-    arrays: Mapping[str, NDArray[Any]], key: str, shape: tuple[int, ...], where: str
-) -> NDArray[np.float32]:
+    arrays: Mapping[str, NDArray[Any]],
+    key: str,
+    shape: tuple[int, ...],
+    where: str,
+    dtype: type[np.generic] = np.float32,
+) -> NDArray[Any]:
     array = arrays.get(key)
     if array is None:
         raise MemoryFormatError(f"{where}: array {key!r} is missing; learn the objects again")
@@ -72,9 +139,10 @@ def _array(
     fits = array.ndim == len(shape) and all(
         want in (-1, got) for want, got in zip(shape, array.shape, strict=True)
     )
-    if array.dtype != np.float32 or not fits:
+    if array.dtype != dtype or not fits:
         raise MemoryFormatError(
-            f"{where}: array {key!r} is {array.dtype} of {array.shape}, expected float32 of {shape} (-1: any)"
+            f"{where}: array {key!r} is {array.dtype} of {array.shape}, expected {np.dtype(dtype)} of "
+            f"{shape} (-1: any)"
         )
     if not np.isfinite(array).all():
         raise MemoryFormatError(f"{where}: array {key!r} holds values that are not finite")

@@ -41,11 +41,13 @@ class Hint:
         point_world: Point ``(3,)`` between the fingertips, in metres.
         kind: ``"grasp"`` or ``"contact"``: part of the object was at this point in the first frame;
             ``"release"``: the object lies below or around this point.
+        place: Hints of one place touched the same spot of the object, as far as one can know.
     """
 
     name: str
     point_world: Array
     kind: Literal["grasp", "release", "contact"]
+    place: str = ""
 
 
 @dataclass(frozen=True)
