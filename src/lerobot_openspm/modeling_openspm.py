@@ -75,9 +75,14 @@ class OpenSPMPolicy(PreTrainedPolicy):
     @torch.no_grad()
     def select_action(self, batch: dict[str, Tensor], **kwargs: Any) -> Tensor:
         """Choose one action ``(b, action_dim)`` for every environment of a batch of observations."""
+        return self._encode(self.act(split_batch(batch, self.config.layouts()[0])))
+
+    @torch.no_grad()
+    def act(self, observations: Sequence[Observation]) -> np.ndarray:
+        """Choose one canonical action ``(b, 7)`` for every environment; images are looked at when needed."""
         self.eval()
         actions = []
-        for row, observation in self._observe(batch):
+        for row, observation in self._observe(observations):
             action = row.next_action()
             if action is None:
                 row.executor.push_chunk(
@@ -85,14 +90,14 @@ class OpenSPMPolicy(PreTrainedPolicy):
                 )
                 action = row.next_action()
             actions.append(action)
-        return self._encode(np.stack(actions))
+        return np.stack(actions)
 
     @torch.no_grad()
     def predict_action_chunk(self, batch: dict[str, Tensor], **kwargs: Any) -> Tensor:
         """Generate a chunk ``(b, chunk_size, action_dim)`` for every environment; the caller executes it."""
         self.eval()
         chunks = []
-        for row, observation in self._observe(batch):
+        for row, observation in self._observe(split_batch(batch, self.config.layouts()[0])):
             chunk = np.tile(row.executor.hold(), (self.config.chunk_size, 1))
             if row.executor.target is not None:
                 chunk = self._chunk(row, row.query(observation.hand))
@@ -102,9 +107,8 @@ class OpenSPMPolicy(PreTrainedPolicy):
             chunks.append(chunk)
         return self._encode(np.stack(chunks))
 
-    def _observe(self, batch: dict[str, Tensor]) -> list[tuple[Row, Observation]]:
+    def _observe(self, observations: Sequence[Observation]) -> list[tuple[Row, Observation]]:
         """Each environment's state, brought up to its observation."""
-        observations = split_batch(batch, self.config.layouts()[0])
         pairs = list(zip(self._rows_of(observations), observations, strict=True))
         for row, observation in pairs:
             row.observe(observation.hand, lambda names, seen=observation: self._find(names, seen))

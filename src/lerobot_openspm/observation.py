@@ -32,7 +32,8 @@ class Observation:
         instruction: The task string.
         state: State vector as it came.
         hand: Hand pose and opening, read from it.
-        images: Images ``(3, H, W)`` by camera, still as tensors: few of them are ever looked at.
+        images: Images ``(3, H, W)`` by camera, still as tensors: few of them are ever looked at. A
+            mapping that makes them when they are asked for will do.
         object_poses: Simulator poses ``(n * 7,)``, or None.
     """
 

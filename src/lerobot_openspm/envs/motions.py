@@ -6,11 +6,13 @@ again.
 
 import math
 from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from lerobot_openspm.envs.simulator import HOME_ROTATION, MAX_STEP_M, MAX_STEP_RAD, TabletopSimulator
+from lerobot_openspm.envs.simulator import HOME_ROTATION, MAX_STEP_M, MAX_STEP_RAD
 
 GAIN = 0.5
 ACTION_NOISE = 0.03
@@ -22,6 +24,34 @@ GRASP_NOISE_RAD = math.radians(1.5)
 LEVEL_ROTATION = Rotation.from_euler("y", 90, degrees=True).as_matrix() @ HOME_ROTATION
 
 Actions = Iterator[np.ndarray]
+
+
+class HandSimulator(Protocol):
+    """What :class:`ScriptedHand` needs of a simulator."""
+
+    def ee_pose(self) -> np.ndarray:
+        """``T_world_ee``, (4, 4)."""
+        ...
+
+
+@dataclass(frozen=True)
+class Pace:
+    """How a simulator's hand follows its actions.
+
+    Attributes:
+        step_m: How far a translation of 1 moves the hand in one step, in metres.
+        step_rad: How far a rotation of 1 turns it in one step, in radians.
+        closing_steps: Bounds [low, high) of the steps that closing fingers need to settle.
+        opening_steps: The same for opening fingers.
+    """
+
+    step_m: float
+    step_rad: float
+    closing_steps: tuple[int, int]
+    opening_steps: tuple[int, int]
+
+
+TABLETOP_PACE = Pace(MAX_STEP_M, MAX_STEP_RAD, closing_steps=(7, 11), opening_steps=(7, 11))
 
 
 def yaw_matrix(yaw: float) -> np.ndarray:
@@ -41,17 +71,19 @@ def pointing_down(position: np.ndarray, yaw: float = 0.0) -> np.ndarray:
     return pose(position, yaw_matrix(yaw) @ HOME_ROTATION)
 
 
-class ScriptedHand:
+class ScriptedHand[SimulatorT: HandSimulator]:
     """Moves the hand of a simulator towards poses, one action at a time, with a person's imperfections.
 
     Args:
         simulator: Where the true poses are read from.
         rng: Source of every imperfection of this episode.
+        pace: How the simulator's hand follows its actions.
     """
 
-    def __init__(self, simulator: TabletopSimulator, rng: np.random.Generator) -> None:
+    def __init__(self, simulator: SimulatorT, rng: np.random.Generator, pace: Pace = TABLETOP_PACE) -> None:
         self.simulator = simulator
         self.rng = rng
+        self.pace = pace
         self.closing = False
         self._segment = 0
         self._pause_at = set(rng.integers(0, PAUSE_SEGMENTS, size=int(rng.integers(0, 4))).tolist())
@@ -82,7 +114,8 @@ class ScriptedHand:
         """Close or open the fingers and hold still until they have settled."""
         self.closing = closing
         goal = self.simulator.ee_pose()
-        for _ in range(int(self.rng.integers(7, 11))):
+        steps = self.pace.closing_steps if closing else self.pace.opening_steps
+        for _ in range(int(self.rng.integers(*steps))):
             yield self._towards(goal, 0.3)
 
     def hold(self, steps: int) -> Actions:
@@ -101,7 +134,7 @@ class ScriptedHand:
     ) -> Actions:
         speed = float(self.rng.uniform(0.6, 1.0)) * slowness
         distance, angle = self._remaining(goal)
-        limit = 25 + int((distance / MAX_STEP_M + angle / MAX_STEP_RAD) / speed)
+        limit = 25 + int((distance / self.pace.step_m + angle / self.pace.step_rad) / speed)
         for _ in range(limit):
             distance, angle = self._remaining(goal)
             if distance < tolerance_m and angle < tolerance_rad:
@@ -120,7 +153,9 @@ class ScriptedHand:
 
     def _towards(self, goal: np.ndarray, speed: float) -> np.ndarray:
         position, turn = self._errors(goal)
-        command = np.concatenate([_scaled(position / MAX_STEP_M, speed), _scaled(turn / MAX_STEP_RAD, speed)])
+        command = np.concatenate(
+            [_scaled(position / self.pace.step_m, speed), _scaled(turn / self.pace.step_rad, speed)]
+        )
         command += self.rng.normal(0.0, ACTION_NOISE, size=6)
         return np.append(np.clip(command, -1.0, 1.0), 1.0 if self.closing else -1.0).astype(np.float32)
 

@@ -1,0 +1,1 @@
+"""Demonstrations on LIBERO: its simulator with the true poses, scripted experts, recording."""

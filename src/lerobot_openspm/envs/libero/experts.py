@@ -1,0 +1,276 @@
+"""Scripted experts for LIBERO's ten goal tasks: they read the true poses and act by the same 7-D actions.
+
+Positions are in LIBERO's world frame unless a comment says otherwise: x points from the robot over the table,
+y to the robot's left, z up; the table's top is at z = 0.9. All lengths are in metres. Every object is always
+grasped at the same place of it, every grasp and every release is approached on a straight line from a pose
+that is clear of everything, and carried objects cross the table high above what stands on it.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from lerobot_openspm.envs.libero.simulator import LiberoSimulator
+from lerobot_openspm.envs.motions import Actions, Pace, ScriptedHand, pointing_down, pose, yaw_matrix
+
+LiberoHand = ScriptedHand[LiberoSimulator]
+
+# Measured: LIBERO's controller covers about a quarter of an action before the next one replaces it.
+PACE = Pace(step_m=0.012, step_rad=0.065, closing_steps=(14, 18), opening_steps=(8, 11))
+
+PRE_GRASP = 0.08
+CARRY_RISE = 0.12
+# The least height above a place from which an object is lowered to it.
+LOWERING = 0.06
+RETREAT_RISE = 0.08
+RELEASE_GAP = 0.004
+FINAL_HOLD_STEPS = 15
+
+# Grasp points from the object's origin, along the world's axes.
+# The bowl looks alike from everywhere: always take its rim on the stove's side, which is free in every task.
+BOWL_RIM = np.array([0.0, 0.050, 0.046])
+CHEESE_MIDDLE = np.array([0.0, 0.0, 0.006])
+BOTTLE_NECK = np.array([0.0, 0.0, 0.135])
+
+# Where an object's origin goes, from the origin of what it goes onto.
+BOWL_ON_PLATE = np.array([0.0, 0.0, 0.008])
+CHEESE_IN_BOWL = np.array([0.0, 0.0, 0.040])
+# In the rack's frame: a third up the tilted upper shelf, far from both of its ends.
+BOTTLE_ON_RACK = np.array([0.0, -0.050, 0.240])
+# From the middles of LIBERO's regions.
+BOWL_ON_BURNER = np.array([0.0, 0.0, 0.020])
+BOWL_IN_DRAWER = np.array([0.0, 0.0, -0.020])
+# Nearer to the robot than the middle of the top, where a hand above a bottle would need a straight arm.
+BOTTLE_ON_CABINET = np.array([-0.050, 0.020, 0.0])
+CABINET_CARRY_RISE = 0.275
+DRAWER_CARRY_RISE = 0.25
+RACK_CARRY_RISE = 0.33
+
+# In the cabinet's frame, whose -y points out of the drawers.
+HANDLE_X, HANDLE_Y = -0.003, -0.1016
+HANDLE_Z = {"top": 0.184, "middle": 0.1104}
+DRAWER_PULL = 0.15
+DRAWER_BACK_OFF = 0.06
+# The open drawer overhangs the bowl: the hand leans away, and the bowl moves aside before it rises.
+BOWL_LEAN = math.radians(35)
+BOWL_ASIDE = np.array([-0.02, 0.09, 0.08])
+
+# In the stove's frame. The fingers lean back towards the robot, or its arm would fold up to its limits.
+KNOB = np.array([-0.004, 0.001, 0.035])
+KNOB_LEAN = math.radians(20)
+KNOB_TURN = math.radians(60)
+
+# Of the ee behind the plate's origin when it stands clear, and when both fingers touch the edge.
+PLATE_CLEAR, PLATE_TOUCHING = 0.085, 0.063
+# Fingertips low over the table, or they climb onto the plate.
+PLATE_PUSH_Z = 0.009
+# The palm leans over the plate, clear of the drawers' handles behind it.
+PLATE_LEAN = math.radians(15)
+# Past the bowl first, then to the goal: a little beyond the region's middle, since the plate lags behind.
+PLATE_FIRST_LEG = 0.08
+PLATE_HALF_WAY = 0.4
+PLATE_GOAL = np.array([-0.010, 0.0, 0.0])
+
+DOWN = np.diag([1.0, -1.0, -1.0])
+# The hand in the cabinet's frame: pointing into its front, one finger above the other.
+LEVEL = np.array([[-1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, 1.0, 0.0]])
+
+
+def expert_actions(simulator: LiberoSimulator, task: str, rng: np.random.Generator) -> Actions:
+    """Yield the actions (7,) that solve `task` from the simulator's present state.
+
+    Step the simulator with each action before asking for the next one.
+
+    Args:
+        simulator: The simulator that is stepped.
+        task: A name in `EXPERTS`.
+        rng: Source of the demonstration's imperfections.
+    """
+    hand = LiberoHand(simulator, rng, PACE)
+    yield from EXPERTS[task](hand)
+    yield from hand.hold(FINAL_HOLD_STEPS)
+
+
+def _bowl_on_plate(hand: LiberoHand) -> Actions:
+    yield from _pick(hand, _origin(hand, "bowl") + BOWL_RIM)
+    yield from _place(hand, "bowl", _origin(hand, "plate") + BOWL_ON_PLATE)
+
+
+def _bowl_on_stove(hand: LiberoHand) -> Actions:
+    yield from _pick(hand, _origin(hand, "bowl") + BOWL_RIM)
+    yield from _place(hand, "bowl", _region(hand, "flat_stove_1_cook_region") + BOWL_ON_BURNER)
+
+
+def _bowl_on_cabinet(hand: LiberoHand) -> Actions:
+    yield from _pick(hand, _origin(hand, "bowl") + BOWL_RIM, CABINET_CARRY_RISE)
+    yield from _place(hand, "bowl", _region(hand, "wooden_cabinet_1_top_side"))
+
+
+def _cheese_in_bowl(hand: LiberoHand) -> Actions:
+    yield from _pick(hand, _origin(hand, "cheese") + CHEESE_MIDDLE)
+    yield from _place(hand, "cheese", _origin(hand, "bowl") + CHEESE_IN_BOWL)
+
+
+def _bottle_on_cabinet(hand: LiberoHand) -> Actions:
+    yield from _pick(hand, _origin(hand, "bottle") + BOTTLE_NECK, CABINET_CARRY_RISE)
+    yield from _place(hand, "bottle", _region(hand, "wooden_cabinet_1_top_side") + BOTTLE_ON_CABINET)
+
+
+def _bottle_on_rack(hand: LiberoHand) -> Actions:
+    yield from _pick(hand, _origin(hand, "bottle") + BOTTLE_NECK, RACK_CARRY_RISE)
+    yield from _place(hand, "bottle", _in_frame(_frame(hand, "rack"), BOTTLE_ON_RACK))
+
+
+def _open_middle_drawer(hand: LiberoHand) -> Actions:
+    yield from _open_drawer(hand, "middle")
+
+
+def _bowl_in_top_drawer(hand: LiberoHand) -> Actions:
+    yield from _open_drawer(hand, "top")
+    offset, turn = hand.grasp_noise()
+    rotation = yaw_matrix(turn) @ Rotation.from_rotvec([-BOWL_LEAN, 0.0, 0.0]).as_matrix() @ DOWN
+    at_rim = pose(_origin(hand, "bowl") + BOWL_RIM + offset, rotation)
+    yield from _grasp(hand, at_rim)
+    aside = pose(at_rim[:3, 3] + BOWL_ASIDE, rotation)
+    yield from hand.travel(aside)
+    yield from hand.travel(_raised(aside, DRAWER_CARRY_RISE - BOWL_ASIDE[2]))
+    yield from _place(hand, "bowl", _region(hand, "wooden_cabinet_1_top_region") + BOWL_IN_DRAWER)
+
+
+def _turn_on_stove(hand: LiberoHand) -> Actions:
+    offset, turn = hand.grasp_noise()
+    stove = _frame(hand, "stove")
+    lean = Rotation.from_rotvec([0.0, KNOB_LEAN, 0.0]).as_matrix()
+    at_knob = pose(_in_frame(stove, KNOB) + offset, stove[:3, :3] @ yaw_matrix(turn) @ lean @ DOWN)
+    yield from _grasp(hand, at_knob)
+    yield from hand.advance(pose(at_knob[:3, 3], yaw_matrix(KNOB_TURN) @ at_knob[:3, :3]))
+    yield from hand.grip(closing=False)
+    yield from _retreat(hand)
+
+
+def _push_plate(hand: LiberoHand) -> Actions:
+    """Push the plate's edge with both fingertips of the open hand: two points of contact keep it straight."""
+    plate = _origin(hand, "plate")
+    offset, turn = hand.grasp_noise()
+    corner = plate + np.array([0.0, PLATE_FIRST_LEG, 0.0])
+    goal = _region(hand, "main_table_stove_front_region") + PLATE_GOAL
+    lean = Rotation.from_rotvec([-PLATE_LEAN, 0.0, 0.0]).as_matrix() @ yaw_matrix(math.pi / 2) @ DOWN
+
+    def behind(middle: np.ndarray, heading: float, distance: float) -> np.ndarray:
+        """T_world_ee with the plate's middle straight ahead; heading 0 looks along the world's y."""
+        rotation = yaw_matrix(heading)
+        position = middle + offset - distance * rotation[:, 1]
+        position[2] = plate[2] + PLATE_PUSH_Z
+        return pose(position, yaw_matrix(turn) @ rotation @ lean)
+
+    start = behind(plate, 0.0, PLATE_CLEAR)
+    yield from hand.travel(_backed(start, PRE_GRASP))
+    yield from hand.advance(start)
+    yield from hand.advance(behind(corner, 0.0, PLATE_TOUCHING), slowness=0.7)
+    heading = math.atan2(corner[0] - goal[0], goal[1] - corner[1])
+    # The hand rises while it turns, by as much as the plate is high: arrive low half-way.
+    half_way = corner + PLATE_HALF_WAY * (goal - corner)
+    for middle in (half_way, goal):
+        yield from hand.advance(behind(middle, heading, PLATE_TOUCHING), slowness=0.7)
+    yield from _retreat(hand)
+
+
+def _open_drawer(hand: LiberoHand, name: str) -> Actions:
+    """Take the handle from the front with a level hand, pull along the drawer's axis, let go and back off.
+
+    The handles stand above one another, too close for fingers that come from above.
+    """
+    cabinet = _frame(hand, "cabinet")
+    offset, turn = hand.grasp_noise()
+    rotation = cabinet[:3, :3] @ yaw_matrix(turn) @ LEVEL
+    handle = np.array([HANDLE_X + offset[0], HANDLE_Y, HANDLE_Z[name] + offset[1]])
+
+    def at(out: float) -> np.ndarray:
+        return pose(_in_frame(cabinet, handle - [0.0, out, 0.0]), rotation)
+
+    yield from _grasp(hand, at(0.0))
+    yield from hand.advance(at(DRAWER_PULL))
+    yield from hand.grip(closing=False)
+    yield from hand.travel(at(DRAWER_PULL + DRAWER_BACK_OFF))
+
+
+def _pick(hand: LiberoHand, grasp: np.ndarray, rise: float = CARRY_RISE) -> Actions:
+    """Grasp from above at a world point (3,), fingers opening along the world's y, and lift straight up."""
+    offset, turn = hand.grasp_noise()
+    at_grasp = pointing_down(grasp + offset, turn)
+    yield from _grasp(hand, at_grasp)
+    yield from hand.travel(_raised(at_grasp, rise))
+
+
+def _grasp(hand: LiberoHand, at_grasp: np.ndarray) -> Actions:
+    """Go before T_world_ee `at_grasp`, advance along the fingers and close them."""
+    yield from hand.travel(_backed(at_grasp, PRE_GRASP))
+    yield from hand.advance(at_grasp)
+    yield from hand.grip(closing=True)
+
+
+def _place(hand: LiberoHand, name: str, goal: np.ndarray) -> Actions:
+    """Put the grasped object's origin at a world point (3,), let go and retreat upwards.
+
+    The object crosses the table at the height that it was lifted to.
+    """
+    release = goal + hand.grasp_noise()[0] + [0.0, 0.0, RELEASE_GAP]
+    above = np.array([release[0], release[1], max(_origin(hand, name)[2], release[2] + LOWERING)])
+    yield from hand.travel(_carried(hand, name, above))
+    yield from hand.advance(_carried(hand, name, release))
+    yield from hand.grip(closing=False)
+    yield from _retreat(hand)
+
+
+def _carried(hand: LiberoHand, name: str, goal: np.ndarray) -> np.ndarray:
+    """T_world_ee that brings the grasped object to a world point (3,), the hand keeping its orientation."""
+    T_world_ee = hand.simulator.ee_pose()
+    return pose(T_world_ee[:3, 3] + goal - _origin(hand, name), T_world_ee[:3, :3])
+
+
+def _retreat(hand: LiberoHand) -> Actions:
+    yield from hand.travel(_raised(hand.simulator.ee_pose(), RETREAT_RISE))
+
+
+def _raised(T_world_ee: np.ndarray, height: float) -> np.ndarray:
+    return pose(T_world_ee[:3, 3] + [0.0, 0.0, height], T_world_ee[:3, :3])
+
+
+def _backed(T_world_ee: np.ndarray, distance: float) -> np.ndarray:
+    """The pose that lies `distance` before another along the fingers."""
+    return pose(T_world_ee[:3, 3] - distance * T_world_ee[:3, 2], T_world_ee[:3, :3])
+
+
+def _frame(hand: LiberoHand, name: str) -> np.ndarray:
+    return hand.simulator.object_poses()[name]
+
+
+def _origin(hand: LiberoHand, name: str) -> np.ndarray:
+    return _frame(hand, name)[:3, 3]
+
+
+def _in_frame(T_world_obj: np.ndarray, point: np.ndarray) -> np.ndarray:
+    return T_world_obj[:3, :3] @ point + T_world_obj[:3, 3]
+
+
+def _region(hand: LiberoHand, name: str) -> np.ndarray:
+    """Middle of one of LIBERO's regions in the world, (3,)."""
+    return np.array(hand.simulator.sim.data.get_site_xpos(name))
+
+
+EXPERTS: dict[str, Callable[[LiberoHand], Actions]] = {
+    "open_the_middle_drawer_of_the_cabinet": _open_middle_drawer,
+    "put_the_bowl_on_the_stove": _bowl_on_stove,
+    "put_the_wine_bottle_on_top_of_the_cabinet": _bottle_on_cabinet,
+    "open_the_top_drawer_and_put_the_bowl_inside": _bowl_in_top_drawer,
+    "put_the_bowl_on_top_of_the_cabinet": _bowl_on_cabinet,
+    "push_the_plate_to_the_front_of_the_stove": _push_plate,
+    "put_the_cream_cheese_in_the_bowl": _cheese_in_bowl,
+    "turn_on_the_stove": _turn_on_stove,
+    "put_the_bowl_on_the_plate": _bowl_on_plate,
+    "put_the_wine_bottle_on_the_rack": _bottle_on_rack,
+}

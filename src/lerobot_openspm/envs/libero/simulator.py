@@ -1,0 +1,159 @@
+"""LIBERO's simulator as the scripted experts see it: true poses, the hand, and one step at a time.
+
+World frame: LIBERO's, z up, the robot's base behind the table at negative x. The `ee` frame has its origin at
+the grip site between the fingertips and the axes of the hand body, exactly as `observation.state` tells it: z
+points out of the hand (down at home), and the fingers open along its y axis.
+"""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+SUITE = "libero_goal"
+HAND_BODY, GRIP_SITE = "robot0_right_hand", "gripper0_grip_site"
+# LIBERO's cameras, by the names that LeRobot gives their images.
+CAMERAS = {"image": "agentview", "image2": "robot0_eye_in_hand"}
+# Everything on the table, in the order of the recorded pose vectors.
+OBJECTS = ("bowl", "cheese", "bottle", "plate", "cabinet", "stove", "rack")
+# Objects float or overlap a little after a reset; LeRobot's environment waits as long.
+SETTLING_STEPS = 10
+DO_NOTHING = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, -1.0)
+
+
+def tasks(suite: str = SUITE) -> dict[str, str]:
+    """Names of a suite's tasks with their instructions, in LIBERO's order."""
+    from libero.libero import benchmark
+
+    return {task.name: task.language for task in benchmark.get_benchmark_dict()[suite]().tasks}
+
+
+class LiberoSimulator:
+    """One LIBERO task.
+
+    Args:
+        task: A name in :func:`tasks`.
+        image_size: Height and width of the images in pixels; None renders nothing, which is far faster.
+        render_steps: Whether every step renders, as in LIBERO; else images are made when asked for.
+        suite: The suite that the task belongs to.
+    """
+
+    def __init__(
+        self, task: str, image_size: int | None = None, render_steps: bool = True, suite: str = SUITE
+    ) -> None:
+        if task not in tasks(suite):
+            raise ValueError(f"{suite} has no task {task!r}, expected one of {', '.join(tasks(suite))}")
+        from libero.libero import get_libero_path
+        from libero.libero.envs.env_wrapper import ControlEnv
+
+        self.task, self.instruction = task, tasks(suite)[task]
+        self._image_size = image_size
+        self._render_steps = image_size is not None and render_steps
+        self._env: Any = ControlEnv(
+            bddl_file_name=os.fspath(Path(get_libero_path("bddl_files")) / suite / f"{task}.bddl"),
+            use_camera_obs=self._render_steps,
+            has_offscreen_renderer=image_size is not None,
+            camera_heights=image_size or 1,
+            camera_widths=image_size or 1,
+        )
+        self._observation: dict[str, Any] = {}
+
+    def reset(self, seed: int) -> None:
+        """Draw a scene and let it settle."""
+        self._draw(seed)
+        self._settle()
+
+    def reset_to(self, seed: int, state: np.ndarray) -> None:
+        """Start from one of the benchmark's evaluation states, as LeRobot does. For evaluation only.
+
+        Args:
+            seed: Draws what a state does not hold: where the fixtures stand.
+            state: LIBERO's flattened state.
+        """
+        self._draw(seed)
+        self._observation = self._env.set_init_state(state)
+        self._settle()
+
+    def _draw(self, seed: int) -> None:
+        # LIBERO draws its scenes from NumPy's global generator; there is no other way to seed them.
+        self._env.seed(seed)
+        self._observation = self._env.reset()
+
+    def _settle(self) -> None:
+        for _ in range(SETTLING_STEPS):
+            self.step(np.array(DO_NOTHING))
+
+    def step(self, action: np.ndarray) -> bool:
+        """Apply a 7-D action for one step of 20 Hz. Returns whether LIBERO's goal holds now."""
+        self._observation, _, _, _ = self._env.step(action)
+        return bool(self._env.check_success())
+
+    @property
+    def sim(self) -> Any:
+        """Robosuite's simulation, with MuJoCo's model and data."""
+        return self._env.sim
+
+    def ee_pose(self) -> np.ndarray:
+        """``T_world_ee``, (4, 4)."""
+        T_world_ee = np.eye(4)
+        T_world_ee[:3, :3] = self.sim.data.get_body_xmat(HAND_BODY)
+        T_world_ee[:3, 3] = self.sim.data.get_site_xpos(GRIP_SITE)
+        return T_world_ee
+
+    def finger_positions(self) -> np.ndarray:
+        """Positions of the two fingers, (2,), metres, of opposite signs as LIBERO gives them."""
+        return np.asarray(self._observation["robot0_gripper_qpos"], float)
+
+    def state(self) -> np.ndarray:
+        """``observation.state`` (8,): position, axis-angle, fingers, as LeRobot makes it."""
+        quat_xyzw = np.asarray(self._observation["robot0_eef_quat"], float)
+        w = np.clip(quat_xyzw[3], -1.0, 1.0)
+        sine = np.sqrt(max(1.0 - w * w, 0.0))
+        axis_angle = quat_xyzw[:3] / sine * 2 * np.arccos(w) if sine > 1e-10 else np.zeros(3)
+        position = self._observation["robot0_eef_pos"]
+        return np.concatenate([position, axis_angle, self.finger_positions()]).astype(np.float32)
+
+    def images(self) -> dict[str, np.ndarray]:
+        """The cameras' images (H, W, 3) uint8 by LeRobot's names, turned as LeRobot turns them."""
+        return {name: self.image(name) for name in CAMERAS}
+
+    def image(self, name: str) -> np.ndarray:
+        """One camera's image (H, W, 3) uint8, turned as LeRobot turns it."""
+        if self._image_size is None:
+            raise ValueError("this simulator was made without images; pass image_size")
+        camera, size = CAMERAS[name], self._image_size
+        raw = (
+            self._observation[f"{camera}_image"]
+            if self._render_steps
+            else self.sim.render(camera_name=camera, width=size, height=size)
+        )
+        return np.ascontiguousarray(raw[::-1, ::-1])
+
+    def object_poses(self) -> dict[str, np.ndarray]:
+        """True ``T_world_obj`` (4, 4) of all `OBJECTS`."""
+        env = self._env.env
+        things = {_short(k): thing for k, thing in {**env.objects_dict, **env.fixtures_dict}.items()}
+        return {name: self.body_pose(things[name].root_body) for name in OBJECTS}
+
+    def body_pose(self, name: str) -> np.ndarray:
+        """``T_world_body`` (4, 4) of any body of the MuJoCo model."""
+        T_world_body = np.eye(4)
+        T_world_body[:3, :3] = self.sim.data.get_body_xmat(name)
+        T_world_body[:3, 3] = self.sim.data.get_body_xpos(name)
+        return T_world_body
+
+    def joint_position(self, name: str) -> float:
+        """Position of a fixture's joint, metres or radians."""
+        return float(self.sim.data.get_joint_qpos(name))
+
+    def close(self) -> None:
+        """Free the simulator."""
+        self._env.close()
+
+
+def _short(name: str) -> str:
+    """``akita_black_bowl_1`` is the bowl: the last word of LIBERO's category."""
+    return name.rsplit("_", 1)[0].rsplit("_", 1)[-1]

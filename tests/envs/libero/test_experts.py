@@ -1,0 +1,62 @@
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from lerobot_openspm.envs.libero.experts import EXPERTS, expert_actions
+from lerobot_openspm.envs.libero.simulator import LiberoSimulator, tasks
+from lerobot_openspm.envs.seeds import TUNING_SEED_START
+
+pytest.importorskip("libero.libero", reason="needs lerobot[libero]")
+pytestmark = pytest.mark.libero
+
+MAX_STEPS = 280
+
+
+def make_simulator(task: str) -> LiberoSimulator:
+    from libero.libero import get_assets_path
+
+    # Without local assets, this fetches them from the Hub.
+    if not Path(get_assets_path()).is_dir():
+        pytest.skip("needs LIBERO's assets, or a network to fetch them")
+    return LiberoSimulator(task)
+
+
+def steps_to_success(simulator: LiberoSimulator, seed: int) -> int | None:
+    simulator.reset(seed)
+    actions = expert_actions(simulator, simulator.task, np.random.default_rng(seed))
+    return next((n for n, action in enumerate(actions, 1) if simulator.step(action)), None)
+
+
+def test_every_task_has_an_expert():
+    assert set(EXPERTS) == set(tasks())
+
+
+@pytest.mark.parametrize("task", EXPERTS)
+def test_expert_solves_its_task(task):
+    simulator = make_simulator(task)
+    steps = steps_to_success(simulator, TUNING_SEED_START)
+    simulator.close()
+    assert steps is not None, f"{task}: not solved"
+    assert steps < MAX_STEPS
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("task", EXPERTS)
+def test_expert_is_reliable(task):
+    simulator = make_simulator(task)
+    seeds = range(TUNING_SEED_START, TUNING_SEED_START + 20)
+    failed = [seed for seed in seeds if (steps_to_success(simulator, seed) or MAX_STEPS) >= MAX_STEPS]
+    simulator.close()
+    assert len(failed) <= 1, f"{task}: failed seeds {failed}"
+
+
+def test_same_generator_same_first_action_and_others_differ():
+    simulator = make_simulator("turn_on_the_stove")
+    simulator.reset(TUNING_SEED_START)
+    first, again, other = (
+        next(expert_actions(simulator, simulator.task, np.random.default_rng(seed))) for seed in (1, 1, 2)
+    )
+    simulator.close()
+    np.testing.assert_array_equal(first, again)
+    assert not np.array_equal(first, other)

@@ -1,0 +1,110 @@
+"""LIBERO as it is recorded is LIBERO as LeRobot evaluates on it."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from lerobot_openspm.envs.seeds import DEMO_SEED_START, TUNING_SEED_START
+from lerobot_openspm.geometry.camera import load_cameras, project
+
+pytest.importorskip("libero.libero", reason="needs lerobot[libero]")
+pytestmark = pytest.mark.libero
+
+TASK = "put_the_bowl_on_the_plate"
+CALIBRATION = Path(__file__).parents[3] / "configs/cameras/libero.json"
+
+
+@pytest.fixture(scope="module")
+def simulator():
+    from lerobot_openspm.envs.libero.simulator import LiberoSimulator
+
+    made = LiberoSimulator(TASK, 256)
+    made.reset(TUNING_SEED_START)
+    yield made
+    made.close()
+
+
+def test_observations_are_those_of_lerobots_environment(simulator):
+    from lerobot.envs.libero import LiberoEnv, _get_suite
+    from lerobot.envs.utils import preprocess_observation
+    from lerobot.processor.env_processor import LiberoProcessorStep
+
+    suite = _get_suite("libero_goal")
+    task_id = [task.name for task in suite.tasks].index(TASK)
+    env = LiberoEnv(suite, task_id, "libero_goal", obs_type="pixels_agent_pos", init_states=False)
+    raw, _ = env.reset(seed=TUNING_SEED_START)
+    batch = preprocess_observation({"pixels": raw["pixels"], "robot_state": _batched(raw["robot_state"])})
+    observed = LiberoProcessorStep().observation(batch)
+    np.testing.assert_allclose(observed["observation.state"][0], simulator.state(), atol=1e-5)
+    for name, image in simulator.images().items():
+        shown = (observed[f"observation.images.{name}"][0] * 255).round().to(torch.uint8)
+        np.testing.assert_array_equal(shown.permute(1, 2, 0), image)
+    env.close()
+
+
+def _batched(state):
+    return {k: _batched(v) if isinstance(v, dict) else np.asarray(v)[None] for k, v in state.items()}
+
+
+def test_the_calibration_file_is_the_simulators():
+    from lerobot_openspm.envs.libero.calibration import calibration_document
+
+    written, read = json.loads(CALIBRATION.read_text()), calibration_document()
+    assert written.keys() == read.keys()
+    for key, camera in read["cameras"].items():
+        for field, value in camera.items():
+            if field == "mount":
+                assert written["cameras"][key][field] == value
+            else:
+                np.testing.assert_allclose(written["cameras"][key][field], value, atol=1e-6)
+
+
+@pytest.mark.parametrize("size", [256, 360])
+def test_objects_are_seen_where_the_calibration_puts_them(simulator, size):
+    camera = load_cameras(CALIBRATION)["observation.images.image"].scaled(size, size)
+    middle = simulator.body_pose("akita_black_bowl_1_main")[:3, 3] + [0.0, 0.0, 0.03]
+    before = _render(simulator, size)
+    state = simulator.sim.get_state()
+    # To where no camera looks. The bowl is black and the table is light.
+    simulator.sim.data.qpos[simulator.sim.model.get_joint_qpos_addr("akita_black_bowl_1_joint0")[0]] = 100.0
+    simulator.sim.forward()
+    after = _render(simulator, size)
+    simulator.sim.set_state(state)
+    simulator.sim.forward()
+    v, u = np.nonzero((after.astype(int) - before).min(axis=-1) > 60)
+    uv, _ = project(camera, camera.T_world_cam(np.eye(4)), middle)
+    seen = np.array([(u.min() + u.max()) / 2, (v.min() + v.max()) / 2])
+    np.testing.assert_allclose(uv, seen, atol=3 * size / 256)
+
+
+def _render(simulator, size):
+    """The agent camera's image, turned as LeRobot turns it."""
+    return simulator.sim.render(camera_name="agentview", width=size, height=size)[::-1, ::-1]
+
+
+def test_demonstrations_never_start_from_an_evaluation_state(simulator):
+    from lerobot.envs.libero import _get_suite, get_task_init_states
+
+    suite = _get_suite("libero_goal")
+    task_id = [task.name for task in suite.tasks].index(TASK)
+    # A flattened state is the time, the positions, the velocities.
+    evaluation = get_task_init_states(suite, task_id)
+    n_positions = simulator.sim.model.nq
+    for seed in range(DEMO_SEED_START, DEMO_SEED_START + 5):
+        simulator.reset(seed)
+        away = np.abs(evaluation[:, 1 : 1 + n_positions] - simulator.sim.data.qpos).max(axis=1)
+        assert away.min() > 1e-3
+    simulator.reset(TUNING_SEED_START)
+
+
+def test_the_same_seed_gives_the_same_scene(simulator):
+    simulator.reset(TUNING_SEED_START + 1)
+    first = simulator.sim.data.qpos.copy()
+    simulator.reset(TUNING_SEED_START + 2)
+    assert np.abs(simulator.sim.data.qpos - first).max() > 1e-3
+    simulator.reset(TUNING_SEED_START + 1)
+    np.testing.assert_array_equal(simulator.sim.data.qpos, first)
+    simulator.reset(TUNING_SEED_START)
