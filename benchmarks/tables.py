@@ -64,8 +64,12 @@ def _perception(result: dict[str, Any]) -> str:
         ]
         for name, row in result["objects"].items()
     ]
+    note = (
+        "A learned object's frame stands anywhere on it: one rigid offset per object was fitted on the "
+        "demonstrations, and the errors are what remains."
+    )
     heads = ["Object", "Scenes", "Not found", "Mean, mm", "95th percentile, mm", "Yaw, degrees"]
-    return _table(heads, rows)
+    return f"{_table(heads, rows)}\n\n{note}"
 
 
 def _rates(runs: dict[str, Any]) -> str:

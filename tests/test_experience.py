@@ -17,7 +17,7 @@ from lerobot_openspm.geometry.camera import Camera
 from lerobot_openspm.memory.entry import WORLD
 from lerobot_openspm.memory.store import KEY_POSE_ARRAY, LAYOUT_ARRAY
 from lerobot_openspm.perception.colour import N_BINS
-from lerobot_openspm.perception.model import ObjectModel
+from lerobot_openspm.perception.model import ObjectModel, Patch, PatchModel, Probe
 
 
 def model(name, seed=0, yaw_period=2 * np.pi):
@@ -28,6 +28,17 @@ def model(name, seed=0, yaw_period=2 * np.pi):
     )  # fmt: skip
 
 
+def patch_model(name):
+    rng = np.random.default_rng(5)
+    T = se3.from_yaw([0.1, 0.2, 0.3], 0.4)
+    camera = Camera(64, 48, -50.0, 50.0, 31.5, 23.5, "world", T)
+    patches = tuple(
+        Patch(rng.integers(0, 255, (9, 8, 3)).astype(np.uint8), np.array([3.0, 4.0]), np.array([0.0, i, 1.0]))
+        for i in range(2)
+    )
+    return PatchModel(name, (Probe("observation.images.front", camera, T, patches, 0.001),), 1.0, 0.9)
+
+
 def experience(**changes):
     T = se3.from_position_rotvec([0.1, 0.2, 0.3], [0.3, 0.2, 0.1])
     entries = (
@@ -36,7 +47,11 @@ def experience(**changes):
     )
     fields = {
         "entries": entries,
-        "objects": {"bowl": model("bowl", 1), "cream cheese box": model("cream cheese box", 2, np.pi)},
+        "objects": {
+            "bowl": model("bowl", 1),
+            "cream cheese box": model("cream cheese box", 2, np.pi),
+            "stove": patch_model("stove"),
+        },
         "robot": robot(),
         "cameras": {"observation.images.front": Camera(64, 48, 50.1, 50.2, 31.5, 23.5, "ee", T)},
         "perception": "demonstrations",
@@ -102,7 +117,11 @@ def test_equal_experiences_make_equal_files(saved, tmp_path):
 
 
 def test_yaw_periods_are_those_of_the_objects():
-    assert experience().yaw_periods == {"bowl": 2 * np.pi, "cream cheese box": np.pi}
+    assert experience().yaw_periods == {
+        "bowl": 2 * np.pi,
+        "cream cheese box": np.pi,
+        "stove": 2 * np.pi,
+    }
 
 
 @pytest.mark.parametrize("name", FILES)
@@ -181,7 +200,7 @@ def without(*path):
 ENTRY = ("entries", 0)
 POSE = (*ENTRY, "key_poses", 0)
 SPOILT = {
-    "newer version": (setting("version", value=2), r"version 2.*upgrade"),
+    "newer version": (setting("version", value=3), r"version 3.*upgrade"),
     "no version": (without("version"), "version None"),
     "version 0": (setting("version", value=0), "version 0"),
     "other format": (setting("format", value="zip"), "'zip'"),
@@ -366,7 +385,7 @@ def test_appending_adds_entries_and_objects_and_keeps_known_ones():
     )
     both = old.appended(newer)
     assert [e.source for e in both.entries] == ["local/demos#0", "local/demos#1", "local/more#0"]
-    assert set(both.objects) == {"bowl", "cream cheese box", "plate"}
+    assert set(both.objects) == {"bowl", "cream cheese box", "stove", "plate"}
     # The old entries are anchored in the old model's frame.
     assert_array_equal(both.objects["bowl"].points, old.objects["bowl"].points)
     assert same(both.robot, old.robot)

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import os
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -20,6 +19,7 @@ from safetensors.numpy import load as load_arrays
 from safetensors.numpy import save as save_arrays
 
 from lerobot_openspm.errors import MemoryFormatError
+from lerobot_openspm.files import write_beside
 from lerobot_openspm.geometry.camera import Camera, cameras_to_dict, load_cameras
 from lerobot_openspm.memory.entry import MemoryEntry
 from lerobot_openspm.memory.robot import RobotModel
@@ -28,7 +28,8 @@ from lerobot_openspm.perception.model import KnownObject
 from lerobot_openspm.perception.store import from_parts as object_from_parts
 from lerobot_openspm.perception.store import to_parts as object_to_parts
 
-FORMAT, VERSION = "openspm-memory", 1
+# Version 2: objects known by patches.
+FORMAT, VERSION = "openspm-memory", 2
 MEMORY_JSON, MEMORY_ARRAYS, CAMERAS_JSON = "memory.json", "memory.safetensors", "cameras.json"
 FILES = (MEMORY_JSON, MEMORY_ARRAYS, CAMERAS_JSON)
 MAX_JSON_BYTES, MAX_ARRAY_BYTES = 512_000_000, 4_000_000_000
@@ -111,10 +112,10 @@ def save_experience(experience: Experience, directory: Path) -> None:
         "entries": rows,
     }
     directory.mkdir(parents=True, exist_ok=True)
-    _write(directory / MEMORY_ARRAYS, blob)
-    _write(directory / CAMERAS_JSON, _json(cameras_to_dict(experience.cameras)))
-    # Last, because it vouches for the others.
-    _write(directory / MEMORY_JSON, _json(memory))
+    write_beside(directory / MEMORY_ARRAYS, blob)
+    write_beside(directory / CAMERAS_JSON, _json(cameras_to_dict(experience.cameras)))
+    # Last, because it vouches for the arrays.
+    write_beside(directory / MEMORY_JSON, _json(memory))
 
 
 def load_experience(directory: Path) -> Experience:
@@ -200,12 +201,3 @@ def _read(path: Path, limit: int) -> bytes:
 
 def _json(data: object) -> bytes:
     return json.dumps(data, indent=1, allow_nan=False).encode()
-
-
-def _write(path: Path, blob: bytes) -> None:
-    beside = path.with_name(f".{path.name}.partial")
-    with beside.open("wb") as file:
-        file.write(blob)
-        file.flush()
-        os.fsync(file.fileno())
-    beside.replace(path)

@@ -134,7 +134,7 @@ def test_collecting_into_a_recorded_folder_leaves_it_alone(openspm: Openspm, tin
 
 def test_collecting_something_else_into_a_recorded_folder_is_refused(openspm: Openspm, tiny_dataset: Path):
     error = one_line_error(openspm("collect", f"--root={tiny_dataset}", "--episodes=4"), "collect")
-    assert "holds 6 episodes" in error
+    assert "episodes is 3, asked was 4" in error
     assert "--overwrite=true" in error
 
 

@@ -75,6 +75,26 @@ def test_an_interrupted_recording_goes_on_where_it_stopped(tmp_path, monkeypatch
     assert [e["task"] for e in recorded["episodes"]] == ["turn_on_stove", "bowl_on_plate"]
 
 
+def test_two_processes_record_what_one_does(tmp_path):
+    env = SimulatorConfig(task="turn_on_stove,bowl_on_plate")
+    recorded = []
+    for workers in (0, 2):
+        root = tmp_path / str(workers)
+        collect(CollectConfig(env, 1, str(root), height=128, width=128, workers=workers))
+        recorded.append(json.loads((root / "meta/openspm_collect.json").read_text())["episodes"])
+    assert recorded[0] == recorded[1]
+    assert [e["task"] for e in recorded[0]] == ["turn_on_stove", "bowl_on_plate"]
+
+
+def test_a_foreign_partial_folder_is_not_touched(tmp_path):
+    foreign = tmp_path / "demos.partial"
+    foreign.mkdir()
+    (foreign / "precious.txt").write_text("keep")
+    with pytest.raises(FileExistsError, match="not written by openspm collect"):
+        collect(CollectConfig(root=str(tmp_path / "demos")))
+    assert (foreign / "precious.txt").exists()
+
+
 def test_a_broken_expert_stops_the_recording(tmp_path, monkeypatch):
     record = TabletopSource.record
 

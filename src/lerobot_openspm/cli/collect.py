@@ -15,11 +15,14 @@ from typing import TYPE_CHECKING, Any
 
 from lerobot_openspm.envs.recording import source
 from lerobot_openspm.envs.seeds import DEMO_SEED_START, require_demo_seeds
+from lerobot_openspm.files import write_json
 
 if TYPE_CHECKING:
     from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
     from lerobot_openspm.envs.recording import RecordedEpisode
+
+logger = logging.getLogger(__name__)
 
 SUMMARY_FILE = "meta/openspm_collect.json"
 # Marks a task's part as complete, and what a folder of parts is being made for.
@@ -61,6 +64,8 @@ class CollectConfig:
     def __post_init__(self) -> None:
         if self.episodes < 1:
             raise ValueError(f"episodes must be at least 1, got {self.episodes}")
+        if min(self.height, self.width) < 64:
+            raise ValueError(f"images must have at least 64 pixels a side, got {self.height} x {self.width}")
         if self.workers < 0:
             raise ValueError(f"workers must not be negative, got {self.workers}")
         recorded = source(self.env.type)
@@ -98,7 +103,8 @@ def collect(config: CollectConfig) -> dict[str, Any]:
         "root": str(root),
         "seconds": round(time.monotonic() - start_s, 1),
     }
-    _write_meta(config, merged, {"summary": summary, "episodes": episodes, "discarded": discarded})
+    document = {"summary": summary, "settings": _settings(config)}
+    _write_meta(config, merged, {**document, "episodes": episodes, "discarded": discarded})
     if root.exists():
         shutil.rmtree(root)
     merged.rename(root)
@@ -117,15 +123,12 @@ def _root(config: CollectConfig) -> Path:
 def _keep_existing(config: CollectConfig, root: Path) -> dict[str, Any]:
     """Leave a complete dataset alone and say what is there."""
     recorded = json.loads((root / SUMMARY_FILE).read_text(encoding="utf-8"))
-    summary = recorded["summary"]
-    tasks, wanted = (
-        {e["task"] for e in recorded["episodes"]},
-        set(source(config.env.type).tasks(config.env.task)),
-    )
-    if tasks != wanted or summary["episodes"] != config.episodes * len(wanted):
+    summary, kept, asked = recorded["summary"], recorded.get("settings", {}), _settings(config)
+    if differing := [key for key in asked if kept.get(key) != asked[key]]:
+        details = "; ".join(f"{key} is {kept.get(key)}, asked was {asked[key]}" for key in differing)
         raise FileExistsError(
-            f"{root} holds {summary['episodes']} episodes of {sorted(tasks)}, asked were {config.episodes} "
-            f"of each of {sorted(wanted)}; choose another --root, or pass --overwrite=true"
+            f"{root} was recorded with other settings: {details}. Choose another --root, or pass "
+            "--overwrite=true"
         )
     print(
         f"{root} already holds {summary['episodes']} episodes; left alone "
@@ -198,14 +201,27 @@ def _quiet_libraries() -> Generator[None]:
             datasets.enable_progress_bars()
 
 
+def _settings(config: CollectConfig) -> dict[str, Any]:
+    """What decides about a dataset's content."""
+    return {
+        key: value for key, value in asdict(config).items() if key not in ("root", "workers", "overwrite")
+    }
+
+
 def _open_parts(config: CollectConfig, partial: Path) -> dict[str, Path]:
     """Folders of the tasks' parts, by task; what other settings left there is discarded."""
-    settings = {key: value for key, value in asdict(config).items() if key not in ("workers", "overwrite")}
+    settings = _settings(config)
     made_for = partial / PARTS_FILE
-    if not made_for.is_file() or json.loads(made_for.read_text(encoding="utf-8")) != settings:
-        shutil.rmtree(partial, ignore_errors=True)
+    if partial.exists() and not made_for.is_file():
+        raise FileExistsError(
+            f"{partial} was not written by openspm collect; move it, or choose another --root"
+        )
+    if partial.exists() and json.loads(made_for.read_text(encoding="utf-8")) != settings:
+        logger.info("%s was being recorded with other settings; recording anew", partial)
+        shutil.rmtree(partial)
+    if not partial.exists():
         partial.mkdir(parents=True)
-        made_for.write_text(json.dumps(settings), encoding="utf-8")
+        write_json(made_for, settings)
     return {task: partial / task for task in source(config.env.type).tasks(config.env.task)}
 
 
@@ -285,7 +301,7 @@ def record_part(config: CollectConfig, task: str, root: Path, done: Callable[[st
                 )
         dataset.finalize()
     document = {"episodes": kept, "discarded": discarded}
-    (root / PART_FILE).write_text(json.dumps(document), encoding="utf-8")
+    write_json(root / PART_FILE, document)
 
 
 def _merge(config: CollectConfig, parts: Sequence[Path], merged: Path) -> Path:
@@ -311,11 +327,9 @@ def _write_episode(dataset: "LeRobotDataset", episode: "RecordedEpisode") -> Non
 
 
 def _write_meta(config: CollectConfig, root: Path, document: dict) -> None:
-    (root / SUMMARY_FILE).write_text(json.dumps(document, indent=1) + "\n", encoding="utf-8")
+    write_json(root / SUMMARY_FILE, document)
     calibration = source(config.env.type).calibration(config.height, config.width)
-    (root / "meta/openspm_cameras.json").write_text(
-        json.dumps(calibration, indent=2) + "\n", encoding="utf-8"
-    )
+    write_json(root / "meta/openspm_cameras.json", calibration)
 
 
 def main(args: Sequence[str] | None = None) -> None:

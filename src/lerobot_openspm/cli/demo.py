@@ -40,6 +40,10 @@ class DemoConfig:
     output: str = "outputs/demo"
     started_at: float | None = None
 
+    def __post_init__(self) -> None:
+        if self.demos < 1 or self.episodes < 1:
+            raise ValueError(f"demos and episodes must be at least 1, got {self.demos} and {self.episodes}")
+
 
 def main(args: list[str]) -> None:
     """Run the demo and print one JSON object."""

@@ -13,7 +13,7 @@ from lerobot_openspm.errors import OpenSPMError
 
 # Command -> module with `main(args)`, and what it is for. Modules are imported when they are asked for.
 COMMANDS = {
-    "collect": ("lerobot_openspm.cli.collect", "record scripted demonstrations on the tabletop"),
+    "collect": ("lerobot_openspm.cli.collect", "record scripted demonstrations on the tabletop or LIBERO"),
     "mine": ("lerobot_openspm.cli.mine", "mine a dataset's key poses into a memory"),
     "inspect": ("lerobot_openspm.cli.inspect", "show the memory of a checkpoint"),
     "demo": ("lerobot_openspm.cli.demo", "collect, train, evaluate and write one page about it"),

@@ -20,8 +20,10 @@ import numpy as np
 from scipy.stats import binomtest
 from tqdm import tqdm
 
+import lerobot_openspm
 from lerobot_openspm.cli.collect import SUMMARY_FILE, CollectConfig, collect
 from lerobot_openspm.envs.tasks import TASK_NAMES
+from lerobot_openspm.files import write_beside, write_json
 
 logger = logging.getLogger(__name__)
 
@@ -69,7 +71,7 @@ def train(dataset: Path, output: Path, options: Sequence[str] = ()) -> tuple[Pat
                 "lerobot-train", f"--config_path={TRAIN_CONFIG}", f"--dataset.root={dataset}",
                 f"--output_dir={output}", *options,
             )  # fmt: skip
-        done.write_text(json.dumps({"seconds": round(time.monotonic() - start_s, 1)}))
+        write_json(done, {"seconds": round(time.monotonic() - start_s, 1)})
     return checkpoint, float(json.loads(done.read_text())["seconds"])
 
 
@@ -104,9 +106,10 @@ def evaluate(
 
 
 def _digest(files: Sequence[Path], options: Sequence[str]) -> str:
-    """What a result is made of, so that a kept one is only used again for the same."""
+    """What a result is made of, the code too, so that a kept one is only used again for the same."""
     digest = hashlib.sha256("\n".join(options).encode())
-    for file in files:
+    code = sorted(Path(lerobot_openspm.__file__).parent.rglob("*.py"))
+    for file in [*code, *files]:
         digest.update(file.read_bytes())
     return digest.hexdigest()
 
@@ -119,7 +122,7 @@ def _discard_unless(output: Path, made_of: str) -> None:
         logger.info("%s was made of something else; making it anew", output)
         shutil.rmtree(output)
     output.parent.mkdir(parents=True, exist_ok=True)
-    kept.write_text(made_of)
+    write_beside(kept, made_of.encode())
 
 
 def _start_evaluation(

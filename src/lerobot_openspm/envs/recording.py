@@ -108,15 +108,18 @@ def source(env_type: str) -> Source:
     """The source of an environment type.
 
     Raises:
-        ValueError: There is no such source.
-        ImportError: LIBERO is not installed.
+        ValueError: There is no such source, or it is not installed.
     """
     if env_type == "openspm_tabletop":
         from lerobot_openspm.envs.tabletop_recording import TabletopSource
 
         return TabletopSource()
     if env_type == "libero":
-        from lerobot_openspm.envs.libero.recording import LiberoSource
-
+        try:
+            from lerobot_openspm.envs.libero.recording import LiberoSource
+        except ImportError as error:
+            raise ValueError(
+                f"env.type=libero needs LIBERO ({error}); install it with: pip install 'lerobot[libero]'"
+            ) from error
         return LiberoSource()
     raise ValueError(f"env.type is {env_type!r}, expected openspm_tabletop or libero")

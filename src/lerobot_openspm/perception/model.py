@@ -99,12 +99,14 @@ class PatchModel:
 
     Attributes:
         name: The noun phrase.
-        probes: What to look for where.
+        probes: What to look for where, the best first.
+        height: World z of the reference point, metres; it is not measured.
         typical_correlation: Of the patches in the demonstrations.
     """
 
     name: str
     probes: tuple[Probe, ...]
+    height: float
     typical_correlation: float
 
     @property

@@ -12,7 +12,7 @@ demonstrations, and judged by how well it explains where the hand went.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -22,7 +22,7 @@ from lerobot_openspm.geometry import se3
 from lerobot_openspm.geometry.camera import project
 from lerobot_openspm.geometry.se3 import Array
 from lerobot_openspm.perception.model import Patch, PatchModel, Picture, Probe
-from lerobot_openspm.perception.types import Hint, PoseEstimate, Scene, View
+from lerobot_openspm.perception.types import UNKNOWN_YAW_STD, Hint, PoseEstimate, Scene, View
 
 # The hand's target moves with the object; if it kept within this in all demonstrations, patches do.
 MAX_SPREAD_M = 0.03
@@ -30,7 +30,7 @@ RADII_M = (0.035, 0.05, 0.07, 0.10)
 # A hand that lets go of something stands above what it puts it on by an unknown height.
 RELEASE_DROPS_M = (0.0, 0.05, 0.10)
 REFERENCES = 5
-# How far beyond the demonstrated places an object is sought.
+# How far from each patch's own place an object is sought.
 REACH_M = 0.035
 # Probes that explain the hints nearly as well as the best are used together.
 KEPT_RATIO, KEPT_SLACK_M = 1.15, 0.0002
@@ -41,6 +41,14 @@ MIN_PATCH_PX = 7
 LEARNED_CORRELATION = 0.8
 # Of the typical correlation.
 FOUND_CORRELATION = 0.5
+# A place touched less often says nothing of how far its object moves.
+MIN_TOUCHES = 3
+# Patches have to explain this much of where the hand went, unless it went to about the same place every time.
+EXPLAINED_SHARE, STILL_M = 0.6, 0.004
+# A patch with less contrast than this, in CIELAB levels, is found everywhere.
+MIN_CONTRAST = 4.0
+# An object that turns looks more like its turned patch, by this much, in more than this share of the scenes.
+TURN_DEG, TURN_GAIN, TURN_SHARE = 10.0, 0.01, 0.25
 # A hand camera sees the patch as in the demonstrations only from the same place.
 MAX_CAMERA_SHIFT_M, MAX_CAMERA_TURN_RAD = 0.02, 0.10
 
@@ -54,8 +62,12 @@ class _Sight:
 
 
 def spread(scenes: Sequence[Scene], name: str) -> float:
-    """Largest distance of a touched place from the middle of its demonstrations' like ones, metres."""
-    groups = _places([hint for scene in scenes for hint in scene.hints if hint.name == name])
+    """Largest distance of a touched place from the middle of its demonstrations' like ones, metres.
+
+    Infinite where no place was touched often enough to tell.
+    """
+    hints = [hint for scene in scenes for hint in scene.hints if hint.name == name]
+    groups = [group for group in _places(hints) if len(group) >= MIN_TOUCHES]
     reach = [np.ptp(np.stack([hint.point_world for hint in group])[:, :2], axis=0) / 2 for group in groups]
     return float(np.max(reach)) if reach else np.inf
 
@@ -82,6 +94,8 @@ def learn_patches(name: str, scenes: Sequence[Scene]) -> PatchModel | None:
     if not tried:
         return None
     best = min(residual for residual, *_ in tried)
+    if best > max(EXPLAINED_SHARE * _residual(np.zeros((len(hints), 2)), hints, groups), STILL_M):
+        return None
     kept = sorted(
         (one for one in tried if one[0] <= KEPT_RATIO * best + KEPT_SLACK_M), key=lambda one: one[0]
     )[:MAX_PROBES]
@@ -93,7 +107,10 @@ def learn_patches(name: str, scenes: Sequence[Scene]) -> PatchModel | None:
         probes.append(
             Probe(probe.camera, probe.calibration, probe.T_world_cam, probe.patches, max(std, MIN_STD_M))
         )
-    return PatchModel(name, tuple(probes), float(np.median([correlation for *_, correlation in kept])))
+    height = float(probes[0].patches[0].point_world[2])
+    return PatchModel(
+        name, tuple(probes), height, float(np.median([correlation for *_, correlation in kept]))
+    )
 
 
 def _places(hints: Sequence[Hint]) -> list[list[Hint]]:
@@ -115,7 +132,7 @@ def _try(
     """Estimate every demonstration's point from others' patches, and compare with where the hand went.
 
     Returns:
-        Median distance to the hints, the points ``(n, 2)``, the probe, and its median correlation.
+        Distance to the hints (root mean square), the points ``(n, 2)``, the probe, its median correlation.
     """
     views = [scene.views[camera] for scene in scenes]
     chosen = np.unique(np.linspace(0, len(scenes) - 1, REFERENCES).round().astype(int))
@@ -141,13 +158,15 @@ def _try(
             correlations[i] = np.median([one.correlation for one in found])
     if np.isnan(points).any() or np.median(correlations) < LEARNED_CORRELATION:
         return None
+    if np.mean([_looks_turned(first, view, other) for other in views]) > TURN_SHARE:
+        return None
     residual = _residual(points, hints, groups)
     probe = Probe(camera, view.camera, view.T_world_cam, tuple(patches.values()), 0.0)
     return residual, points, probe, float(np.median(correlations))
 
 
 def _residual(points: Array, hints: Sequence[Hint], groups: Sequence[Sequence[Hint]]) -> float:
-    """Median distance between estimates ``(n, 2)`` and hints, each place's own offset taken out, metres."""
+    """Root mean square distance of estimates ``(n, 2)`` from hints, less each place's own offset, metres."""
     offsets = np.stack([hint.point_world[:2] for hint in hints]) - points
     left = []
     for group in groups:
@@ -166,7 +185,22 @@ def _cut(view: View, point_world: Array, radius: float) -> Patch | None:
     high = np.minimum(np.round(uv + half) + 1, [view.camera.width, view.camera.height]).astype(int)
     if (high - low).min() < max(MIN_PATCH_PX, half):
         return None
-    return Patch(_lab(view.image)[low[1] : high[1], low[0] : high[0]], low.astype(float), point_world)
+    image = _lab(view.image)[low[1] : high[1], low[0] : high[0]]
+    if image.reshape(-1, 3).std(axis=0).max() < MIN_CONTRAST:
+        return None
+    return Patch(image, low.astype(float), point_world)
+
+
+def _looks_turned(patch: Patch, seen_with: View, view: View) -> bool:
+    """Whether the patch, turned either way, is found more clearly than as it is."""
+    height, width = patch.image.shape[:2]
+    correlations = []
+    for angle in (0.0, -TURN_DEG, TURN_DEG):
+        turn = cv2.getRotationMatrix2D(((width - 1) / 2, (height - 1) / 2), angle, 1.0)
+        image = cv2.warpAffine(patch.image, turn, (width, height), borderMode=cv2.BORDER_REPLICATE)
+        seen = _match(replace(patch, image=np.asarray(image, np.uint8)), seen_with, view)
+        correlations.append(0.0 if seen is None else seen.correlation)
+    return max(correlations[1:]) > correlations[0] + TURN_GAIN
 
 
 def _match(patch: Patch, seen_with: View | Probe, view: View) -> _Sight | None:
@@ -214,7 +248,7 @@ def localise_patches(views: Mapping[str, View], model: PatchModel) -> PoseEstima
         model: The object.
     """
     information, weighted = np.zeros((2, 2)), np.zeros(2)
-    correlations, height = [], 0.0
+    correlations = []
     for probe in model.probes:
         view = _as_seen(views.get(probe.camera), probe)
         found = [] if view is None else [_match(patch, probe, view) for patch in probe.patches]
@@ -225,18 +259,18 @@ def localise_patches(views: Mapping[str, View], model: PatchModel) -> PoseEstima
         information += weight
         weighted += weight @ np.median([one.point_world[:2] for one in sights], axis=0)
         correlations.append(float(np.median([one.correlation for one in sights])))
-        height = float(probe.patches[0].point_world[2])
-    unknown = np.diag([1.0, 1.0, 1.0, 1.0])
+    unknown = np.diag([1.0, 1.0, 1.0, UNKNOWN_YAW_STD**2])
     if not correlations:
         return PoseEstimate("not_found", np.eye(4), unknown, 0.0, {})
     confidence = float(np.clip(np.mean(correlations) / max(model.typical_correlation, 1e-3), 0, 1))
     status = (
         "found" if np.mean(correlations) >= FOUND_CORRELATION * model.typical_correlation else "not_found"
     )
-    covariance = np.zeros((4, 4))
+    # Height and direction are taken to be the demonstrated ones; they are not measured.
+    covariance = np.diag([0.0, 0.0, REACH_M**2, UNKNOWN_YAW_STD**2])
     covariance[:2, :2] = np.linalg.inv(information)
     place = np.linalg.solve(information, weighted)
-    return PoseEstimate(status, se3.from_yaw(np.append(place, height), 0.0), covariance, confidence, {})
+    return PoseEstimate(status, se3.from_yaw(np.append(place, model.height), 0.0), covariance, confidence, {})
 
 
 def _as_seen(view: View | None, probe: Probe) -> View | None:

@@ -79,7 +79,7 @@ def _patches_to_parts(model: PatchModel) -> tuple[dict[str, Any], dict[str, NDAr
         arrays[f"{i}.points"] = np.stack([patch.point_world for patch in probe.patches]).astype(float)
         for j, patch in enumerate(probe.patches):
             arrays[f"{i}.patch.{j}"] = patch.image
-    fields = {"typical_correlation": model.typical_correlation, "probes": probes}
+    fields = {"height": model.height, "typical_correlation": model.typical_correlation, "probes": probes}
     return {"version": VERSION, "kind": "patches", "name": model.name, **fields}, arrays
 
 
@@ -90,13 +90,15 @@ def _patches_from_parts(
     if not isinstance(rows, list) or not 1 <= len(rows) <= MAX_PROBES:
         raise MemoryFormatError(f"{where}: 'probes' of {name!r} must be a list of 1 to {MAX_PROBES} objects")
     probes = tuple(_probe(row, i, arrays, where) for i, row in enumerate(rows))
-    return PatchModel(name, probes, _number(data, "typical_correlation", 0.0, 1.0, where))
+    height = _number(data, "height", *NUMBERS["height"], where)
+    return PatchModel(name, probes, height, _number(data, "typical_correlation", 0.0, 1.0, where))
 
 
 def _probe(row: Any, index: int, arrays: Mapping[str, NDArray[Any]], where: str) -> Probe:
     if not isinstance(row, Mapping) or not isinstance(row.get("camera"), str):
         raise MemoryFormatError(f"{where}: probe {index} has no 'camera'; learn the objects again")
-    width, height, fx, fy, cx, cy = _array(arrays, f"{index}.calibration", (6,), where, np.float64)
+    intrinsics = _array(arrays, f"{index}.calibration", (len(INTRINSICS),), where, np.float64)
+    width, height, fx, fy, cx, cy = (float(number) for number in intrinsics)
     T_world_cam = _array(arrays, f"{index}.T_world_cam", (4, 4), where, np.float64)
     if not (1 <= width <= MAX_PIXELS and 1 <= height <= MAX_PIXELS and fx != 0 and fy > 0):
         raise MemoryFormatError(f"{where}: the camera of probe {index} has impossible intrinsics")
