@@ -190,7 +190,8 @@ def _read(path: Path, limit: int) -> bytes:
     if not path.is_file():
         raise MemoryFormatError(
             f"no memory at {path}: a checkpoint of this policy holds {', '.join(FILES)}; train with "
-            "lerobot-train --policy.type=openspm, or pull the whole checkpoint"
+            "lerobot-train --policy.type=openspm, or pull the whole checkpoint. In a training's folder it is "
+            "checkpoints/last/pretrained_model"
         )
     if path.stat().st_size > limit:
         raise MemoryFormatError(

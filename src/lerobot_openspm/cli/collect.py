@@ -222,7 +222,10 @@ def _open_parts(config: CollectConfig, partial: Path) -> dict[str, Path]:
     if not partial.exists():
         partial.mkdir(parents=True)
         write_json(made_for, settings)
-    return {task: partial / task for task in source(config.env.type).tasks(config.env.task)}
+    parts = {task: partial / task for task in source(config.env.type).tasks(config.env.task)}
+    if kept := [task for task, part in parts.items() if (part / PART_FILE).is_file()]:
+        logger.info("keeping what was recorded before an interruption: %s", ", ".join(kept))
+    return parts
 
 
 def _record_parts(config: CollectConfig, parts: Mapping[str, Path]) -> None:

@@ -29,13 +29,24 @@ def main() -> None:
         print("\n`openspm COMMAND --help` lists the options of one.")
         return
     if command not in COMMANDS:
-        sys.exit(f"openspm: unknown command {command!r}; expected one of {', '.join(COMMANDS)}")
+        print(f"openspm: unknown command {command!r}; expected one of {', '.join(COMMANDS)}", file=sys.stderr)
+        sys.exit(2)
     logging.basicConfig(level=logging.INFO, format="%(levelname)s %(message)s", stream=sys.stderr)
     try:
         importlib.import_module(COMMANDS[command][0]).main(args)
     except (OpenSPMError, ParsingError, FileExistsError, FileNotFoundError, RuntimeError) as error:
-        print(f"openspm {command}: {error}", file=sys.stderr)
+        print(f"openspm {command}: {_reason(error)}", file=sys.stderr)
         sys.exit(2)
+    except KeyboardInterrupt:
+        print(f"openspm {command}: interrupted; the same command again goes on from here", file=sys.stderr)
+        sys.exit(130)
     except subprocess.CalledProcessError as error:
         print(f"openspm {command}: {error.cmd[0]} failed with exit code {error.returncode}", file=sys.stderr)
         sys.exit(error.returncode)
+
+
+def _reason(error: BaseException) -> BaseException:
+    """What a configuration said of its own values, where the parser only says that it could not be made."""
+    while isinstance(error, ParsingError) and error.__cause__ is not None:
+        error = error.__cause__
+    return error
