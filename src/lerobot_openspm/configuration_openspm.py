@@ -126,6 +126,12 @@ class OpenSPMConfig(PreTrainedConfig):
         _require_choice("memory_update", self.memory_update, get_args(MemoryUpdate))
         _require_choice("conditioning", self.conditioning, get_args(Conditioning))
         _require_choice("execution", self.execution, get_args(Execution))
+        scaled = {k: v for k, v in self.normalization_mapping.items() if v is not NormalizationMode.IDENTITY}
+        if scaled:
+            raise ValueError(
+                f"normalization_mapping scales {scaled}, but OpenSPM works on poses and images as they are; "
+                "leave it out"
+            )
         for name in ("state_rotation", "action_rotation"):
             if getattr(self, name) is not None:
                 _require_choice(name, getattr(self, name), ROTATION_KINDS)

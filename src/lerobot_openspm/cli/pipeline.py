@@ -52,7 +52,7 @@ def collect_dataset(root: Path, demos: int) -> dict[str, Any]:
 def train(dataset: Path, output: Path, options: Sequence[str] = ()) -> tuple[Path, float]:
     """Run lerobot-train, unless its checkpoint is there. Returns the checkpoint and the seconds it took.
 
-    An interrupted run is resumed from its last checkpoint.
+    An interrupted run is resumed from its last checkpoint; the seconds are NaN then.
     """
     checkpoint, done = output / "checkpoints" / "last" / "pretrained_model", output / DONE
     if not TRAIN_CONFIG.is_file():
@@ -62,7 +62,8 @@ def train(dataset: Path, output: Path, options: Sequence[str] = ()) -> tuple[Pat
     if not done.exists():
         start_s = time.monotonic()
         config = checkpoint / "train_config.json"
-        if config.exists():
+        resumed = config.exists()
+        if resumed:
             run_lerobot("lerobot-train", f"--config_path={config}", "--resume=true")
         else:
             # lerobot-train wants to make its folder itself.
@@ -71,8 +72,10 @@ def train(dataset: Path, output: Path, options: Sequence[str] = ()) -> tuple[Pat
                 "lerobot-train", f"--config_path={TRAIN_CONFIG}", f"--dataset.root={dataset}",
                 f"--output_dir={output}", *options,
             )  # fmt: skip
-        write_json(done, {"seconds": round(time.monotonic() - start_s, 1)})
-    return checkpoint, float(json.loads(done.read_text())["seconds"])
+        # What an interrupted run took before is not known any more.
+        write_json(done, {"seconds": None if resumed else round(time.monotonic() - start_s, 1)})
+    seconds = json.loads(done.read_text())["seconds"]
+    return checkpoint, float("nan") if seconds is None else float(seconds)
 
 
 def evaluate(
