@@ -61,6 +61,10 @@ class _Sight:
     correlation: float
 
 
+# How badly a probe explains the hints, metres; the points that it found; itself; its median correlation.
+_Trial = tuple[float, Array, Probe, float]
+
+
 def spread(scenes: Sequence[Scene], name: str) -> float:
     """Largest distance of a touched place from the middle of its demonstrations' like ones, metres.
 
@@ -81,16 +85,9 @@ def learn_patches(name: str, scenes: Sequence[Scene]) -> PatchModel | None:
     """
     hints = [next(hint for hint in scene.hints if hint.name == name) for scene in scenes]
     groups = _places(hints)
-    place = max(groups, key=len)
-    middle = np.median(np.stack([hint.point_world for hint in place]), axis=0)
-    drops = RELEASE_DROPS_M if place[0].kind == "release" else (0.0,)
-    tried: list[tuple[float, Array, Probe, float]] = []
-    for camera in scenes[0].views:
-        for drop in drops:
-            for radius in RADII_M:
-                result = _try(camera, middle - [0, 0, drop], radius, scenes, hints, groups)
-                if result is not None:
-                    tried.append(result)
+    # Every place that was touched is a candidate for the patches' middle: some lie beside the object.
+    by_place = [_try_all(place, scenes, hints, groups) for place in groups]
+    tried = min(by_place, key=lambda results: min((residual for residual, *_ in results), default=np.inf))
     if not tried:
         return None
     best = min(residual for residual, *_ in tried)
@@ -113,6 +110,21 @@ def learn_patches(name: str, scenes: Sequence[Scene]) -> PatchModel | None:
     )
 
 
+def _try_all(
+    place: Sequence[Hint], scenes: Sequence[Scene], hints: Sequence[Hint], groups: Sequence[Sequence[Hint]]
+) -> list[_Trial]:
+    """Every camera and size of patches around one place."""
+    middle = np.median(np.stack([hint.point_world for hint in place]), axis=0)
+    drops = RELEASE_DROPS_M if place[0].kind == "release" else (0.0,)
+    results = [
+        _try(camera, middle - [0, 0, drop], radius, scenes, hints, groups)
+        for camera in scenes[0].views
+        for drop in drops
+        for radius in RADII_M
+    ]
+    return [one for one in results if one is not None]
+
+
 def _places(hints: Sequence[Hint]) -> list[list[Hint]]:
     """Hints grouped by the place on the object that they touch."""
     groups: dict[tuple[str, str], list[Hint]] = {}
@@ -128,7 +140,7 @@ def _try(
     scenes: Sequence[Scene],
     hints: Sequence[Hint],
     groups: Sequence[Sequence[Hint]],
-) -> tuple[float, Array, Probe, float] | None:
+) -> _Trial | None:
     """Estimate every demonstration's point from others' patches, and compare with where the hand went.
 
     Returns:
