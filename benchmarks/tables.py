@@ -10,6 +10,10 @@ INTRODUCTION = """# Results on the tabletop
 Made by `python benchmarks/tables.py` from `benchmarks/results`; each file there says on what commit and
 machine it was measured. Ten demonstrations a task; seeds from 1000 on, on which nothing was tuned. The ten
 tasks share their scenes seed by seed. Rates come with 95 % Wilson intervals."""
+LIBERO = """# Results on LIBERO-GOAL
+
+From scripted demonstrations of seeded scenes, with LIBERO's two RGB cameras, the robot's state and the
+instruction alone."""
 PAGE = Path(__file__).parent.parent / "docs" / "results.md"
 
 
@@ -21,14 +25,16 @@ def write_page() -> None:
         _part("Object poses from the simulator (oracle)", "oracle", _oracle),
         _part("What the flow model is told, from pixels", "conditioning", _conditioning),
         _part("Error of the object poses on unseen scenes", "perception", _perception),
+        LIBERO,
+        _part("Success from pixels, 50 initial states a task", "libero_goal", _libero, "libero/evaluate.py"),
     ]
     PAGE.write_text("\n\n".join(parts) + "\n")
 
 
-def _part(title: str, name: str, table: Any) -> str:
+def _part(title: str, name: str, table: Any, script: str = "figures.py") -> str:
     path = RESULTS / f"{name}.json"
     if not path.exists():
-        return f"## {title}\n\nNot measured: `{path.name}` is missing; run `make figures`."
+        return f"## {title}\n\nNot measured: `{path.name}` is missing; run `benchmarks/{script}`."
     result = json.loads(path.read_text())
     note = (
         f"Commit `{result['commit']}`, {result['machine']['cores']} cores ({result['machine']['processor']})."
@@ -50,6 +56,17 @@ def _oracle(result: dict[str, Any]) -> str:
 
 def _conditioning(result: dict[str, Any]) -> str:
     return _rates({name: result[name] for name in ("equivariant", "paper")})
+
+
+def _libero(result: dict[str, Any]) -> str:
+    demonstrations = " to ".join(str(n) for n in result["demonstrations"])
+    rows = [
+        [task.replace("_", " "), f"{100 * row['success']:.0f} %", row["n"], row["mean_steps"]]
+        for task, row in result["per_task"].items()
+    ]
+    overall = _rates({f"{demonstrations} demonstrations a task": result})
+    table = _table(["Task", "Success", "Episodes", "Mean steps of successes"], rows)
+    return f"{overall}\n\n{table}\n\n{result['note']}"
 
 
 def _perception(result: dict[str, Any]) -> str:

@@ -13,6 +13,7 @@ import json
 import multiprocessing
 import os
 import sys
+from collections import Counter
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -23,10 +24,14 @@ import numpy as np
 import torch
 from tqdm import tqdm
 
+sys.path.insert(0, str(Path(__file__).parents[1]))
+from common import write
+
 from lerobot_openspm.cli.pipeline import rate
 from lerobot_openspm.control.executor import Execution, Hand
 from lerobot_openspm.envs.libero.simulator import CAMERAS, LiberoSimulator, tasks
 from lerobot_openspm.envs.recording import pose_vector
+from lerobot_openspm.experience import load_experience
 from lerobot_openspm.modeling_openspm import OpenSPMPolicy
 from lerobot_openspm.observation import Observation
 
@@ -46,6 +51,8 @@ class EvaluationConfig:
         processes: Tasks at a time.
         image_size: Pixels; lerobot-eval's default.
         execution: Of the policy; the checkpoint's if not given.
+        result: Name of the file under benchmarks/results to write the rates to; none if not given.
+        note: What a reader of that file has to know, such as stand-ins for assets that were not to be had.
     """
 
     checkpoint: str
@@ -56,6 +63,8 @@ class EvaluationConfig:
     processes: int = 2
     image_size: int = 360
     execution: Execution | None = None
+    result: str | None = None
+    note: str = ""
 
 
 class LazyImages(Mapping[str, torch.Tensor]):
@@ -92,11 +101,34 @@ def main(config: EvaluationConfig) -> dict[str, Any]:
             file.write(json.dumps(episode) + "\n")
             file.flush()
     episodes = [e for e in _read(log) if e["task"] in wanted and e["state"] < config.episodes]
+    result = _summary(config, episodes, wanted)
+    return write(config.result, result) if config.result else result
+
+
+def _summary(config: EvaluationConfig, episodes: list[dict[str, Any]], wanted: list[str]) -> dict[str, Any]:
+    """Rates over all and per task, and how many demonstrations stand behind them."""
+    entries = Counter(entry.language for entry in load_experience(Path(config.checkpoint)).entries)
     own = {task: [e for e in episodes if e["task"] == task] for task in wanted}
     return {
         **rate(sum(e["success"] for e in episodes), len(episodes)),
         "mean_steps": round(float(np.mean([e["steps"] for e in episodes if e["success"]] or [np.nan])), 1),
-        "per_task": {task: [sum(e["success"] for e in es), len(es)] for task, es in own.items()},
+        "demonstrations": sorted(set(entries.values())),
+        "image_size": config.image_size,
+        "states": "tuning seeds" if config.tuning else "evaluation",
+        "note": config.note,
+        "per_task": {
+            task: {
+                "success": sum(e["success"] for e in es) / len(es),
+                "n": len(es),
+                "mean_steps": round(float(np.mean([e["steps"] for e in es if e["success"]] or [np.nan])), 1),
+            }
+            for task, es in own.items()
+        },
+        "failed": [
+            [e["task"], e["state"], e["status"], e["phase"], e["attempts"]]
+            for e in episodes
+            if not e["success"]
+        ],
     }
 
 
