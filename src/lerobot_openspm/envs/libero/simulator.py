@@ -26,7 +26,7 @@ DO_NOTHING = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, -1.0)
 
 def tasks(suite: str = SUITE) -> dict[str, str]:
     """Names of a suite's tasks with their instructions, in LIBERO's order."""
-    from libero.libero import benchmark
+    from libero.libero import benchmark  # pyright: ignore[reportMissingImports]
 
     return {task.name: task.language for task in benchmark.get_benchmark_dict()[suite]().tasks}
 
@@ -46,8 +46,8 @@ class LiberoSimulator:
     ) -> None:
         if task not in tasks(suite):
             raise ValueError(f"{suite} has no task {task!r}, expected one of {', '.join(tasks(suite))}")
-        from libero.libero import get_libero_path
-        from libero.libero.envs.env_wrapper import ControlEnv
+        from libero.libero import get_libero_path  # pyright: ignore[reportMissingImports]
+        from libero.libero.envs.env_wrapper import ControlEnv  # pyright: ignore[reportMissingImports]
 
         self.task, self.instruction = task, tasks(suite)[task]
         self._image_size = image_size
