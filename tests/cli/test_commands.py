@@ -124,7 +124,7 @@ def test_inspecting_what_holds_no_memory_is_one_line(openspm: Openspm, tmp_path:
 
 def test_collecting_into_a_recorded_folder_leaves_it_alone(openspm: Openspm, tiny_dataset: Path):
     before = {path: path.stat().st_mtime_ns for path in tiny_dataset.rglob("*") if path.is_file()}
-    same = ("--env.task=bowl_on_plate,turn_on_stove", "--episodes=3")
+    same = ("--env.task=bowl_on_plate,turn_on_stove", "--episodes=3", "--height=128", "--width=128")
     code, out, _ = openspm("collect", f"--root={tiny_dataset}", *same)
     assert code == 0
     assert "already holds 6 episodes; left alone" in out

@@ -113,7 +113,8 @@ def test_mirrored_images_of_a_mirrored_camera_give_the_same_pose(models, unseen)
         }
         plain, turned = localise(views, models[name]), localise(mirrored, models[name])
         assert turned.status == plain.status == "found"
-        np.testing.assert_allclose(turned.T_world_obj, plain.T_world_obj, atol=2e-3)
+        np.testing.assert_allclose(turned.T_world_obj[:3, 3], plain.T_world_obj[:3, 3], atol=1e-3)
+        np.testing.assert_allclose(turned.T_world_obj[:3, :3], plain.T_world_obj[:3, :3], atol=0.01)
 
 
 def test_covariance_is_positive_and_knows_what_cannot_be_seen(models, unseen):

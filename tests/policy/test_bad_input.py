@@ -122,7 +122,7 @@ def test_a_truncated_memory_is_refused(load: Callable[..., OpenSPMPolicy], copy:
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"version": 2}, "got version 2, this release reads up to 1; upgrade"),
+        ({"version": 3}, "got version 3, this release reads up to 2; upgrade"),
         ({"version": "1"}, "got version '1'"),
         ({"format": "something"}, "got format 'something', expected 'openspm-memory'"),
         ({"entries": {}}, "must be lists"),
