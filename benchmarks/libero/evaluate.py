@@ -2,13 +2,15 @@
 
     python benchmarks/libero/evaluate.py --checkpoint=FOLDER --output=FOLDER
 
-An episode is the one that `lerobot-eval --env.type=libero --env.task=libero_goal --seed=1000` with one
-environment runs: initial state i, seed 1000 + i, ten settling steps, at most 300 steps. Images are rendered
-only when the policy looks at them. Every episode is written down as it ends; a second run does the rest.
+An episode is meant to be the one that `lerobot-eval --env.type=libero --env.task=libero_goal --seed=1000` with
+one environment runs (initial state i, seed 1000 + i, ten settling steps, at most 300 steps); the two have not
+been compared action by action yet. Images are rendered only when the policy looks at them. Every episode is
+written down as it ends; a second run does the rest.
 """
 
 from __future__ import annotations
 
+import hashlib
 import json
 import multiprocessing
 import os
@@ -32,6 +34,7 @@ from lerobot_openspm.control.executor import Execution, Hand
 from lerobot_openspm.envs.libero.simulator import CAMERAS, LiberoSimulator, tasks
 from lerobot_openspm.envs.recording import pose_vector
 from lerobot_openspm.experience import load_experience
+from lerobot_openspm.files import write_json
 from lerobot_openspm.modeling_openspm import OpenSPMPolicy
 from lerobot_openspm.observation import Observation
 
@@ -92,6 +95,7 @@ def main(config: EvaluationConfig) -> dict[str, Any]:
     output = Path(config.output)
     output.mkdir(parents=True, exist_ok=True)
     log = output / "episodes.jsonl"
+    _refuse_others(config, output)
     wanted = list(tasks()) if config.task == "all" else config.task.split(",")
     done = {(e["task"], e["state"]) for e in _read(log)}
     jobs = [(config, task, i) for task in wanted for i in range(config.episodes) if (task, i) not in done]
@@ -103,6 +107,25 @@ def main(config: EvaluationConfig) -> dict[str, Any]:
     episodes = [e for e in _read(log) if e["task"] in wanted and e["state"] < config.episodes]
     result = _summary(config, episodes, wanted)
     return write(config.result, result) if config.result else result
+
+
+def _refuse_others(config: EvaluationConfig, output: Path) -> None:
+    """Keep episodes of different policies or settings apart.
+
+    Raises:
+        FileExistsError: The folder holds episodes of something else.
+    """
+    files = [Path(config.checkpoint) / name for name in ("model.safetensors", "memory.json")]
+    made_of = {
+        "policy": [hashlib.sha256(file.read_bytes()).hexdigest() for file in files],
+        **{key: getattr(config, key) for key in ("tuning", "image_size", "execution")},
+    }
+    kept = output / "made_of.json"
+    if kept.exists() and json.loads(kept.read_text()) != made_of:
+        raise FileExistsError(
+            f"{output} holds episodes of another policy or settings; choose another --output"
+        )
+    write_json(kept, made_of)
 
 
 def _summary(config: EvaluationConfig, episodes: list[dict[str, Any]], wanted: list[str]) -> dict[str, Any]:

@@ -94,9 +94,12 @@ class Recorder:
 
 
 def pose_vector(poses: Mapping[str, np.ndarray]) -> np.ndarray:
-    """Position and quat_wxyz of every object, in their order, (7 * n,)."""
-    quats = {name: np.roll(Rotation.from_matrix(T[:3, :3]).as_quat(), 1) for name, T in poses.items()}
-    return np.concatenate([np.append(T[:3, 3], quats[name]) for name, T in poses.items()])
+    """Position (m) and quat_wxyz (w >= 0) of every object's ``T_world_obj``, in their order, (7 * n,)."""
+    parts = []
+    for T_world_obj in poses.values():
+        x, y, z, w = Rotation.from_matrix(T_world_obj[:3, :3]).as_quat(canonical=True)
+        parts.append([*T_world_obj[:3, 3], w, x, y, z])
+    return np.concatenate(parts)
 
 
 def pose_names(objects: Sequence[str]) -> list[str]:

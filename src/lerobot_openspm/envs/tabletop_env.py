@@ -10,6 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from lerobot_openspm.envs import scene
 from lerobot_openspm.envs.layout import sample_layout
+from lerobot_openspm.envs.recording import pose_names, pose_vector
 from lerobot_openspm.envs.simulator import TabletopSimulator
 from lerobot_openspm.envs.tasks import TASKS, select_tasks
 
@@ -23,9 +24,7 @@ ACTION_NAMES = (
     "delta_axis_angle_z",
     "gripper",
 )
-OBJECT_POSE_NAMES = tuple(
-    f"{n}.{c}" for n in scene.OBJECT_NAMES for c in ("x", "y", "z", "qw", "qx", "qy", "qz")
-)
+OBJECT_POSE_NAMES = tuple(pose_names(scene.OBJECT_NAMES))
 SUCCESS_HOLD_STEPS = 5
 MIN_IMAGE_SIZE, MAX_IMAGE_SIZE = 128, 256
 RENDER_SIZE = 256
@@ -181,11 +180,7 @@ class TabletopEnv(gym.Env):
 
     def object_pose_vector(self) -> np.ndarray:
         """(49,) float32, as in `OBJECT_POSE_NAMES`: position (m) and quat_wxyz (w >= 0) per object."""
-        parts = []
-        for pose in self.object_poses().values():
-            x, y, z, w = Rotation.from_matrix(pose[:3, :3]).as_quat(canonical=True)
-            parts.append([*pose[:3, 3], w, x, y, z])
-        return np.concatenate(parts).astype(np.float32)
+        return pose_vector(self.object_poses()).astype(np.float32)
 
     def render(self) -> np.ndarray:
         """The front view, 256 x 256 RGB."""

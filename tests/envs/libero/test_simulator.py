@@ -66,12 +66,12 @@ def test_the_calibration_file_is_the_simulators():
 def test_objects_are_seen_where_the_calibration_puts_them(simulator, size):
     camera = load_cameras(CALIBRATION)["observation.images.image"].scaled(size, size)
     middle = simulator.body_pose("akita_black_bowl_1_main")[:3, 3] + [0.0, 0.0, 0.03]
-    before = _render(simulator, size)
+    before = simulator.render("image", size)
     state = simulator.sim.get_state()
     # To where no camera looks. The bowl is black and the table is light.
     simulator.sim.data.qpos[simulator.sim.model.get_joint_qpos_addr("akita_black_bowl_1_joint0")[0]] = 100.0
     simulator.sim.forward()
-    after = _render(simulator, size)
+    after = simulator.render("image", size)
     simulator.sim.set_state(state)
     simulator.sim.forward()
     v, u = np.nonzero((after.astype(int) - before).min(axis=-1) > 60)
@@ -80,9 +80,18 @@ def test_objects_are_seen_where_the_calibration_puts_them(simulator, size):
     np.testing.assert_allclose(uv, seen, atol=3 * size / 256)
 
 
-def _render(simulator, size):
-    """The agent camera's image, turned as LeRobot turns it."""
-    return simulator.sim.render(camera_name="agentview", width=size, height=size)[::-1, ::-1]
+def test_two_simulators_draw_their_own_scenes(simulator):
+    from lerobot_openspm.envs.libero.simulator import LiberoSimulator
+
+    before = simulator.render("image", 128)
+    other = LiberoSimulator("open_the_middle_drawer_of_the_cabinet", 128, render_steps=False)
+    other.reset(TUNING_SEED_START + 3)
+    theirs = other.image("image")
+    np.testing.assert_array_equal(simulator.render("image", 128), before)
+    np.testing.assert_array_equal(other.image("image"), theirs)
+    assert np.abs(theirs.astype(int) - before).max() > 60
+    other.close()
+    np.testing.assert_array_equal(simulator.render("image", 128), before)
 
 
 def test_demonstrations_never_start_from_an_evaluation_state(simulator):

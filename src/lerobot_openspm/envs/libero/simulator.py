@@ -24,11 +24,11 @@ SETTLING_STEPS = 10
 DO_NOTHING = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, -1.0)
 
 
-def tasks(suite: str = SUITE) -> dict[str, str]:
-    """Names of a suite's tasks with their instructions, in LIBERO's order."""
+def tasks() -> dict[str, str]:
+    """Names of the suite's tasks with their instructions, in LIBERO's order."""
     from libero.libero import benchmark  # pyright: ignore[reportMissingImports]
 
-    return {task.name: task.language for task in benchmark.get_benchmark_dict()[suite]().tasks}
+    return {task.name: task.language for task in benchmark.get_benchmark_dict()[SUITE]().tasks}
 
 
 class LiberoSimulator:
@@ -38,22 +38,19 @@ class LiberoSimulator:
         task: A name in :func:`tasks`.
         image_size: Height and width of the images in pixels; None renders nothing, which is far faster.
         render_steps: Whether every step renders, as in LIBERO; else images are made when asked for.
-        suite: The suite that the task belongs to.
     """
 
-    def __init__(
-        self, task: str, image_size: int | None = None, render_steps: bool = True, suite: str = SUITE
-    ) -> None:
-        if task not in tasks(suite):
-            raise ValueError(f"{suite} has no task {task!r}, expected one of {', '.join(tasks(suite))}")
+    def __init__(self, task: str, image_size: int | None = None, render_steps: bool = True) -> None:
+        if task not in tasks():
+            raise ValueError(f"{SUITE} has no task {task!r}, expected one of {', '.join(tasks())}")
         from libero.libero import get_libero_path  # pyright: ignore[reportMissingImports]
         from libero.libero.envs.env_wrapper import ControlEnv  # pyright: ignore[reportMissingImports]
 
-        self.task, self.instruction = task, tasks(suite)[task]
+        self.task, self.instruction = task, tasks()[task]
         self._image_size = image_size
         self._render_steps = image_size is not None and render_steps
         self._env: Any = ControlEnv(
-            bddl_file_name=os.fspath(Path(get_libero_path("bddl_files")) / suite / f"{task}.bddl"),
+            bddl_file_name=os.fspath(Path(get_libero_path("bddl_files")) / SUITE / f"{task}.bddl"),
             use_camera_obs=self._render_steps,
             has_offscreen_renderer=image_size is not None,
             camera_heights=image_size or 1,
@@ -88,6 +85,8 @@ class LiberoSimulator:
 
     def step(self, action: np.ndarray) -> bool:
         """Apply a 7-D action for one step of 20 Hz. Returns whether LIBERO's goal holds now."""
+        if self._render_steps:
+            self._draw_here()
         self._observation, _, _, _ = self._env.step(action)
         return bool(self._env.check_success())
 
@@ -124,13 +123,18 @@ class LiberoSimulator:
         """One camera's image (H, W, 3) uint8, turned as LeRobot turns it."""
         if self._image_size is None:
             raise ValueError("this simulator was made without images; pass image_size")
-        camera, size = CAMERAS[name], self._image_size
-        raw = (
-            self._observation[f"{camera}_image"]
-            if self._render_steps
-            else self.sim.render(camera_name=camera, width=size, height=size)
-        )
-        return np.ascontiguousarray(raw[::-1, ::-1])
+        if self._render_steps:
+            return _turned(self._observation[f"{CAMERAS[name]}_image"])
+        return self.render(name, self._image_size)
+
+    def render(self, name: str, size: int) -> np.ndarray:
+        """One camera's image of the present scene (size, size, 3) uint8, turned as LeRobot turns it."""
+        self._draw_here()
+        return _turned(self.sim.render(camera_name=CAMERAS[name], width=size, height=size))
+
+    def _draw_here(self) -> None:
+        # OpenGL draws into the context made last, which is another simulator's where there are several.
+        self.sim._render_context_offscreen.gl_ctx.make_current()
 
     def object_poses(self) -> dict[str, np.ndarray]:
         """True ``T_world_obj`` (4, 4) of all `OBJECTS`."""
@@ -152,6 +156,10 @@ class LiberoSimulator:
     def close(self) -> None:
         """Free the simulator."""
         self._env.close()
+
+
+def _turned(image: np.ndarray) -> np.ndarray:
+    return np.ascontiguousarray(image[::-1, ::-1])
 
 
 def _short(name: str) -> str:

@@ -1,0 +1,27 @@
+"""Known objects made of random numbers, for tests of what is done with them."""
+
+import numpy as np
+
+from lerobot_openspm.geometry import se3
+from lerobot_openspm.geometry.camera import Camera
+from lerobot_openspm.perception.colour import N_BINS
+from lerobot_openspm.perception.model import ObjectModel, Patch, PatchModel, Probe
+
+
+def model(name, seed=0, yaw_period=2 * np.pi):
+    rng = np.random.default_rng(seed)
+    return ObjectModel(
+        name, rng.normal(size=N_BINS).astype(np.float32), rng.normal(size=(9, 3)).astype(np.float32),
+        0.005, 0.01, yaw_period, 0.1, 0.2, 0.9,
+    )  # fmt: skip
+
+
+def patch_model(name):
+    rng = np.random.default_rng(5)
+    T = se3.from_yaw([0.1, 0.2, 0.3], 0.4)
+    camera = Camera(64, 48, -50.0, 50.0, 31.5, 23.5, "world", T)
+    patches = tuple(
+        Patch(rng.integers(0, 255, (9, 8, 3)).astype(np.uint8), np.array([3.0, 4.0]), np.array([0.0, i, 1.0]))
+        for i in range(2)
+    )
+    return PatchModel(name, (Probe("observation.images.front", camera, T, patches, 0.001),), 1.0, 0.9)
