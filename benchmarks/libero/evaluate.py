@@ -2,10 +2,10 @@
 
     python benchmarks/libero/evaluate.py --checkpoint=FOLDER --output=FOLDER
 
-An episode is meant to be the one of `lerobot-eval --env.type=libero --env.task=libero_goal --seed=1000` with one
-environment (initial state i, seed 1000 + i, ten settling steps, at most 300 steps); the two have not been
-compared action by action yet. Images are rendered only when the policy looks at them. Every episode is written
-down as it ends; a second run does the rest.
+An episode is meant to be the one of `lerobot-eval --env.type=libero --env.task=libero_goal --seed=1000`
+with one environment (initial state i, seed 1000 + i, ten settling steps, at most 300 steps); the two have not
+been compared action by action yet. Images are rendered only when the policy looks at them. Every episode is
+written down as it ends; a second run does the rest.
 """
 
 from __future__ import annotations
