@@ -31,7 +31,7 @@ demo: egl ## collect DEMOS demonstrations, train, evaluate EPISODES episodes; th
 	@$(BIN)/openspm demo --demos=$(DEMOS) --episodes=$(EPISODES) --started_at=$(STARTED_AT)
 
 figures: egl ## measure the published figures into benchmarks/results; the last line is JSON
-	@$(BIN)/python benchmarks/figures.py
+	@$(BIN)/python -m benchmarks.figures
 
 test: egl ## run the tests, without those marked slow, libero or gpu (PYTEST_ARGS=... adds arguments)
 	@$(BIN)/python -m pytest -n 2 $(PYTEST_ARGS)

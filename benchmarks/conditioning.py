@@ -1,6 +1,6 @@
 """The flow model told the poses in the world, as in the paper, against those in the frame of the target."""
 
-from common import EVALUATION_SEED, evaluation, policy, success, write
+from benchmarks.common import EVALUATION_SEED, evaluation, policy, success, write
 
 
 def main() -> dict:

@@ -1,6 +1,6 @@
 """Success from pixels of the three ways to follow key poses, on the same policy and the same episodes."""
 
-from common import EVALUATION_SEED, dataset, evaluation, policy, success, write
+from benchmarks.common import EVALUATION_SEED, dataset, evaluation, policy, success, write
 
 from lerobot_openspm.cli.pipeline import collect_dataset
 

@@ -3,12 +3,7 @@
 import json
 import logging
 
-import conditioning
-import execution
-import oracle
-import tables
-
-import perception
+from benchmarks import conditioning, execution, oracle, perception, tables
 
 
 def main() -> None:

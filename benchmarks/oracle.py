@@ -1,6 +1,6 @@
 """Success with the simulator's object poses in place of perception: what is lost to perception (oracle)."""
 
-from common import EVALUATION_SEED, evaluation, policy, success, write
+from benchmarks.common import EVALUATION_SEED, evaluation, policy, success, write
 
 
 def main() -> dict:

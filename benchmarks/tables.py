@@ -7,7 +7,7 @@ from typing import Any
 RESULTS = Path(__file__).parent / "results"
 INTRODUCTION = """# Results on the tabletop
 
-Made by `python benchmarks/tables.py` from `benchmarks/results`; each file there says on what commit and
+Made by `python -m benchmarks.tables` from `benchmarks/results`; each file there says on what commit and
 machine it was measured. Ten demonstrations a task; seeds from 1000 on. They were measured once before, at an
 earlier commit; in between the rack's shape was mended, judged on scenes of other seeds. The ten tasks share
 their scenes seed by seed. Rates come with 95 % Wilson intervals."""
@@ -27,15 +27,15 @@ def write_page() -> None:
         _part("What the flow model is told, from pixels", "conditioning", _conditioning),
         _part("Error of the object poses on unseen scenes", "perception", _perception),
         LIBERO,
-        _part("Success from pixels, 50 initial states a task", "libero_goal", _libero, "libero/evaluate.py"),
+        _part("Success from pixels, 50 initial states a task", "libero_goal", _libero, "libero.run"),
     ]
     PAGE.write_text("\n\n".join(parts) + "\n")
 
 
-def _part(title: str, name: str, table: Any, script: str = "figures.py") -> str:
+def _part(title: str, name: str, table: Any, script: str = "figures") -> str:
     path = RESULTS / f"{name}.json"
     if not path.exists():
-        return f"## {title}\n\nNot measured: `{path.name}` is missing; run `benchmarks/{script}`."
+        return f"## {title}\n\nNot measured: `{path.name}` is missing; run `python -m benchmarks.{script}`."
     result = json.loads(path.read_text())
     note = (
         f"Commit `{result['commit']}`, {result['machine']['cores']} cores ({result['machine']['processor']})."

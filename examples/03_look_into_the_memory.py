@@ -49,7 +49,7 @@ def main() -> None:
         config.transfer_limits, config.control_settings,
     )  # fmt: skip
     row = Row(knowledge, options.instruction, observation.fingerprint(), noise_seed=0)
-    row.observe(observation.hand, lambda names: find_objects(names, observation, experience))
+    row.observe(observation.hand, lambda names, _: find_objects(names, observation, experience))
 
     print(f"{options.instruction!r}: {row.status.name.lower()}")
     for name, T_world_obj in row.layout.items():

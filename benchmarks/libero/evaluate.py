@@ -1,11 +1,10 @@
 """Evaluate a checkpoint on libero_goal's 50 initial states a task, resumably and without needless rendering.
 
-    python benchmarks/libero/evaluate.py --checkpoint=FOLDER --output=FOLDER
+    python -m benchmarks.libero.evaluate --checkpoint=FOLDER --output=FOLDER
 
-An episode is meant to be the one of `lerobot-eval --env.type=libero --env.task=libero_goal --seed=1000`
-with one environment (initial state i, seed 1000 + i, ten settling steps, at most 300 steps); the two have not
-been compared action by action yet. Images are rendered only when the policy looks at them. Every episode is
-written down as it ends; a second run does the rest.
+An episode is the one of `lerobot-eval --env.type=libero --env.task=libero_goal --seed=1000` with one
+environment: initial state i, seed 1000 + i, ten settling steps, at most 300 steps. `equality.py` compares the
+two action by action. Every episode is written down as it ends; a second run does the rest.
 """
 
 from __future__ import annotations
@@ -15,8 +14,6 @@ import json
 import multiprocessing
 import os
 import sys
-from collections import Counter
-from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -24,21 +21,20 @@ from typing import Any
 import draccus
 import numpy as np
 import torch
+from benchmarks.libero.episode import Episode, initial_states, run_episode
 from tqdm import tqdm
 
-sys.path.insert(0, str(Path(__file__).parents[1]))
-from common import write
-
 from lerobot_openspm.cli.pipeline import rate
-from lerobot_openspm.control.executor import Execution, Hand
-from lerobot_openspm.envs.libero.simulator import CAMERAS, LiberoSimulator, tasks
-from lerobot_openspm.envs.recording import pose_vector
-from lerobot_openspm.experience import load_experience
+from lerobot_openspm.control.executor import Execution
+from lerobot_openspm.envs.libero.simulator import LiberoSimulator, tasks
+from lerobot_openspm.envs.seeds import TUNING_SEED_START
 from lerobot_openspm.files import write_json
+from lerobot_openspm.geometry import se3
 from lerobot_openspm.modeling_openspm import OpenSPMPolicy
-from lerobot_openspm.observation import Observation
 
-SEED, MAX_STEPS = 1000, 300
+SEED = 1000
+# Tuning scenes of the benchmark, apart from those that tests use.
+TUNING_SEED = TUNING_SEED_START + 100_000
 
 
 @dataclass
@@ -51,11 +47,9 @@ class EvaluationConfig:
         task: A task's name, several with commas, or "all".
         episodes: Initial states a task, from the first on.
         tuning: Draw as many scenes from tuning seeds instead of taking the benchmark's initial states.
-        processes: Tasks at a time.
+        processes: Episodes at a time.
         image_size: Pixels; lerobot-eval's default.
         execution: Of the policy; the checkpoint's if not given.
-        result: Name of the file under benchmarks/results to write the rates to; none if not given.
-        note: What a reader of that file has to know, such as stand-ins for assets that were not to be had.
     """
 
     checkpoint: str
@@ -66,47 +60,27 @@ class EvaluationConfig:
     processes: int = 2
     image_size: int = 360
     execution: Execution | None = None
-    result: str | None = None
-    note: str = ""
 
 
-class LazyImages(Mapping[str, torch.Tensor]):
-    """The present images by LeRobot's names, rendered when one is asked for."""
-
-    def __init__(self, simulator: LiberoSimulator) -> None:
-        self._simulator = simulator
-        self._made: dict[str, torch.Tensor] = {}
-
-    def __getitem__(self, key: str) -> torch.Tensor:
-        if key not in self._made:
-            image = torch.from_numpy(self._simulator.image(key.removeprefix("observation.images.")))
-            self._made[key] = image.permute(2, 0, 1).contiguous().float() / 255
-        return self._made[key]
-
-    def __iter__(self) -> Iterator[str]:
-        return iter([f"observation.images.{name}" for name in CAMERAS])
-
-    def __len__(self) -> int:
-        return len(CAMERAS)
-
-
-def main(config: EvaluationConfig) -> dict[str, Any]:
-    """Evaluate what is missing, and return the rates."""
+def evaluate(config: EvaluationConfig) -> list[dict[str, Any]]:
+    """Run the episodes that are missing, and return all of them."""
     output = Path(config.output)
     output.mkdir(parents=True, exist_ok=True)
     log = output / "episodes.jsonl"
     _refuse_others(config, output)
     wanted = list(tasks()) if config.task == "all" else config.task.split(",")
+    if unknown := [task for task in wanted if task not in tasks()]:
+        raise ValueError(f"libero_goal has no tasks {unknown}, expected some of {', '.join(tasks())}")
     done = {(e["task"], e["state"]) for e in _read(log)}
     jobs = [(config, task, i) for task in wanted for i in range(config.episodes) if (task, i) not in done]
     context = multiprocessing.get_context("spawn")
     with context.Pool(config.processes) as pool, log.open("a") as file:
-        for episode in tqdm(pool.imap_unordered(evaluate_one, jobs), total=len(jobs), unit="episode"):
+        for episode in tqdm(
+            pool.imap_unordered(evaluate_one, jobs), total=len(jobs), unit="episode", disable=not jobs
+        ):
             file.write(json.dumps(episode) + "\n")
             file.flush()
-    episodes = [e for e in _read(log) if e["task"] in wanted and e["state"] < config.episodes]
-    result = _summary(config, episodes, wanted)
-    return write(config.result, result) if config.result else result
+    return [e for e in _read(log) if e["task"] in wanted and e["state"] < config.episodes]
 
 
 def _refuse_others(config: EvaluationConfig, output: Path) -> None:
@@ -115,7 +89,8 @@ def _refuse_others(config: EvaluationConfig, output: Path) -> None:
     Raises:
         FileExistsError: The folder holds episodes of something else.
     """
-    files = [Path(config.checkpoint) / name for name in ("model.safetensors", "memory.json")]
+    names = ("model.safetensors", "memory.json", "config.json")
+    files = [Path(config.checkpoint) / name for name in names]
     made_of = {
         "policy": [hashlib.sha256(file.read_bytes()).hexdigest() for file in files],
         **{key: getattr(config, key) for key in ("tuning", "image_size", "execution")},
@@ -128,23 +103,17 @@ def _refuse_others(config: EvaluationConfig, output: Path) -> None:
     write_json(kept, made_of)
 
 
-def _summary(config: EvaluationConfig, episodes: list[dict[str, Any]], wanted: list[str]) -> dict[str, Any]:
-    """Rates over all and per task, and how many demonstrations stand behind them."""
-    entries = Counter(entry.language for entry in load_experience(Path(config.checkpoint)).entries)
-    own = {task: [e for e in episodes if e["task"] == task] for task in wanted}
+def summary(episodes: list[dict[str, Any]]) -> dict[str, Any]:
+    """Rates over all episodes and per task, and which of them failed."""
+    names = dict.fromkeys(e["task"] for e in episodes)
+    own = {
+        task: [e for e in episodes if e["task"] == task] for task in sorted(names, key=list(tasks()).index)
+    }
     return {
         **rate(sum(e["success"] for e in episodes), len(episodes)),
-        "mean_steps": round(float(np.mean([e["steps"] for e in episodes if e["success"]] or [np.nan])), 1),
-        "demonstrations": sorted(set(entries.values())),
-        "image_size": config.image_size,
-        "states": "tuning seeds" if config.tuning else "evaluation",
-        "note": config.note,
+        "mean_steps": mean_steps(episodes),
         "per_task": {
-            task: {
-                "success": sum(e["success"] for e in es) / len(es),
-                "n": len(es),
-                "mean_steps": round(float(np.mean([e["steps"] for e in es if e["success"]] or [np.nan])), 1),
-            }
+            task: {**rate(sum(e["success"] for e in es), len(es)), "mean_steps": mean_steps(es)}
             for task, es in own.items()
         },
         "failed": [
@@ -155,41 +124,42 @@ def _summary(config: EvaluationConfig, episodes: list[dict[str, Any]], wanted: l
     }
 
 
+def mean_steps(episodes: list[dict[str, Any]]) -> float | None:
+    """Mean steps of the successes; None if there is none."""
+    steps = [e["steps"] for e in episodes if e["success"]]
+    return round(float(np.mean(steps)), 1) if steps else None
+
+
 def evaluate_one(job: tuple[EvaluationConfig, str, int]) -> dict[str, Any]:
     """Run one episode, with a policy and a simulator kept by the process."""
     config, task, state = job
     policy, simulator = _policy(config), _simulator(task, config.image_size)
     if config.tuning:
-        from lerobot_openspm.envs.seeds import TUNING_SEED_START
-
-        simulator.reset(TUNING_SEED_START + 100_000 + state)
+        simulator.reset(TUNING_SEED + state)
     else:
-        simulator.reset_to(SEED + state, _initial_states(task)[state])
-    policy.reset()
-    state_layout = policy.config.layouts()[0]
-    success, steps = False, 0
-    while not success and steps < MAX_STEPS:
-        vector = simulator.state().astype(float)
-        hand = Hand(state_layout.poses(vector), float(state_layout.openings(vector)))
-        poses = pose_vector(simulator.object_poses()) if policy.config.perception == "oracle" else None
-        with torch.inference_mode():
-            action = policy.act(
-                [Observation(simulator.instruction, vector, hand, LazyImages(simulator), poses)]
-            )[0]
-        success = simulator.step(np.clip(action, -1.0, 1.0))
-        steps += 1
-    row = policy._rows[0]
+        simulator.reset_to(SEED + state, initial_states(task)[state])
+    return {"task": task, "state": state, **_told(run_episode(policy, simulator))}
+
+
+def _told(episode: Episode) -> dict[str, Any]:
+    """An episode as a line of JSON."""
+    executor, ranked = episode.row.executor, episode.row.ranked
     return {
-        "task": task,
-        "state": state,
-        "steps": steps,
-        "success": success,
-        "status": str(row.status),
-        "key_pose": row.executor.index,
-        "phase": row.executor.plan[row.executor.index].memory.phase if row.executor.plan else None,
-        "attempts": row.executor.attempts,
-        "entry": row.ranked[0].entry.source if row.ranked else None,
+        "steps": len(episode.actions),
+        "success": episode.success,
+        "status": str(episode.row.status),
+        "key_pose": executor.index,
+        "phase": executor.plan[executor.index].memory.phase if executor.plan else None,
+        "attempts": executor.attempts,
+        "entry": ranked[0].entry.source if ranked else None,
+        "seen": {name: _place(T) for name, T in episode.seen.items()},
+        "true": {name: _place(T) for name, T in episode.true.items()},
     }
+
+
+def _place(T_world_obj: np.ndarray) -> list[float]:
+    """Position in metres and yaw in radians."""
+    return [round(float(x), 5) for x in (*T_world_obj[:3, 3], se3.yaw_of(T_world_obj))]
 
 
 _KEPT: dict[str, Any] = {}
@@ -212,17 +182,10 @@ def _simulator(task: str, image_size: int) -> LiberoSimulator:
     return _KEPT["simulator"]
 
 
-def _initial_states(task: str) -> np.ndarray:
-    from lerobot.envs.libero import _get_suite, get_task_init_states
-
-    suite = _get_suite("libero_goal")
-    return np.asarray(get_task_init_states(suite, [one.name for one in suite.tasks].index(task)))
-
-
 def _read(log: Path) -> list[dict[str, Any]]:
     return [json.loads(line) for line in log.read_text().splitlines()] if log.exists() else []
 
 
 if __name__ == "__main__":
     os.environ.setdefault("MUJOCO_GL", "egl")
-    print(json.dumps(main(draccus.parse(EvaluationConfig, args=sys.argv[1:]))))
+    print(json.dumps(summary(evaluate(draccus.parse(EvaluationConfig, args=sys.argv[1:])))))

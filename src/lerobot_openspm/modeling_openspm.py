@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -83,12 +84,12 @@ class OpenSPMPolicy(PreTrainedPolicy):
         self.eval()
         actions = []
         for row, observation in self._observe(observations):
-            action = row.next_action()
+            action = row.next_action(observation.hand)
             if action is None:
                 row.executor.push_chunk(
                     self._chunk(row, row.query(observation.hand))[: self.config.n_action_steps]
                 )
-                action = row.next_action()
+                action = row.next_action(observation.hand)
             actions.append(action)
         return np.stack(actions)
 
@@ -98,12 +99,13 @@ class OpenSPMPolicy(PreTrainedPolicy):
         self.eval()
         chunks = []
         for row, observation in self._observe(split_batch(batch, self.config.layouts()[0])):
-            chunk = np.tile(row.executor.hold(), (self.config.chunk_size, 1))
-            if row.executor.target is not None:
-                chunk = self._chunk(row, row.query(observation.hand))
-                row.executor.push_chunk(chunk)
-                while row.next_action() is not None:  # count them as done
-                    pass
+            chunk = []
+            while len(chunk) < self.config.chunk_size:
+                action = row.next_action(observation.hand)  # counts it as done
+                if action is None:
+                    row.executor.push_chunk(self._chunk(row, row.query(observation.hand)))
+                else:
+                    chunk.append(action)
             chunks.append(chunk)
         return self._encode(np.stack(chunks))
 
@@ -111,7 +113,7 @@ class OpenSPMPolicy(PreTrainedPolicy):
         """Each environment's state, brought up to its observation."""
         pairs = list(zip(self._rows_of(observations), observations, strict=True))
         for row, observation in pairs:
-            row.observe(observation.hand, lambda names, seen=observation: self._find(names, seen))
+            row.observe(observation.hand, partial(self._find, observation))
         return pairs
 
     def _encode(self, actions: np.ndarray) -> Tensor:
@@ -137,8 +139,10 @@ class OpenSPMPolicy(PreTrainedPolicy):
         )  # fmt: skip
         return Row(knowledge, observation.instruction, observation.fingerprint(), config.noise_seed)
 
-    def _find(self, names: Sequence[str], observation: Observation) -> Mapping[str, np.ndarray]:
-        return find_objects(names, observation, self._require_experience())
+    def _find(
+        self, observation: Observation, names: Sequence[str], min_confidence: float
+    ) -> Mapping[str, np.ndarray]:
+        return find_objects(names, observation, self._require_experience(), min_confidence)
 
     def _chunk(self, row: Row, query: Query) -> np.ndarray:
         """Generate one chunk ``(chunk_size, 7)`` in the world. Rows go one by one, so batches act alike."""

@@ -2,6 +2,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 from tests.memory.builders import OPEN_WIDTH, entry, hand_pose, key_pose, robot
 
@@ -67,10 +69,10 @@ def run(executor, world, n_steps=600, until=lambda _: False, flow=toward):
             if executor.status is Status.DONE:
                 left[executor.index] = world.T
             break
-        action = executor.next_action()
+        action = executor.next_action(world.hand)
         if action is None:
             executor.push_chunk(flow(executor.query(world.hand)))
-            action = executor.next_action()
+            action = executor.next_action(world.hand)
         steps_at[executor.index] = steps_at.get(executor.index, 0) + 1
         world.step(action)
     return left, retries, steps_at
@@ -102,6 +104,28 @@ def test_waiting_for_the_fingers_takes_the_demonstrated_steps():
     for i, target in enumerate(executor.plan):
         if target.memory.dwell:
             assert steps_at[i] == target.memory.n_steps
+
+
+@pytest.mark.parametrize("settings", [ControlSettings(), ControlSettings(execution="open_loop")])
+def test_a_hand_that_drifts_while_the_fingers_close_is_brought_back(settings):
+    executor, world = make(settings), World()
+    run(executor, world, until=lambda e: e.plan[e.index].memory.dwell)
+    target = executor.plan[executor.index]
+    drift = np.array([0.012, -0.008, 0.005, 0.0, 0.0, 0.05])
+    world.T = se3.apply_increment(target.T_world_ee, drift)
+    actions = []
+    for _ in range(target.memory.n_steps):
+        actions.append(executor.next_action(world.hand))
+        world.step(actions[-1])
+    assert_allclose(np.array(actions)[:, 6], ROBOT.command(target.memory.closed))
+    if settings.execution == "open_loop":  # it cannot know
+        assert float(se3.distances(world.T, target.T_world_ee)[0]) > 0.01
+        return
+    # Each of the ten steps makes good a fifth.
+    metres, radians = se3.distances(world.T, target.T_world_ee)
+    assert target.memory.n_steps >= 8
+    assert metres < 0.2 * np.linalg.norm(drift[:3])
+    assert radians < 0.2 * np.linalg.norm(drift[3:])
 
 
 def test_via_points_are_passed_without_stopping_short():
@@ -144,6 +168,27 @@ def test_residual_correction_reaches_what_time_alone_does_not():
     assert error(left_with, corrected) <= ControlSettings().residual_m < error(left_without, without)
 
 
+def test_a_correction_contracts_the_error_whatever_the_flow_model_says():
+    executor, world = make(), World()
+    still = lambda query: np.zeros((CHUNK, 7))  # noqa: E731
+    start = float(se3.distance(HOME, executor.plan[0].T_world_ee))
+    left, retries, _ = run(executor, world, flow=still)
+    assert executor.status is Status.DONE
+    assert retries == 0
+    assert float(se3.distances(left[0], executor.plan[0].T_world_ee)[0]) <= 0.015 < start
+
+
+@given(st.lists(st.floats(-0.3, 0.3), min_size=6, max_size=6))
+def test_a_corrective_action_points_straight_at_the_key_pose_and_is_bounded(offset):
+    executor = make(key_poses=[key_pose("bowl", np.eye(4), "place")])
+    T = se3.apply_increment(executor.plan[0].T_world_ee, np.array(offset))
+    action = executor._toward(Hand(T, OPEN_WIDTH))
+    residual = se3.increment(T, executor.plan[0].T_world_ee) / GAINS
+    assert np.abs(action[:6]).max() <= 1 + 1e-12
+    assert float(action[:6] @ residual) >= 0
+    assert_allclose(np.outer(action[:6], residual), np.outer(residual, action[:6]), atol=1e-6)
+
+
 def blocked_at_the_bowl(executor):
     height = executor.plan[1].T_world_ee[2, 3]
     return lambda T: bool(T[2, 3] < height + 0.02)
@@ -157,7 +202,7 @@ def test_what_cannot_be_met_is_corrected_then_tried_again_then_given_up():
     assert executor.status is Status.NO_PROGRESS
     assert retries == 2
     assert executor.attempts == 3
-    assert executor.next_action()[:6].tolist() == [0.0] * 6
+    assert executor.next_action(world.hand)[:6].tolist() == [0.0] * 6
 
 
 def test_corrections_are_counted_once_time_is_up_and_forgotten_at_the_next_key_pose():
@@ -269,29 +314,29 @@ def test_non_finite_actions_never_reach_the_robot(value):
     chunk[3, 2] = value
     with pytest.raises(OpenSPMError, match="not finite"):
         executor.push_chunk(chunk)
-    assert executor.next_action() is None
+    assert executor.next_action(Hand(HOME, OPEN_WIDTH)) is None
 
 
 def test_actions_left_over_are_dropped_at_the_next_key_pose():
     executor = make()
     executor.push_chunk(np.ones((CHUNK, 7)))
-    executor.next_action()
+    executor.next_action(Hand(HOME, OPEN_WIDTH))
     executor.advance(Hand(executor.plan[0].T_world_ee, OPEN_WIDTH))
     assert executor.index == 1
-    assert executor.next_action() is None
+    assert executor.next_action(Hand(HOME, OPEN_WIDTH)) is None
 
 
 def test_holding_still_keeps_the_fingers_as_they_are():
     executor = Executor(ControlSettings(), ROBOT)
     assert executor.hold().tolist() == [0] * 6 + [ROBOT.open_command]
-    assert executor.next_action().tolist() == [0] * 6 + [ROBOT.open_command]
+    assert executor.next_action(Hand(HOME, OPEN_WIDTH)).tolist() == [0] * 6 + [ROBOT.open_command]
     carrying = make()
     carrying.begin(carrying.plan, Hand(HOME, 0.03), 4)
     assert carrying.hold().tolist() == [0] * 6 + [ROBOT.close_command]
     done = make(key_poses=[key_pose("bowl", HOME, "lift", closed=True)])
     done.advance(Hand(done.plan[0].T_world_ee, 0.03))
     assert done.status is Status.DONE
-    assert done.next_action().tolist() == [0] * 6 + [ROBOT.close_command]
+    assert done.next_action(Hand(HOME, OPEN_WIDTH)).tolist() == [0] * 6 + [ROBOT.close_command]
 
 
 @pytest.mark.parametrize(("gap", "retries_wanted"), [(0.008, 0), (0.03, 1)])

@@ -7,31 +7,35 @@ from lerobot_openspm.control.executor import ControlSettings, Hand, Status
 from lerobot_openspm.control.row import LOOK_AGAIN_STEPS, Knowledge, Row
 from lerobot_openspm.control.transfer import TransferLimits
 from lerobot_openspm.errors import InstructionError
+from lerobot_openspm.geometry import se3
 from lerobot_openspm.memory.retrieval import ScoreWeights
 
 HAND = Hand(hand_pose(0.0, 0.0, 0.3), OPEN_WIDTH)
 INSTRUCTION = "put the bowl on the plate"
 
 
-def knowledge(*entries, limits=None):
+def knowledge(*entries, limits=None, execution="closed_loop_trc"):
     return Knowledge(
-        entries or (entry(),), {}, robot(), ScoreWeights(), limits or TransferLimits(), ControlSettings()
-    )
+        entries or (entry(),), {}, robot(), ScoreWeights(), limits or TransferLimits(),
+        ControlSettings(execution=execution),
+    )  # fmt: skip
 
 
 class Eyes:
     """Finds the objects it is shown, and remembers what it was asked for."""
 
     def __init__(self, layout):
-        self.layout, self.asked = dict(layout), []
+        self.layout, self.asked, self.confidence = dict(layout), [], 1.0
 
-    def __call__(self, names):
+    def __call__(self, names, min_confidence):
         self.asked.append(list(names))
+        if min_confidence > self.confidence:
+            return {}
         return {name: self.layout[name] for name in names if name in self.layout}
 
 
-def row(*entries, instruction=INSTRUCTION, seed=0, shown=7, limits=None):
-    return Row(knowledge(*entries, limits=limits), instruction, shown, seed)
+def row(*entries, instruction=INSTRUCTION, seed=0, shown=7, **options):
+    return Row(knowledge(*entries, **options), instruction, shown, seed)
 
 
 def test_the_first_observation_makes_a_plan():
@@ -44,7 +48,7 @@ def test_the_first_observation_makes_a_plan():
     assert_allclose(one.executor.plan[0].T_world_ee, bowl @ entry().key_poses[0].T_obj_ee)
     one.observe(HAND, eyes)
     assert len(eyes.asked) == 1
-    assert one.next_action() is None  # a chunk is wanted
+    assert one.next_action(HAND) is None  # a chunk is wanted
 
 
 def test_an_object_that_is_not_found_is_looked_for_again_and_then_found():
@@ -53,7 +57,7 @@ def test_an_object_that_is_not_found_is_looked_for_again_and_then_found():
     for _ in range(LOOK_AGAIN_STEPS):
         one.observe(HAND, eyes)
         assert one.status is Status.OBJECT_NOT_FOUND
-        assert one.next_action().tolist() == [0.0] * 6 + [-1.0]
+        assert one.next_action(HAND).tolist() == [0.0] * 6 + [-1.0]
     assert len(eyes.asked) == 1
     eyes.layout = {"plate": layout["plate"]}  # what was seen once is remembered
     one.observe(HAND, eyes)
@@ -66,7 +70,7 @@ def test_key_poses_out_of_reach_are_infeasible():
     one = row()
     one.observe(HAND, Eyes(far))
     assert one.status is Status.INFEASIBLE
-    assert one.next_action().tolist() == [0.0] * 6 + [-1.0]
+    assert one.next_action(HAND).tolist() == [0.0] * 6 + [-1.0]
 
 
 def test_a_feasible_entry_is_preferred_to_a_better_one_that_is_not():
@@ -94,6 +98,85 @@ def test_a_missed_grasp_looks_again_and_goes_to_where_the_object_is_now():
     assert len(eyes.asked) == 2
     assert one.executor.index == 0
     assert_allclose(one.executor.plan[0].T_world_ee, moved @ entry().key_poses[0].T_obj_ee)
+
+
+def advanced(one, eyes, index):
+    """The row, brought to a key pose as if the hand had got there."""
+    one.observe(HAND, eyes)
+    one.executor.begin(one.executor.plan, HAND, index - 1)
+    before = one.executor.plan[index - 1]
+    hand = Hand(before.T_world_ee, before.memory.opening)
+    eyes.asked.clear()
+    one.observe(hand, eyes)
+    assert one.executor.index == index
+    return hand
+
+
+def shifted(T, x):
+    return se3.transform(T[:3, :3], T[:3, 3] + [x, 0.0, 0.0])
+
+
+def test_at_every_key_pose_what_was_not_touched_is_looked_for_again():
+    eyes, one = Eyes(entry().layout), row()
+    advanced(one, eyes, 1)
+    assert eyes.asked == [["bowl", "plate"]]
+    eyes, one = Eyes(entry().layout), row()
+    advanced(one, eyes, 4)  # the bowl is in the hand
+    assert eyes.asked == [["plate"]]
+
+
+def test_fingers_that_move_are_not_looked_past():
+    eyes, one = Eyes(entry().layout), row()
+    advanced(one, eyes, 2)
+    assert one.executor.target.memory.dwell
+    assert eyes.asked == []
+
+
+@pytest.mark.parametrize(("shift", "follows"), [(0.03, True), (-0.03, True), (0.0015, False)])
+def test_key_poses_follow_an_object_that_has_moved(shift, follows):
+    eyes, one = Eyes(entry().layout), row()
+    one.observe(HAND, eyes)
+    before = one.executor.plan
+    eyes.layout["plate"] = shifted(entry().layout["plate"], shift)
+    one.executor.push_chunk(np.zeros((5, 7)))
+    advanced(one, eyes, 4)
+    assert one.status is Status.RUNNING
+    for old, new in zip(before, one.executor.plan, strict=True):
+        expected = shift if follows and new.memory.anchor.place == "plate" else 0.0
+        assert_allclose(new.T_world_ee[0, 3] - old.T_world_ee[0, 3], expected, atol=1e-12)
+
+
+def test_a_glimpse_past_the_hand_is_not_believed():
+    eyes, one = Eyes(entry().layout), row()
+    one.observe(HAND, eyes)
+    before = [target.T_world_ee for target in one.executor.plan]
+    eyes.layout["plate"], eyes.confidence = shifted(entry().layout["plate"], 0.03), 0.9
+    advanced(one, eyes, 4)
+    assert eyes.asked
+    assert_allclose([target.T_world_ee for target in one.executor.plan], before)
+
+
+def test_a_place_out_of_reach_is_not_believed():
+    eyes, one = Eyes(entry().layout), row()
+    one.observe(HAND, eyes)
+    before = [target.T_world_ee for target in one.executor.plan]
+    eyes.layout["plate"] = shifted(entry().layout["plate"], 3.0)
+    advanced(one, eyes, 4)
+    assert one.status is Status.RUNNING
+    assert_allclose([target.T_world_ee for target in one.executor.plan], before)
+
+
+def test_the_open_loop_does_not_look_again():
+    eyes, one = Eyes(entry().layout), row(execution="open_loop")
+    one.observe(HAND, eyes)
+    eyes.asked.clear()
+    for _ in range(100):
+        if one.next_action(HAND) is None:
+            one.query(HAND)
+            one.executor.push_chunk(np.zeros((5, 7)))
+        one.observe(HAND, eyes)
+    assert one.executor.index > 1
+    assert eyes.asked == []
 
 
 def test_an_unknown_instruction_raises():

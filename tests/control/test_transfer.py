@@ -64,14 +64,14 @@ def test_moving_one_object_moves_its_own_targets_alone():
 def test_an_anchor_with_the_worlds_axes_follows_the_place_and_not_the_turn():
     pose = key_pose("rack", hand_pose(0.1, 0.0, 0.2), "place", axes=WORLD)
     layout = {"rack": se3.from_yaw([0.3, 0.4, 0.0], 1.2)}
-    (target,) = transfer(entry(key_poses=[pose], layout=layout), layout, {}, HOME)
+    target = transfer(entry(key_poses=[pose], layout=layout), layout, {}, HOME)[0]
     assert_allclose(target.T_world_ee, hand_pose(0.4, 0.4, 0.2), atol=1e-12)
 
 
 def test_an_anchor_with_anothers_axes_follows_the_place_of_one_and_the_turn_of_the_other():
     pose = key_pose("plate", hand_pose(0.1, 0.0, 0.2), "place", axes="bowl")
     layout = {"plate": se3.from_yaw([0.3, 0.4, 0.0], 1.2), "bowl": se3.from_yaw([9.0, 9.0, 0.0], np.pi / 2)}
-    (target,) = transfer(entry(key_poses=[pose], layout=layout), layout, {}, HOME)
+    target = transfer(entry(key_poses=[pose], layout=layout), layout, {}, HOME)[0]
     assert_allclose(target.T_world_ee, hand_pose(0.3, 0.5, 0.2, np.pi / 2), atol=1e-12)
 
 
@@ -179,3 +179,23 @@ def test_a_cut_demonstration_ends_with_a_retreat_against_its_arrival():
     assert_allclose(left[:3, 3] - released[:3, 3], [0, 0, RETREAT_M], atol=1e-9)
     assert_allclose(left[:3, :3], released[:3, :3], atol=1e-9)
     assert len(transfer(whole, whole.layout, {}, HOME)) == len(whole.key_poses)
+
+
+def test_a_demonstration_cut_with_the_object_in_the_hand_ends_with_letting_go():
+    memory = entry(key_poses=entry().key_poses[:6])
+    assert memory.key_poses[-1].phase == "place"
+    targets = transfer(memory, memory.layout, {}, HOME)
+    assert [target.memory.phase for target in targets[-3:]] == ["place", "release", "retreat"]
+    release, retreat = targets[-2:]
+    assert_allclose(release.T_world_ee, targets[5].T_world_ee)
+    assert release.memory.dwell
+    assert not release.memory.closed
+    assert not retreat.memory.closed
+    assert release.memory.n_steps == targets[2].memory.n_steps  # as long as the fingers took to close
+
+
+def test_what_is_not_to_be_put_anywhere_is_not_let_go():
+    poses = [*entry().key_poses[:3], key_pose("bowl", hand_pose(0, 0, 0.3), "place", closed=True)]
+    memory = entry("open the top drawer of the bowl", key_poses=poses)
+    targets = transfer(memory, memory.layout, {}, HOME)
+    assert "release" not in [target.memory.phase for target in targets]

@@ -49,15 +49,17 @@ def collect_dataset(root: Path, demos: int) -> dict[str, Any]:
     return collect(CollectConfig(episodes=demos, root=str(root), repo_id=REPO_ID))
 
 
-def train(dataset: Path, output: Path, options: Sequence[str] = ()) -> tuple[Path, float]:
+def train(
+    dataset: Path, output: Path, options: Sequence[str] = (), config_file: Path = TRAIN_CONFIG
+) -> tuple[Path, float]:
     """Run lerobot-train, unless its checkpoint is there. Returns the checkpoint and the seconds it took.
 
     An interrupted run is resumed from its last checkpoint; the seconds are NaN then.
     """
     checkpoint, done = output / "checkpoints" / "last" / "pretrained_model", output / DONE
-    if not TRAIN_CONFIG.is_file():
-        raise FileNotFoundError(f"no {TRAIN_CONFIG} here: run this from a checkout of the project")
-    made_of = _digest([TRAIN_CONFIG, dataset / "meta" / "info.json", dataset / SUMMARY_FILE], options)
+    if not config_file.is_file():
+        raise FileNotFoundError(f"no {config_file} here: run this from a checkout of the project")
+    made_of = _digest([config_file, dataset / "meta" / "info.json", dataset / SUMMARY_FILE], options)
     _discard_unless(output, made_of)
     if not done.exists():
         start_s = time.monotonic()
@@ -69,7 +71,7 @@ def train(dataset: Path, output: Path, options: Sequence[str] = ()) -> tuple[Pat
             # lerobot-train wants to make its folder itself.
             shutil.rmtree(output, ignore_errors=True)
             run_lerobot(
-                "lerobot-train", f"--config_path={TRAIN_CONFIG}", f"--dataset.root={dataset}",
+                "lerobot-train", f"--config_path={config_file}", f"--dataset.root={dataset}",
                 f"--output_dir={output}", *options,
             )  # fmt: skip
         # What an interrupted run took before is not known any more.

@@ -31,6 +31,8 @@ HOLDING_SHARE = 0.03
 STUCK_SHARE = 0.9
 # ... and the key pose counts as met within this multiple of the tolerance: what is touched is in the way.
 BLOCKED_SHARE = 3.0
+# Each step of a correction makes good this share of the residual, and this many steps are one correction.
+CORRECTION_SHARE, CORRECTION_STEPS = 0.2, 5
 
 
 class Status(StrEnum):
@@ -55,7 +57,7 @@ class ControlSettings:
         residual_rad: ... and this angle.
         passing_m: A key pose that is only passed by is met within this distance ...
         passing_rad: ... and this angle.
-        max_corrections: Corrective chunks per key pose.
+        max_corrections: Corrections of five steps per key pose.
         max_attempts: How often a grasp that missed, or a key pose that was not met, is tried again.
     """
 
@@ -88,6 +90,7 @@ class Executor:
         self.corrections = 0
         self.replans = 0  # chunks asked for so far; seeds the noise of each
         self._steps = 0
+        self._late_steps = 0
         self._left = np.inf  # distance from the key pose at the last correction
         self._blocked = False  # whether that correction brought the hand no closer
         self._start = np.eye(4)
@@ -99,6 +102,11 @@ class Executor:
         self.plan, self.status = tuple(plan), Status.RUNNING
         self._believed = hand.T_world_ee
         self._enter(index, hand)
+
+    def change(self, plan: Sequence[Target]) -> None:
+        """Follow a better version of the same plan from here on."""
+        self.plan = tuple(plan)
+        self._queue.clear()
 
     @property
     def target(self) -> Target | None:
@@ -131,17 +139,21 @@ class Executor:
             return self._retry(f"it stays {1000 * metres:.1f} mm and {radians:.3f} rad away")
         return False
 
-    def next_action(self) -> Array | None:
-        """The next queued canonical action ``(7,)``, or None when a chunk is needed (:meth:`query`)."""
+    def next_action(self, hand: Hand) -> Array | None:
+        """The next canonical action ``(7,)``, or None when a chunk is needed (:meth:`query`)."""
         if self.status is not Status.RUNNING:
             return self.hold()
-        if not self._queue:
+        if self.plan[self.index].memory.dwell:
+            action = self._toward(hand)
+        elif self._queue:
+            action = self._queue.popleft()
+        elif self._settings.execution == "closed_loop_trc" and self._steps >= self._nominal_steps():
+            action = self._correct(hand)
+        else:
             return None
         self._steps += 1
-        action = self._queue.popleft()
         if self._settings.execution == "open_loop":
-            gains = [self._robot.metres_per_action] * 3 + [self._robot.radians_per_action] * 3
-            self._believed = se3.apply_increment(self._believed, action[:6] * np.array(gains))
+            self._believed = se3.apply_increment(self._believed, action[:6] * self._gains())
         return action
 
     def hold(self) -> Array:
@@ -149,16 +161,44 @@ class Executor:
         closed = self.plan[self.index].memory.closed if self.plan else False
         return np.array([0.0] * 6 + [self._robot.command(closed)])
 
-    def query(self, hand: Hand) -> Query:
-        """The condition of the next chunk. Counts it, and counts it as a correction once time is up."""
-        target = self.plan[self.index]
-        if self._steps >= self._nominal_steps():
+    def _correct(self, hand: Hand) -> Array:
+        """Terminal residual correction: make good what the flow model has left of the way to the key pose.
+
+        The correction is the residual itself, so that the error contracts whatever the model has learned.
+        """
+        if self._late_steps % CORRECTION_STEPS == 0:
             self.corrections += 1
-            left = float(se3.distance(hand.T_world_ee, target.T_world_ee))
+            left = _distance(hand, self.plan[self.index])
             self._blocked = left > STUCK_SHARE * self._left
             self._left = left
+        self._late_steps += 1
+        return self._toward(hand)
+
+    def _toward(self, hand: Hand) -> Array:
+        """An action straight towards the key pose, and the fingers as it says.
+
+        A hand that waits for its fingers is kept there by it: nothing in the flow model's condition says how
+        far a grasp has come, and drifting a centimetre under closing fingers loses it.
+        """
+        target, gains = self.plan[self.index], self._gains()
+        residual = se3.increment(self._here(hand), target.T_world_ee)
+        motion: Array = np.where(gains > 0, CORRECTION_SHARE * residual / np.maximum(gains, 1e-9), 0.0)
+        motion = motion / max(1.0, float(np.abs(motion).max()))
+        return np.append(motion, self._robot.command(target.memory.closed))
+
+    def _gains(self) -> Array:
+        """How far the hand moves per unit of each of the six numbers of an action."""
+        return np.array([self._robot.metres_per_action] * 3 + [self._robot.radians_per_action] * 3)
+
+    def _here(self, hand: Hand) -> Array:
+        """Where the hand is taken to be."""
+        return self._believed if self._settings.execution == "open_loop" else hand.T_world_ee
+
+    def query(self, hand: Hand) -> Query:
+        """The condition of the next chunk, which is counted."""
+        target = self.plan[self.index]
         self.replans += 1
-        here = self._believed if self._settings.execution == "open_loop" else hand.T_world_ee
+        here = self._here(hand)
         return Query(
             T_world_ee=here,
             T_world_target=target.T_world_ee,
@@ -180,8 +220,8 @@ class Executor:
     def _enter(self, index: int, hand: Hand) -> None:
         if self._settings.execution == "open_loop" and index > 0:
             self._believed = self.plan[index - 1].T_world_ee
-        self._start = self._believed if self._settings.execution == "open_loop" else hand.T_world_ee
-        self.index, self._steps, self.corrections = index, 0, 0
+        self._start = self._here(hand)
+        self.index, self._steps, self._late_steps, self.corrections = index, 0, 0, 0
         self._left, self._blocked = np.inf, False
         self._queue.clear()
 
@@ -240,3 +280,7 @@ class Executor:
         while index > 0 and self.plan[index - 1].memory.phase == "approach":
             index -= 1
         return index
+
+
+def _distance(hand: Hand, target: Target) -> float:
+    return float(se3.distance(hand.T_world_ee, target.T_world_ee))

@@ -71,7 +71,24 @@ def transfer(
             after is not None and (after.dwell or after.phase == "push")
         )
         targets.append(Target(before, pose, precise))
+    if targets and entry.key.sub_tasks[-1].operation == "put":
+        targets += _release(targets)
     return tuple(targets) + _retreat(targets)
+
+
+def _release(targets: Sequence[Target]) -> list[Target]:
+    """Letting go at the end, for a demonstration that was cut with the object still in the hand.
+
+    A benchmark ends an episode when its goal first holds, which an object that is being lowered may do.
+    """
+    last = targets[-1]
+    if last.memory.phase != "place":
+        return []
+    waits = [target.memory.n_steps for target in targets if target.memory.dwell]
+    memory = replace(
+        last.memory, phase="release", closed=False, n_steps=max(waits, default=1), dwell=True, confidence=0.5
+    )
+    return [Target(last.T_world_ee, memory, precise=True)]
 
 
 def _retreat(targets: Sequence[Target]) -> tuple[Target, ...]:

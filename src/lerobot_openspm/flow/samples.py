@@ -12,7 +12,7 @@ from lerobot_openspm.errors import DatasetError
 from lerobot_openspm.flow.condition import Conditioning, Query, encode, progress, to_model_frame
 from lerobot_openspm.geometry import se3
 from lerobot_openspm.geometry.se3 import Array
-from lerobot_openspm.memory.entry import DWELL_PHASES, PHASES
+from lerobot_openspm.memory.entry import PHASES
 from lerobot_openspm.memory.robot import RobotModel
 from lerobot_openspm.mining.key_poses import KeyPose
 from lerobot_openspm.mining.signals import Episode
@@ -48,12 +48,12 @@ class SegmentFrames:
 def segment_frames(
     episodes: Sequence[Episode], key_poses: Sequence[Sequence[KeyPose]], robot: RobotModel, chunk_size: int
 ) -> SegmentFrames:
-    """Cut demonstrations into segments and take every frame of them, human pauses left out."""
+    """Cut demonstrations into segments and take every frame of motion; pauses and waits are left out."""
     parts = [
         _one_segment(episode, before, pose, robot, chunk_size)
         for episode, poses in zip(episodes, key_poses, strict=True)
         for before, pose in zip([0, *(p.frame for p in poses[:-1])], poses, strict=True)
-        if pose.frame > before
+        if pose.frame > before and not pose.dwell
     ]
     parts = [part for part in parts if len(part)]
     if not parts:
@@ -82,7 +82,7 @@ def _one_segment(
     away = se3.distance(T_world_ee, pose.T_world_ee)
     effort = np.linalg.norm(actions[:, 0, :6], axis=-1)
     usual = np.median(np.linalg.norm(episode.actions[:, :6], axis=-1))
-    keep = (effort > PAUSE_FRACTION * usual) | (away < PAUSE_DISTANCE_M) | pose.dwell
+    keep = (effort > PAUSE_FRACTION * usual) | (away < PAUSE_DISTANCE_M)
     frames, T_world_ee, actions = frames[keep], T_world_ee[keep], actions[keep]
     n = len(frames)
     start = np.broadcast_to(episode.T_world_ee[first], (n, 4, 4))
@@ -105,13 +105,11 @@ def perturbed(
     """Move each frame's hand a little and correct its chunk so that it ends where it did.
 
     Closed-loop execution leaves the demonstrated paths by the error of the model and of the controller.
-    These samples show the way back. The displacement grows with the distance from the target, and waiting
-    frames stay as they are.
+    These samples show the way back. The displacement grows with the distance from the target.
     """
     query, n = frames.query, len(frames)
     away = se3.distance(query.T_world_ee, query.T_world_target)
-    waiting = np.isin(query.phase, [PHASES.index(phase) for phase in DWELL_PHASES])
-    size = np.where(waiting, 0.0, np.minimum(1.0, 0.25 + away / 0.1))[:, None]
+    size = np.minimum(1.0, 0.25 + away / 0.1)[:, None]
     shift = rng.normal(size=(n, 6)) * size * np.array([std_m] * 3 + [std_rad] * 3)
     moved = se3.apply_increment(query.T_world_ee, shift)
     gains = np.array([robot.metres_per_action] * 3 + [robot.radians_per_action] * 3)

@@ -47,9 +47,6 @@ class RetrievalKey:
     phases: tuple[str, ...]
 
 
-# Phases in which the hand stands still and waits for the fingers.
-DWELL_PHASES = ("grasp", "release")
-
 WORLD = "world"
 
 

@@ -5,13 +5,21 @@ the grip site between the fingertips and the axes of the hand body, exactly as `
 points out of the hand (down at home), and the fingers open along its y axis.
 """
 
+# mujoco ships no stubs for its compiled part.
+# pyright: reportAttributeAccessIssue=false
+
 from __future__ import annotations
 
+import functools
 import os
+from collections.abc import Mapping
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
+from lerobot.envs.utils import preprocess_observation
+from lerobot.processor.env_processor import LiberoProcessorStep
 
 SUITE = "libero_goal"
 HAND_BODY, GRIP_SITE = "robot0_right_hand", "gripper0_grip_site"
@@ -57,6 +65,8 @@ class LiberoSimulator:
             camera_widths=image_size or 1,
         )
         self._observation: dict[str, Any] = {}
+        # The scene as it was when the last observation was sampled, MuJoCo's data.
+        self._sampled: Any = None
 
     def reset(self, seed: int) -> None:
         """Draw a scene and let it settle."""
@@ -78,6 +88,27 @@ class LiberoSimulator:
         # LIBERO draws its scenes from NumPy's global generator; there is no other way to seed them.
         self._env.seed(seed)
         self._observation = self._env.reset()
+        if self._image_size is not None and not self._render_steps:
+            self._keep_what_is_sampled()
+
+    def _keep_what_is_sampled(self) -> None:
+        """Keep the scene of every observation, so that its images can be made later.
+
+        robosuite samples observations somewhere within a control step, not at its end.
+        """
+        import mujoco
+
+        model, data = self.sim.model._model, self.sim.data._data
+        self._sampled = mujoco.MjData(model)
+        observable = self._env.env._observables["robot0_eef_pos"]
+        sense = observable._sensor
+
+        @functools.wraps(sense)
+        def sense_and_keep(cache: dict[str, Any]) -> Any:
+            mujoco.mj_copyData(self._sampled, model, data)
+            return sense(cache)
+
+        self._env.env.modify_observable("robot0_eef_pos", "sensor", sense_and_keep)
 
     def _settle(self) -> None:
         for _ in range(SETTLING_STEPS):
@@ -107,13 +138,15 @@ class LiberoSimulator:
         return np.asarray(self._observation["robot0_gripper_qpos"], float)
 
     def state(self) -> np.ndarray:
-        """``observation.state`` (8,): position, axis-angle, fingers, as LeRobot makes it."""
-        quat_xyzw = np.asarray(self._observation["robot0_eef_quat"], float)
-        w = np.clip(quat_xyzw[3], -1.0, 1.0)
-        sine = np.sqrt(max(1.0 - w * w, 0.0))
-        axis_angle = quat_xyzw[:3] / sine * 2 * np.arccos(w) if sine > 1e-10 else np.zeros(3)
-        position = self._observation["robot0_eef_pos"]
-        return np.concatenate([position, axis_angle, self.finger_positions()]).astype(np.float32)
+        """``observation.state`` (8,): position, axis-angle, fingers, made by LeRobot's own processor step."""
+        seen = self._observation
+        raw = {
+            "eef": {"pos": seen["robot0_eef_pos"], "quat": seen["robot0_eef_quat"]},
+            "gripper": {"qpos": seen["robot0_gripper_qpos"]},
+        }
+        nested: Any = {"robot_state": _batched(raw)}
+        batch = preprocess_observation(nested)
+        return LiberoProcessorStep().observation(batch)["observation.state"][0].numpy()
 
     def images(self) -> dict[str, np.ndarray]:
         """The cameras' images (H, W, 3) uint8 by LeRobot's names, turned as LeRobot turns them."""
@@ -125,7 +158,12 @@ class LiberoSimulator:
             raise ValueError("this simulator was made without images; pass image_size")
         if self._render_steps:
             return _turned(self._observation[f"{CAMERAS[name]}_image"])
-        return self.render(name, self._image_size)
+        context = self.sim._render_context_offscreen
+        present, context.data = context.data, SimpleNamespace(_data=self._sampled)
+        try:
+            return self.render(name, self._image_size)
+        finally:
+            context.data = present
 
     def render(self, name: str, size: int) -> np.ndarray:
         """One camera's image of the present scene (size, size, 3) uint8, turned as LeRobot turns it."""
@@ -138,9 +176,13 @@ class LiberoSimulator:
 
     def object_poses(self) -> dict[str, np.ndarray]:
         """True ``T_world_obj`` (4, 4) of all `OBJECTS`."""
+        return {name: self.body_pose(self.root_body(name)) for name in OBJECTS}
+
+    def root_body(self, name: str) -> str:
+        """MuJoCo's name of the body of one of `OBJECTS`."""
         env = self._env.env
         things = {_short(k): thing for k, thing in {**env.objects_dict, **env.fixtures_dict}.items()}
-        return {name: self.body_pose(things[name].root_body) for name in OBJECTS}
+        return things[name].root_body
 
     def body_pose(self, name: str) -> np.ndarray:
         """``T_world_body`` (4, 4) of any body of the MuJoCo model."""
@@ -156,6 +198,10 @@ class LiberoSimulator:
     def close(self) -> None:
         """Free the simulator."""
         self._env.close()
+
+
+def _batched(state: Mapping[str, Any]) -> dict[str, Any]:
+    return {k: _batched(v) if isinstance(v, Mapping) else np.asarray(v)[None] for k, v in state.items()}
 
 
 def _turned(image: np.ndarray) -> np.ndarray:

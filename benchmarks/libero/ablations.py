@@ -1,0 +1,53 @@
+"""What each part is worth: how key poses are followed, whose object poses, where key poses come from.
+
+python -m benchmarks.libero.ablations --states=10
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+import os
+import sys
+from dataclasses import dataclass
+from typing import Any
+
+import draccus
+from benchmarks.common import write
+from benchmarks.libero.evaluate import summary
+from benchmarks.libero.geometric_guess import guessing_policy
+from benchmarks.libero.stages import dataset, evaluation, policy, run_folder
+
+
+@dataclass
+class AblationConfig:
+    """On how many initial states a task."""
+
+    states: int = 10
+
+
+def main(config: AblationConfig) -> dict[str, Any]:
+    """Evaluate every variant on the same states, and write the result down."""
+    root, folder = dataset(), run_folder()
+    full, _ = policy(root, "train")
+    oracle, _ = policy(root, "train_oracle", "--policy.perception=oracle")
+    guess = guessing_policy(oracle, folder / "train_guess")
+    variants: dict[str, Any] = {
+        "closed_loop_trc": evaluation(folder / "ablation_full", full, config.states),
+        "closed_loop": evaluation(
+            folder / "ablation_closed_loop", full, config.states, execution="closed_loop"
+        ),
+        "open_loop": evaluation(folder / "ablation_open_loop", full, config.states, execution="open_loop"),
+        "oracle": evaluation(folder / "ablation_oracle", oracle, config.states),
+        "geometric_guess": evaluation(folder / "ablation_guess", guess, config.states),
+    }
+    return write(
+        "libero_ablations",
+        {"states": config.states, "runs": {name: summary(found) for name, found in variants.items()}},
+    )
+
+
+if __name__ == "__main__":
+    logging.basicConfig(level=logging.INFO, format="%(levelname)s %(message)s")
+    os.environ.setdefault("MUJOCO_GL", "egl")
+    print(json.dumps(main(draccus.parse(AblationConfig, args=sys.argv[1:]))))

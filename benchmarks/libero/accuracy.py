@@ -1,0 +1,62 @@
+"""Errors of the object poses that the policy found at the start of evaluated episodes."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from benchmarks.libero.stages import REPO_ID
+from benchmarks.object_frames import error, offset, summary
+from lerobot.datasets import LeRobotDatasetMetadata
+
+from lerobot_openspm.configuration_openspm import OpenSPMConfig
+from lerobot_openspm.envs.libero.simulator import tasks
+from lerobot_openspm.experience import load_experience
+from lerobot_openspm.geometry import se3
+from lerobot_openspm.training import open_demonstrations
+
+# By which angle each object truly turns into itself.
+TRUE_PERIODS = {
+    "bowl": 0.0,
+    "plate": 0.0,
+    "wine bottle": 0.0,
+    "cream cheese": np.pi,
+    "rack": 2 * np.pi,
+    "cabinet": 2 * np.pi,
+    "stove": 2 * np.pi,
+}
+
+
+def accuracy(checkpoint: Path, dataset: Path, episodes: list[dict[str, Any]]) -> dict[str, Any]:
+    """Position and yaw errors, over all objects that an episode's task touches, per object and per task."""
+    experience = load_experience(checkpoint)
+    config = OpenSPMConfig(
+        device="cpu", push_to_hub=False, state_rotation="axis_angle", action_rotation="axis_angle"
+    )
+    demonstrations = open_demonstrations(LeRobotDatasetMetadata(REPO_ID, root=dataset), config)
+    offsets = {name: offset(experience, name, demonstrations) for name in experience.objects}
+    by_object, by_task = defaultdict(list), defaultdict(list)
+    for episode in episodes:
+        for name, true in episode["true"].items():
+            one = error(_pose(true), _pose(episode["seen"][name]), offsets[name], TRUE_PERIODS[name])
+            by_object[name].append(one)
+            by_task[episode["task"]].append(one)
+    everything = 1000 * np.concatenate([np.array(found)[:, 0] for found in by_object.values()])
+    known = [task for task in tasks() if task in by_task]
+    return {
+        "position_mm_mean": round(float(everything.mean()), 2),
+        "position_mm_p95": round(float(np.percentile(everything, 95)), 2),
+        "objects": {name: summary(np.array(found), TRUE_PERIODS[name]) for name, found in by_object.items()},
+        "tasks": {task: summary(np.array(by_task[task]), _turning(by_task[task])) for task in known},
+    }
+
+
+def _turning(errors: list[tuple[float, float]]) -> float:
+    """A period for a summary: 0 if every object of a task is round, so that no yaw is meant."""
+    return 0.0 if np.isnan(np.array(errors)[:, 1]).all() else 2 * np.pi
+
+
+def _pose(place: list[float]) -> np.ndarray:
+    return se3.from_yaw(place[:3], place[3])

@@ -1,0 +1,73 @@
+"""How long a chunk takes, and a whole decision with images, on one thread and one environment."""
+
+from __future__ import annotations
+
+import json
+import os
+import time
+from typing import Any
+
+import numpy as np
+import torch
+from benchmarks.common import write
+from benchmarks.libero.episode import LazyImages
+from benchmarks.libero.stages import dataset, policy
+
+from lerobot_openspm.control.executor import Hand
+from lerobot_openspm.envs.libero.simulator import LiberoSimulator
+from lerobot_openspm.envs.seeds import TUNING_SEED_START
+from lerobot_openspm.modeling_openspm import OpenSPMPolicy
+from lerobot_openspm.observation import Observation
+
+TASK = "put_the_bowl_on_the_plate"
+CHUNKS, LOOKS, WARM_UP = 1000, 100, 20
+
+
+def main() -> dict[str, Any]:
+    """Measure, write and return the result."""
+    torch.set_num_threads(1)
+    checkpoint, _ = policy(dataset(), "train")
+    acting = OpenSPMPolicy.from_pretrained(checkpoint)
+    simulator = LiberoSimulator(TASK, 360, render_steps=False)
+    simulator.reset(TUNING_SEED_START)
+    layout, vector = acting.config.layouts()[0], simulator.state().astype(float)
+    hand = Hand(layout.poses(vector), float(layout.openings(vector)))
+    images = {key: LazyImages(simulator)[key] for key in LazyImages(simulator)}
+    observation = Observation(simulator.instruction, vector, hand, images)
+    with torch.inference_mode():
+        first = _times(lambda: (acting.reset(), acting.act([observation])), LOOKS)
+        row = acting._rows[0]
+        chunk = _times(lambda: acting._chunk(row, row.query(hand)), CHUNKS)
+    horizon = acting.config.chunk_size
+    return write(
+        "libero_latency",
+        {
+            "threads": 1,
+            "chunk_size": horizon,
+            "parameters": sum(p.numel() for p in acting.parameters()),
+            "chunk_ms": chunk,
+            "equivalent_hz": round(1000 * horizon / chunk["median"], 1),
+            "decisions_hz": round(1000 / chunk["median"], 1),
+            "first_action_ms": first,
+        },
+    )
+
+
+def _times(run: Any, n: int) -> dict[str, float]:
+    """Milliseconds: median and 99th percentile of `n` runs after some to warm up."""
+    spent = []
+    for _ in range(n + WARM_UP):
+        start_s = time.perf_counter()
+        run()
+        spent.append(1000 * (time.perf_counter() - start_s))
+    kept = spent[WARM_UP:]
+    return {
+        "median": round(float(np.median(kept)), 2),
+        "p99": round(float(np.percentile(kept, 99)), 2),
+        "n": n,
+    }
+
+
+if __name__ == "__main__":
+    os.environ.setdefault("MUJOCO_GL", "egl")
+    print(json.dumps(main()))

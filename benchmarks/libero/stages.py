@@ -1,0 +1,90 @@
+"""The stages that LIBERO's benchmarks share, each run once: demonstrations, policies, evaluations."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from benchmarks.libero.evaluate import EvaluationConfig, evaluate
+
+from lerobot_openspm.cli.collect import SUMMARY_FILE, CollectConfig, SimulatorConfig, collect
+from lerobot_openspm.cli.pipeline import train
+from lerobot_openspm.control.executor import Execution
+from lerobot_openspm.envs.libero.simulator import tasks
+
+REPO_ID = "local/libero_goal"
+TRAIN_CONFIG = Path("configs/openspm_libero_train.yaml")
+# The demonstrations of the published figures; whoever asks for fewer takes the first of them.
+DEMOS, STATES = 10, 50
+
+
+def run_folder(demos: int = DEMOS) -> Path:
+    """Where everything made of so many demonstrations a task lies."""
+    return Path("outputs/libero") / f"demos_{demos}"
+
+
+def select_tasks(selection: str) -> list[str]:
+    """Tasks by their numbers: "0-9", or "0,3,5-6".
+
+    Raises:
+        ValueError: There is no such task.
+    """
+    known = list(tasks())
+    chosen: list[int] = []
+    for part in selection.split(","):
+        first, _, last = part.strip().partition("-")
+        if not first.isdecimal() or not (last or first).isdecimal() or int(last or first) >= len(known):
+            raise ValueError(
+                f"TASKS must be numbers from 0 to {len(known) - 1} like 0-9 or 0,3,5, got {selection}"
+            )
+        chosen += range(int(first), int(last or first) + 1)
+    return [known[i] for i in dict.fromkeys(chosen)]
+
+
+def dataset(demos: int = DEMOS, selected: Sequence[str] | None = None) -> Path:
+    """The demonstrations, recorded if need be."""
+    root = run_folder(demos) / "dataset"
+    names = ",".join(selected) if selected and list(selected) != list(tasks()) else "all"
+    collect(CollectConfig(SimulatorConfig("libero", names), episodes=demos, root=str(root), repo_id=REPO_ID))
+    return root
+
+
+def first_episodes(root: Path, demos: int, without: str | None = None) -> list[int]:
+    """Episode numbers of the first demonstrations of every task, but for one that is left out."""
+    recorded = json.loads((root / SUMMARY_FILE).read_text())["episodes"]
+    numbers: dict[str, list[int]] = {}
+    for number, episode in enumerate(recorded):
+        numbers.setdefault(episode["task"], []).append(number)
+    return [n for task, own in numbers.items() if task != without for n in own[:demos]]
+
+
+def policy(
+    root: Path, variant: str, *options: str, episodes: Sequence[int] | None = None
+) -> tuple[Path, float]:
+    """Checkpoint and seconds of a variant, mined and trained if need be.
+
+    Args:
+        root: The demonstrations.
+        variant: Name of its folder beside them.
+        options: Further options of lerobot-train.
+        episodes: The demonstrations that may be learned from; all if not given.
+    """
+    if episodes is not None:
+        chosen = json.dumps(list(episodes))
+        options = (f"--dataset.episodes={chosen}", f"--policy.memory_episodes={chosen}", *options)
+    options = (f"--dataset.repo_id={REPO_ID}", *options)
+    return train(root, root.with_name(variant), options, TRAIN_CONFIG)
+
+
+def evaluation(
+    name: Path,
+    checkpoint: Path,
+    states: int = STATES,
+    selected: Sequence[str] | None = None,
+    execution: Execution | None = None,
+) -> list[dict[str, Any]]:
+    """Episodes on the benchmark's initial states, run if need be."""
+    names = ",".join(selected) if selected else "all"
+    return evaluate(EvaluationConfig(str(checkpoint), str(name), names, episodes=states, execution=execution))
