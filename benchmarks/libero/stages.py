@@ -14,7 +14,7 @@ from lerobot_openspm.cli.pipeline import train
 from lerobot_openspm.control.executor import Execution
 from lerobot_openspm.envs.libero.simulator import tasks
 
-REPO_ID = "local/libero_goal"
+REPO_ID = "local/libero"
 TRAIN_CONFIG = Path("configs/openspm_libero_train.yaml")
 # The demonstrations of the published figures; whoever asks for fewer takes the first of them.
 DEMOS, STATES = 10, 50
