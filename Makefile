@@ -2,13 +2,15 @@
 
 .DEFAULT_GOAL := setup
 .NOTPARALLEL:
-.PHONY: help setup egl demo figures test lint typecheck format clean
+.PHONY: help setup egl demo figures libero libero-setup libero-tables test lint typecheck format clean
 
 # The demo's total time counts the set-up, so the clock starts before anything else does.
 STARTED_AT := $(shell date +%s)
 
 DEMOS ?= 10
 EPISODES ?= 20
+STATES ?= 50
+TASKS ?= 0-9
 PYTEST_ARGS ?=
 
 BIN := .venv/bin
@@ -19,7 +21,7 @@ endif
 export PYTHON
 
 help: ## list the targets
-	@grep -hE '^[a-z]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 12
+	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 16
 
 setup: ## make .venv with Python 3.12 or 3.13 (PYTHON=... chooses one) and install everything
 	@scripts/setup.sh
@@ -32,6 +34,17 @@ demo: egl ## collect DEMOS demonstrations, train, evaluate EPISODES episodes; th
 
 figures: egl ## measure the published figures into benchmarks/results; the last line is JSON
 	@$(BIN)/python -m benchmarks.figures
+
+# LIBERO and its scenes are hundreds of megabytes that only these figures need.
+libero-setup: egl
+	@$(BIN)/python -c 'import importlib.util, sys; sys.exit(importlib.util.find_spec("libero") is None)' \
+		|| $(BIN)/python -m pip install --no-input --disable-pip-version-check --editable '.[libero]'
+
+libero: libero-setup ## the same on LIBERO-GOAL: DEMOS, STATES initial states of TASKS (0-9); needs LIBERO, see README
+	@$(BIN)/python -m benchmarks.libero.run --demos=$(DEMOS) --states=$(STATES) --tasks=$(TASKS)
+
+libero-tables: setup ## write docs/results.md from what was measured (benchmarks/results)
+	@$(BIN)/python -m benchmarks.tables
 
 test: egl ## run the tests, without those marked slow, libero or gpu (PYTEST_ARGS=... adds arguments)
 	@$(BIN)/python -m pytest -n 2 $(PYTEST_ARGS)

@@ -117,7 +117,7 @@ def summary(episodes: list[dict[str, Any]]) -> dict[str, Any]:
             for task, es in own.items()
         },
         "failed": [
-            [e["task"], e["state"], e["status"], e["phase"], e["attempts"]]
+            {key: e[key] for key in ("task", "state", "status", "phase", "attempts")}
             for e in episodes
             if not e["success"]
         ],

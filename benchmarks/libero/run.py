@@ -50,6 +50,9 @@ def main(config: RunConfig) -> dict[str, Any]:
     folder = run_folder(config.demos) / "evaluation"
     episodes = evaluation(folder, checkpoint, config.states, selected)
     figures, errors = summary(episodes), accuracy(checkpoint, root, episodes)
+    worst = {(e["task"], e["state"]): off for e, off in zip(episodes, errors.pop("off_mm"), strict=True)}
+    for failed in figures["failed"]:
+        failed["off_mm"] = worst[failed["task"], failed["state"]]
     timing = {"mine_and_train_s": seconds}
     if config.demos == DEMOS and config.states == STATES and selected == list(tasks()):
         write("libero_goal", {"demonstrations": DEMOS, **timing, **figures, "note": config.note})
