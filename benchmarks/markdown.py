@@ -49,5 +49,5 @@ def interval(run: dict[str, Any]) -> str:
 def table(heads: list[str], rows: list[list[Any]]) -> str:
     """A table in Markdown; None is a dash."""
     lines = [heads, ["---"] * len(heads), *rows]
-    cells = [["–" if cell is None else str(cell) for cell in line] for line in lines]
+    cells = [["-" if cell is None else str(cell) for cell in line] for line in lines]
     return "\n".join("| " + " | ".join(line) + " |" for line in cells)

@@ -225,6 +225,6 @@ def _losses(result: dict[str, Any]) -> str:
 def _equality(result: dict[str, Any]) -> str:
     return (
         f"{result['equal']} of {result['episodes']} episodes by LeRobot's own rollout and by the harness, "
-        f"which renders only when the policy looks, took the same actions bit by bit ({result['actions']} actions; "
-        f"largest difference {result['largest_difference']})."
+        "which renders only when the policy looks, took the same actions bit by bit "
+        f"({result['actions']} actions; largest difference {result['largest_difference']})."
     )
