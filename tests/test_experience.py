@@ -12,18 +12,20 @@ from tests.memory.builders import entry, key_pose, robot
 from tests.perception.builders import model, patch_model
 
 from lerobot_openspm.errors import MemoryFormatError, OpenSPMError
-from lerobot_openspm.experience import FILES, Experience, load_experience, save_experience
+from lerobot_openspm.experience import FILES, VERSION, Experience, load_experience, save_experience
 from lerobot_openspm.geometry import se3
 from lerobot_openspm.geometry.camera import Camera
-from lerobot_openspm.memory.entry import WORLD
+from lerobot_openspm.memory.entry import Axis
 from lerobot_openspm.memory.store import KEY_POSE_ARRAY, LAYOUT_ARRAY
+
+SLIDE = Axis("slide", np.array([0.0, -0.6, 0.8]), 0.15)
 
 
 def experience(**changes):
     T = se3.from_position_rotvec([0.1, 0.2, 0.3], [0.3, 0.2, 0.1])
     entries = (
         entry("put the bowl on the plate", source="local/demos#0"),
-        entry("open the top drawer", [key_pose("cabinet", T, "open", axes=WORLD)], source="local/demos#1"),
+        entry("open the top drawer", [key_pose("cabinet", T, "open", axis=SLIDE)], source="local/demos#1"),
     )
     fields = {
         "entries": entries,
@@ -179,8 +181,9 @@ def without(*path):
 
 ENTRY = ("entries", 0)
 POSE = (*ENTRY, "key_poses", 0)
+AXIS = {"kind": "slide", "direction": [1.0, 0.0, 0.0], "amount": 0.1}
 SPOILT = {
-    "newer version": (setting("version", value=3), r"version 3.*upgrade"),
+    "newer version": (setting("version", value=VERSION + 1), r"version 4.*upgrade"),
     "no version": (without("version"), "version None"),
     "version 0": (setting("version", value=0), "version 0"),
     "other format": (setting("format", value="zip"), "'zip'"),
@@ -227,6 +230,11 @@ SPOILT = {
     "steps beyond integers": (setting(*POSE, "n_steps", value=float("inf")), r"entries\[0\]"),
     "anchor that is nowhere": (setting(*POSE, "anchor", "place", value="cup"), r"entries\[0\].*'cup'"),
     "anchor as text": (setting(*POSE, "anchor", value="bowl"), r"entries\[0\]"),
+    "axis of no kind": (setting(*POSE, "axis", value=AXIS | {"kind": "bend"}), r"entries\[0\].*'bend'"),
+    "axis of 2 numbers": (setting(*POSE, "axis", value=AXIS | {"direction": [1, 0]}), r"entries\[0\].*unit"),
+    "axis too long": (setting(*POSE, "axis", value=AXIS | {"direction": [1, 1, 0]}), r"entries\[0\].*unit"),
+    "axis NaN": (setting(*POSE, "axis", value=AXIS | {"amount": float("nan")}), r"entries\[0\].*amount"),
+    "axis without amount": (setting(*POSE, "axis", value={"kind": "turn"}), r"entries\[0\]"),
     "anchor without axes": (without(*POSE, "anchor", "axes"), r"entries\[0\].*axes"),
 }  # fmt: skip
 

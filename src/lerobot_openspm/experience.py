@@ -28,8 +28,8 @@ from lerobot_openspm.perception.model import KnownObject
 from lerobot_openspm.perception.store import from_parts as object_from_parts
 from lerobot_openspm.perception.store import to_parts as object_to_parts
 
-# Version 2: objects known by patches.
-FORMAT, VERSION = "openspm-memory", 2
+# Version 2: objects known by patches. Version 3: key poses with the axis of their constraint.
+FORMAT, VERSION = "openspm-memory", 3
 MEMORY_JSON, MEMORY_ARRAYS, CAMERAS_JSON = "memory.json", "memory.safetensors", "cameras.json"
 FILES = (MEMORY_JSON, MEMORY_ARRAYS, CAMERAS_JSON)
 MAX_JSON_BYTES, MAX_ARRAY_BYTES = 512_000_000, 4_000_000_000

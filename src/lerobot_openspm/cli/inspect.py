@@ -12,7 +12,7 @@ import numpy as np
 
 from lerobot_openspm.experience import load_experience
 from lerobot_openspm.geometry import se3
-from lerobot_openspm.memory.entry import MemoryEntry
+from lerobot_openspm.memory.entry import MemoryEntry, MemoryKeyPose
 
 
 @dataclass
@@ -45,6 +45,15 @@ def main(args: list[str]) -> None:
     )
 
 
+def _constraint(pose: MemoryKeyPose) -> str:
+    if pose.axis is None:
+        return ""
+    along = " ".join(f"{x:.2f}" for x in pose.axis.direction)
+    if pose.axis.kind == "slide":
+        return f"  slides {1000 * pose.axis.amount:.0f} mm along {along}"
+    return f"  turns {np.rad2deg(pose.axis.amount):.0f} deg about {along}"
+
+
 def _lines(entry: MemoryEntry) -> list[str]:
     head = f"{entry.language!r} from {entry.source}, version {entry.version}, quality {entry.quality:.2f}"
     names = f"{'phase':10s} {'place':18s} {'axes':18s}"
@@ -55,5 +64,5 @@ def _lines(entry: MemoryEntry) -> list[str]:
         deg = " ".join(f"{np.rad2deg(x):6.1f}" for x in se3.log_so3(pose.T_obj_ee[:3, :3]))
         gripper = "closed" if pose.closed else "open"
         names = f"{pose.phase:10s} {pose.anchor.place:18s} {pose.anchor.axes:18s}"
-        rows.append(f"  {names} {mm:>24s} {deg:>22s} {gripper:7s} {pose.confidence:.2f}")
+        rows.append(f"  {names} {mm:>24s} {deg:>22s} {gripper:7s} {pose.confidence:.2f}{_constraint(pose)}")
     return [head, columns, *rows]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 from collections import deque
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import StrEnum
 from typing import Literal
 
@@ -32,6 +32,7 @@ STUCK_SHARE = 0.9
 # ... and the key pose counts as met within this multiple of the tolerance: what is touched is in the way.
 BLOCKED_SHARE = 3.0
 # Each step of a correction makes good this share of the residual, and this many steps are one correction.
+# Every further one pushes harder by as much: friction holds a hand that asks for millimetres.
 CORRECTION_SHARE, CORRECTION_STEPS = 0.2, 5
 
 
@@ -105,7 +106,10 @@ class Executor:
 
     def change(self, plan: Sequence[Target]) -> None:
         """Follow a better version of the same plan from here on."""
+        present = self.plan[self.index]
         self.plan = tuple(plan)
+        if present.axis is not None:  # it goes on from where the hand took hold
+            self._replace_target(present)
         self._queue.clear()
 
     @property
@@ -130,11 +134,12 @@ class Executor:
                 self._queue.clear()
             else:
                 self._enter(self.index + 1, hand)
-        if self.status is Status.RUNNING and self.corrections > self._settings.max_corrections:
+        given_up = self.corrections > self._settings.max_corrections
+        passing = not self.plan[self.index].precise and self.index + 1 < len(self.plan)
+        if self.status is Status.RUNNING and passing and (given_up or self._blocked):
             # A hand that is held up short of a key pose it only passes by goes on to the next one.
-            if not self.plan[self.index].precise and self.index + 1 < len(self.plan):
-                self._enter(self.index + 1, hand)
-                return False
+            self._enter(self.index + 1, hand)
+        elif self.status is Status.RUNNING and given_up:
             metres, radians = se3.distances(hand.T_world_ee, self.plan[self.index].T_world_ee)
             return self._retry(f"it stays {1000 * metres:.1f} mm and {radians:.3f} rad away")
         return False
@@ -172,9 +177,9 @@ class Executor:
             self._blocked = left > STUCK_SHARE * self._left
             self._left = left
         self._late_steps += 1
-        return self._toward(hand)
+        return self._toward(hand, min(1.0, CORRECTION_SHARE * self.corrections))
 
-    def _toward(self, hand: Hand) -> Array:
+    def _toward(self, hand: Hand, share: float = CORRECTION_SHARE) -> Array:
         """An action straight towards the key pose, and the fingers as it says.
 
         A hand that waits for its fingers is kept there by it: nothing in the flow model's condition says how
@@ -182,7 +187,7 @@ class Executor:
         """
         target, gains = self.plan[self.index], self._gains()
         residual = se3.increment(self._here(hand), target.T_world_ee)
-        motion: Array = np.where(gains > 0, CORRECTION_SHARE * residual / np.maximum(gains, 1e-9), 0.0)
+        motion: Array = np.where(gains > 0, share * residual / np.maximum(gains, 1e-9), 0.0)
         motion = motion / max(1.0, float(np.abs(motion).max()))
         return np.append(motion, self._robot.command(target.memory.closed))
 
@@ -224,6 +229,13 @@ class Executor:
         self.index, self._steps, self._late_steps, self.corrections = index, 0, 0, 0
         self._left, self._blocked = np.inf, False
         self._queue.clear()
+        target = self.plan[index]
+        if target.axis is not None:
+            # What slides or turns does so from where the hand took hold of it, be that a little off.
+            self._replace_target(replace(target, T_world_ee=target.axis.follow(self._start)))
+
+    def _replace_target(self, target: Target) -> None:
+        self.plan = (*self.plan[: self.index], target, *self.plan[self.index + 1 :])
 
     def _nominal_steps(self) -> int:
         """How long the way to the key pose should take, by the demonstration and by its length here."""

@@ -9,7 +9,7 @@ import numpy as np
 
 from lerobot_openspm.geometry import se3
 from lerobot_openspm.geometry.se3 import Array
-from lerobot_openspm.memory.entry import MemoryEntry, MemoryKeyPose
+from lerobot_openspm.memory.entry import Axis, MemoryEntry, MemoryKeyPose
 from lerobot_openspm.memory.robot import RobotModel
 
 # Phases in which the hand touches something: their key poses are met precisely, the others in passing.
@@ -31,11 +31,13 @@ class Target:
         T_world_ee: Where the hand is to be, ``(4, 4)``.
         memory: The key pose it was carried over from.
         precise: Whether it is met by terminal residual correction, or only passed by.
+        axis: The constraint that the way here follows, its direction in the world; None in free space.
     """
 
     T_world_ee: Array
     memory: MemoryKeyPose
     precise: bool
+    axis: Axis | None = None
 
 
 def transfer_pose(T_world_obj: Array, T_obj_ee: Array) -> Array:
@@ -64,13 +66,17 @@ def transfer(
         for name in pose.anchor.objects:
             if name not in chosen:
                 chosen[name] = _nearest_equivalent(name, pose, {**layout, **chosen}, yaw_periods, before)
-        before = transfer_pose(pose.anchor.frame(chosen), pose.T_obj_ee)
+        T_world_anchor = pose.anchor.frame(chosen)
+        before = transfer_pose(T_world_anchor, pose.T_obj_ee)
         after = entry.key_poses[i + 1] if i + 1 < len(entry.key_poses) else None
         # The arrival before the fingers move is where a grasp or a release is decided.
         precise = pose.phase in PRECISE_PHASES or (
             after is not None and (after.dwell or after.phase == "push")
         )
-        targets.append(Target(before, pose, precise))
+        axis = pose.axis
+        if axis is not None:
+            axis = replace(axis, direction=T_world_anchor[:3, :3] @ axis.direction)
+        targets.append(Target(before, pose, precise, axis))
     if targets and entry.key.sub_tasks[-1].operation == "put":
         targets += _release(targets)
     return tuple(targets) + _retreat(targets)

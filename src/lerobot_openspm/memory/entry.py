@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from typing import Literal
 
 import numpy as np
 
@@ -77,6 +78,32 @@ class Anchor:
         return se3.transform(rotation, layout[self.place][:3, 3])
 
 
+AxisKind = Literal["slide", "turn"]
+# What the phases in which an object follows the hand along a constraint do.
+AXIS_KINDS: dict[str, AxisKind] = {"open": "slide", "turn": "turn"}
+
+
+@dataclass(frozen=True)
+class Axis:
+    """What an anchor that moves along a constraint allows: a drawer slides, a knob turns.
+
+    Attributes:
+        kind: Whether it is a direction to slide in or an axis to turn about.
+        direction: Unit vector ``(3,)`` in the anchor's frame.
+        amount: How far the demonstration went, metres or radians.
+    """
+
+    kind: AxisKind
+    direction: Array
+    amount: float
+
+    def follow(self, T: Array) -> Array:
+        """Where a hand at ``T`` ``(4, 4)``, in the frame of the direction, ends that goes all the way."""
+        if self.kind == "slide":
+            return se3.transform(T[:3, :3], T[:3, 3] + self.amount * self.direction)
+        return se3.transform(se3.exp_so3(self.amount * self.direction) @ T[:3, :3], T[:3, 3])
+
+
 @dataclass(frozen=True)
 class MemoryKeyPose:
     """Where the hand was relative to the object that mattered, at one phase boundary.
@@ -90,6 +117,7 @@ class MemoryKeyPose:
         opening: Gripper opening observed here, in the units of the robot's state.
         n_steps: Control steps the demonstration took to get here from the key pose before, pauses left out.
         dwell: Whether the hand stands still on the way here while the gripper opens or closes.
+        axis: The constraint that the way here follows; None in free space.
     """
 
     anchor: Anchor
@@ -100,6 +128,7 @@ class MemoryKeyPose:
     opening: float
     n_steps: int
     dwell: bool
+    axis: Axis | None = None
 
 
 @dataclass(frozen=True)

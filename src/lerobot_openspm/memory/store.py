@@ -4,14 +4,23 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
-from typing import Any
+from typing import Any, cast, get_args
 
 import numpy as np
 
 from lerobot_openspm.errors import MemoryFormatError
 from lerobot_openspm.geometry import se3
 from lerobot_openspm.geometry.se3 import Array
-from lerobot_openspm.memory.entry import PHASES, Anchor, MemoryEntry, MemoryKeyPose, RetrievalKey, SubTask
+from lerobot_openspm.memory.entry import (
+    PHASES,
+    Anchor,
+    Axis,
+    AxisKind,
+    MemoryEntry,
+    MemoryKeyPose,
+    RetrievalKey,
+    SubTask,
+)
 from lerobot_openspm.memory.robot import RobotModel
 
 # What reading a field of another kind, or a number beyond what Python converts, ends in.
@@ -24,10 +33,7 @@ def entries_to_parts(entries: Sequence[MemoryEntry]) -> tuple[list[dict[str, Any
     """Split entries into JSON rows and two arrays of transforms, in the order of the rows."""
     rows: list[dict[str, Any]] = []
     for entry in entries:
-        key_poses = [
-            {name: value for name, value in asdict(pose).items() if name != "T_obj_ee"}
-            for pose in entry.key_poses
-        ]
+        key_poses = [_key_pose_fields(pose) for pose in entry.key_poses]
         rows.append(
             {
                 "language": entry.language,
@@ -42,6 +48,14 @@ def entries_to_parts(entries: Sequence[MemoryEntry]) -> tuple[list[dict[str, Any
     poses = [pose.T_obj_ee for entry in entries for pose in entry.key_poses]
     layouts = [T for entry in entries for T in entry.layout.values()]
     return rows, {KEY_POSE_ARRAY: _stacked(poses), LAYOUT_ARRAY: _stacked(layouts)}
+
+
+def _key_pose_fields(pose: MemoryKeyPose) -> dict[str, Any]:
+    """What a key pose says beside its transform."""
+    fields = {name: value for name, value in asdict(pose).items() if name != "T_obj_ee"}
+    if pose.axis is not None:
+        fields["axis"] = {**fields["axis"], "direction": pose.axis.direction.tolist()}
+    return fields
 
 
 def _stacked(transforms: Sequence[Array]) -> Array:
@@ -113,7 +127,20 @@ def _key_pose(fields: Mapping[str, Any], T_obj_ee: Array) -> MemoryKeyPose:
         opening,
         int(fields["n_steps"]),
         fields["dwell"],
+        None if fields.get("axis") is None else _axis(fields["axis"]),
     )
+
+
+def _axis(fields: Mapping[str, Any]) -> Axis:
+    kind, direction = str(fields["kind"]), np.asarray(fields["direction"], float)
+    amount = float(fields["amount"])
+    if kind not in get_args(AxisKind):
+        raise ValueError(f"axis is of kind {kind!r}, expected one of {get_args(AxisKind)}")
+    if direction.shape != (3,) or not abs(float(np.linalg.norm(direction)) - 1) < 1e-6:
+        raise ValueError(f"axis has direction {direction.tolist()}, expected a unit vector of 3 numbers")
+    if not np.isfinite(amount):
+        raise ValueError(f"axis has amount {amount}, expected a finite number")
+    return Axis(cast(AxisKind, kind), direction, amount)
 
 
 def _transforms(arrays: Mapping[str, Array], name: str, where: str) -> Array:

@@ -14,7 +14,7 @@ from lerobot_openspm.errors import DatasetError, InstructionError
 from lerobot_openspm.geometry import se3
 from lerobot_openspm.geometry.camera import Camera
 from lerobot_openspm.geometry.se3 import Array
-from lerobot_openspm.memory.entry import Anchor, MemoryEntry, MemoryKeyPose, RetrievalKey, SubTask
+from lerobot_openspm.memory.entry import Anchor, Axis, MemoryEntry, MemoryKeyPose, RetrievalKey, SubTask
 from lerobot_openspm.memory.instruction import parse_instruction
 from lerobot_openspm.memory.robot import RobotModel
 from lerobot_openspm.mining.anchors import (
@@ -27,6 +27,7 @@ from lerobot_openspm.mining.anchors import (
     roles,
     sub_task_of,
 )
+from lerobot_openspm.mining.axes import constrained_axes
 from lerobot_openspm.mining.dataset import Demonstrations
 from lerobot_openspm.mining.key_poses import KeyPose, find_key_poses
 from lerobot_openspm.mining.signals import Episode
@@ -220,8 +221,9 @@ def build_entries(
         sub_tasks = mined[members[0]].sub_tasks
         group = align_symmetric([Demonstration(mined[i].key_poses, layouts[i]) for i in members], yaw_periods)
         anchors = consensus(group, sub_tasks)
-        for i, demonstration, quality in zip(members, group, qualities(group, anchors), strict=True):
-            key_poses = _remember(demonstration, anchors)
+        judged = zip(members, group, constrained_axes(group, anchors), qualities(group, anchors), strict=True)
+        for i, demonstration, axes, quality in judged:
+            key_poses = _remember(demonstration, anchors, axes)
             if key_poses is None:
                 logger.warning(
                     "skipping episode %d of %s: its anchors were not found", mined[i].episode.index, source
@@ -239,7 +241,7 @@ def build_entries(
 
 
 def _remember(
-    demonstration: Demonstration, anchors: Mapping[Role, Anchor]
+    demonstration: Demonstration, anchors: Mapping[Role, Anchor], axes: Mapping[Role, Axis]
 ) -> tuple[MemoryKeyPose, ...] | None:
     """Express key poses in their anchors' frames; None if a contact's anchor was not found."""
     kept = []
@@ -260,6 +262,7 @@ def _remember(
                 pose.opening,
                 pose.n_steps,
                 pose.dwell,
+                axes.get(role),
             )
         )
     return tuple(kept)
