@@ -38,6 +38,8 @@ class OpenSPMConfig(PreTrainedConfig):
         state_rotation: How the state writes the rotation, where its names are wrong about it: "axis_angle",
             "quat", "euler" or "none".
         action_rotation: Likewise for the action.
+        control_hz: How often the robot takes an action, where it is known. Only compared with what the dataset
+            says of itself: OpenSPM counts steps.
         perception: "demonstrations" finds objects in the images, by what the demonstrations showed of them.
             "oracle" takes their poses from the simulator, for ablations only.
         memory_episodes: Episodes that may enter the memory and the training samples; all if not given. Name
@@ -81,6 +83,7 @@ class OpenSPMConfig(PreTrainedConfig):
     action_layout: list[str] | None = None
     state_rotation: str | None = None
     action_rotation: str | None = None
+    control_hz: float | None = None
 
     # Memory and perception.
     perception: PerceptionSource = "demonstrations"
@@ -146,6 +149,8 @@ class OpenSPMConfig(PreTrainedConfig):
         for name in positive:
             if not getattr(self, name) > 0:  # NaN is not either
                 raise ValueError(f"{name} is {getattr(self, name)}, expected more than 0")
+        if self.control_hz is not None and not self.control_hz > 0:
+            raise ValueError(f"control_hz is {self.control_hz}, expected more than 0, or none")
         not_negative = (
             "perturbation_m", "perturbation_rad", "max_corrections", "max_attempts", "reach_margin_m",
             "min_clearance_m", "weight_semantic", "weight_geometric", "weight_quality", "noise_seed",

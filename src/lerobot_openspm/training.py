@@ -69,6 +69,7 @@ def mine_experience(
             "mining needs the cameras' calibration, got none; pass --policy.cameras=FILE, e.g. "
             "configs/cameras/openspm_tabletop.json"
         )
+    _compare_rates(dataset_meta, config)
     demonstrations = open_demonstrations(dataset_meta, config)
     episodes = demonstrations.episodes(config.memory_episodes)
     robot = observe_robot(episodes, known.robot if known else None)
@@ -93,6 +94,19 @@ def mine_experience(
     )  # fmt: skip
     experience = Experience(entries, objects.models, robot, dict(cameras), config.perception, names)
     return known.appended(experience) if known else experience
+
+
+def _compare_rates(dataset_meta: Any, config: OpenSPMConfig) -> None:
+    """Say so where a dataset claims another rate than the robot's; nothing is computed from either."""
+    if config.control_hz is None or float(dataset_meta.fps) == config.control_hz:
+        return
+    logger.warning(
+        "dataset %s says %g frames per second, but the robot takes %g actions per second. OpenSPM counts "
+        "steps, so this is harmless where only the number is wrong, as in the public LIBERO dataset; if the "
+        "frames were really recorded at %g Hz, every recorded action reaches further than one step does, and "
+        "the demonstrations have to be recorded again at the robot's rate",
+        dataset_meta.repo_id, dataset_meta.fps, config.control_hz, dataset_meta.fps,
+    )  # fmt: skip
 
 
 def training_set(dataset_meta: Any, config: OpenSPMConfig, robot: RobotModel) -> TrainingSet:
