@@ -38,8 +38,8 @@ class OpenSPMConfig(PreTrainedConfig):
         state_rotation: How the state writes the rotation, where its names are wrong about it: "axis_angle",
             "quat", "euler" or "none".
         action_rotation: Likewise for the action.
-        control_hz: How often the robot takes an action, where it is known. Only compared with what the dataset
-            says of itself: OpenSPM counts steps.
+        control_hz: How often the robot takes an action, where it is known. Only compared with what the
+            dataset says of itself: OpenSPM counts steps.
         perception: "demonstrations" finds objects in the images, by what the demonstrations showed of them.
             "oracle" takes their poses from the simulator, for ablations only.
         memory_episodes: Episodes that may enter the memory and the training samples; all if not given. Name
