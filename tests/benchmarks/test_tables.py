@@ -1,0 +1,93 @@
+"""The page of results says what the committed JSON files say, and what has not been measured."""
+
+import json
+from pathlib import Path
+
+import pytest
+from benchmarks.libero import tables as libero_tables
+
+from benchmarks import markdown, tables
+
+MACHINE = {"commit": "0123456789ab", "machine": {"cores": 2, "processor": "x86_64"}}
+RATE = {"success": 0.5, "n": 4, "interval": [0.15, 0.85], "mean_steps": 100.0}
+
+
+@pytest.fixture
+def results(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """An empty folder of results."""
+    for module in (markdown, libero_tables):
+        monkeypatch.setattr(module, "RESULTS", tmp_path)
+    return tmp_path
+
+
+def put(folder: Path, name: str, **content) -> None:
+    (folder / f"{name}.json").write_text(json.dumps({**MACHINE, **content}))
+
+
+def page(monkeypatch: pytest.MonkeyPatch, folder: Path) -> str:
+    monkeypatch.setattr(tables, "PAGE", folder / "page.md")
+    tables.write_page()
+    return (folder / "page.md").read_text()
+
+
+def test_the_committed_page_is_made_of_the_committed_results(tmp_path, monkeypatch):
+    committed = tables.PAGE.read_text()
+    assert page(monkeypatch, tmp_path) == committed, "run: python -m benchmarks.tables"
+
+
+def test_what_is_not_measured_says_so_and_how_to_measure_it(results, monkeypatch):
+    text = page(monkeypatch, results)
+    assert text.count("Not measured") == 4 + len(libero_tables.libero_parts()) - 1
+    assert "`execution.json` is missing; run `python -m benchmarks.figures`" in text
+    assert "`libero_goal.json` is missing; run `python -m benchmarks.libero.run`" in text
+
+
+def test_failures_are_told_apart_by_rule(results, monkeypatch):
+    failed = [
+        {"task": task, "state": state, "status": "done", "phase": "retreat", "attempts": 0, "off_mm": off}
+        for task, state, off in (
+            ("push_the_plate", 1, 1.0),
+            ("put_the_bowl", 2, 2.0),
+            ("put_the_bowl", 3, 30.0),
+        )
+    ]
+    per_task = {"put_the_bowl": RATE}
+    put(
+        results,
+        "libero_goal",
+        **RATE,
+        demonstrations=10,
+        mine_and_train_s=200,
+        note="",
+        per_task=per_task,
+        failed=failed,
+    )
+    text = page(monkeypatch, results)
+    for category in ("perception", "small tolerances", "geometric constraints"):
+        assert f"| {category} | 1 |" in text
+    assert "2 of 3 failed episodes failed physically" in text
+    assert "put the bowl, state 3 (done in retreat" in text
+
+
+def test_the_curve_of_few_demonstrations_ends_with_the_main_result(results, monkeypatch):
+    for n in (3, 1):
+        put(results, f"libero_few_shot_{n}", **RATE, demonstrations=n, mine_and_train_s=9)
+    put(
+            results, f"libero_few_shot_{demonstrations}", **RATE, demonstrations=demonstrations, mine_and_train_s=9,
+        )  # fmt: skip
+    put(
+        results,
+        "libero_goal",
+        **RATE,
+        demonstrations=10,
+        mine_and_train_s=200,
+        note="",
+        per_task={},
+        failed=[],
+    )
+    rows = [
+        line
+        for line in page(monkeypatch, results).splitlines()
+        if line.endswith("| 9 |") or "| 200 |" in line
+    ]
+    assert [row.split("|")[1].strip() for row in rows] == ["1", "3", "10"]
