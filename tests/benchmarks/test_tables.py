@@ -73,9 +73,6 @@ def test_the_curve_of_few_demonstrations_ends_with_the_main_result(results, monk
     for n in (3, 1):
         put(results, f"libero_few_shot_{n}", **RATE, demonstrations=n, mine_and_train_s=9)
     put(
-            results, f"libero_few_shot_{demonstrations}", **RATE, demonstrations=demonstrations, mine_and_train_s=9,
-        )  # fmt: skip
-    put(
         results,
         "libero_goal",
         **RATE,
