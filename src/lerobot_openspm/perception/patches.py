@@ -197,7 +197,7 @@ def _cut(view: View, point_world: Array, radius: float) -> Patch | None:
     high = np.minimum(np.round(uv + half) + 1, [view.camera.width, view.camera.height]).astype(int)
     if (high - low).min() < max(MIN_PATCH_PX, half):
         return None
-    image = _lab(view.image)[low[1] : high[1], low[0] : high[0]]
+    image = _lab(view.image[low[1] : high[1], low[0] : high[0]])
     if image.reshape(-1, 3).std(axis=0).max() < MIN_CONTRAST:
         return None
     return Patch(image, low.astype(float), point_world)
@@ -225,10 +225,10 @@ def _match(patch: Patch, seen_with: View | Probe, view: View) -> _Sight | None:
     x, y = patch.corner.astype(int)
     low = np.maximum([x - reach, y - reach], 0)
     high = np.minimum([x + width + reach, y + height + reach], [camera.width, camera.height])
-    window = _lab(view.image)[low[1] : high[1], low[0] : high[0]]
+    window = view.image[low[1] : high[1], low[0] : high[0]]
     if window.shape[0] < height or window.shape[1] < width:
         return None
-    scores = np.asarray(cv2.matchTemplate(window, patch.image, cv2.TM_CCOEFF_NORMED), np.float32)
+    scores = np.asarray(cv2.matchTemplate(_lab(window), patch.image, cv2.TM_CCOEFF_NORMED), np.float32)
     _, correlation, _, (u, v) = cv2.minMaxLoc(scores)
     shift = np.add(low, [u + _vertex(scores[v], u), v + _vertex(scores[:, u], v)]) - patch.corner
     # How the projection moves as the point does, on its horizontal plane.
