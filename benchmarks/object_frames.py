@@ -21,7 +21,7 @@ def offset(experience: Experience, name: str, demonstrations: Demonstrations) ->
         if name in entry.layout:
             episode = demonstrations.episodes([int(entry.source.rsplit("#", 1)[1])])[0]
             poses = demonstrations.simulator_poses(episode, 0)
-            truth = name_simulator_poses(poses, [name], experience.objects)[name]
+            truth = upright(name_simulator_poses(poses, [name], experience.objects)[name])
             equivalents = [se3.inverse(truth) @ T for T in se3.yaw_equivalents(entry.layout[name], period)]
             relative.append(min(equivalents, key=lambda T: abs(float(se3.yaw_of(T)))))
     relative = np.stack(relative)
@@ -39,9 +39,14 @@ def error(
         T_sim_obj: The model's :func:`offset`.
         period: Angle that truly turns the object into itself, radians; 0 for a body of revolution.
     """
-    T_error = se3.inverse(T_sim) @ T_world_obj @ se3.inverse(T_sim_obj)
+    T_error = se3.inverse(upright(T_sim)) @ T_world_obj @ se3.inverse(T_sim_obj)
     yaw = float(abs(se3.wrap_angle(se3.yaw_of(T_error), period))) if period > 0 else np.nan
     return float(np.linalg.norm(T_error[:3, 3])), yaw
+
+
+def upright(T: np.ndarray) -> np.ndarray:
+    """A pose with its tilt left out, as perception's are: a simulator's body may be modelled lying down."""
+    return se3.from_yaw(T[:3, 3], float(se3.yaw_of(T)))
 
 
 def summary(errors: np.ndarray, period: float) -> dict:

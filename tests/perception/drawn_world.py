@@ -33,10 +33,11 @@ def cameras() -> dict[str, tuple[Camera, np.ndarray]]:
     return placed
 
 
-def render(objects: list[tuple[tuple, np.ndarray]]) -> dict[str, View]:
-    """Draw shapes at poses ``T_world_obj``, the furthest first, antialiased."""
+def render(objects: list[tuple[tuple, np.ndarray]], T_moved: np.ndarray | None = None) -> dict[str, View]:
+    """Draw shapes at ``T_world_obj``, the furthest first, antialiased; ``T_moved`` moves the cameras."""
     views = {}
-    for name, (camera, T_world_cam) in cameras().items():
+    for name, (camera, T_world_usual) in cameras().items():
+        T_world_cam = T_world_usual if T_moved is None else T_moved @ T_world_usual
         image = np.full((4 * SIZE, 4 * SIZE, 3), TABLE, np.uint8)
         order = sorted(objects, key=lambda pair: -np.linalg.norm(pair[1][:3, 3] - T_world_cam[:3, 3]))
         for (half, height, side, top, is_round), T in order:
@@ -67,8 +68,8 @@ def draw_poses(rng: np.random.Generator) -> dict[str, np.ndarray]:
     }
 
 
-def views_of(poses: dict[str, np.ndarray]) -> dict[str, View]:
-    return render([(SHAPES.get(name, DISTRACTOR), T) for name, T in poses.items()])
+def views_of(poses: dict[str, np.ndarray], T_moved: np.ndarray | None = None) -> dict[str, View]:
+    return render([(SHAPES.get(name, DISTRACTOR), T) for name, T in poses.items()], T_moved)
 
 
 def demonstration(rng: np.random.Generator, wrong: bool = False) -> Scene:

@@ -73,6 +73,18 @@ def test_another_image_size_gives_the_same_place(models, unseen):
     np.testing.assert_allclose(scaled.T_world_obj, plain.T_world_obj, atol=1e-3)
 
 
+@pytest.mark.parametrize("shift", [(0.012, -0.008, 0.005), (-0.01, 0.01, -0.006)])
+@pytest.mark.parametrize("name", ["block", "cup"])
+def test_a_camera_on_a_hand_that_starts_elsewhere_gives_the_same_place(models, unseen, name, shift):
+    T_moved = se3.transform(np.eye(3), np.array(shift))
+    usual = np.stack([localise(views_of(one), models[name]).T_world_obj[:2, 3] for one in unseen])
+    found = [localise(views_of(one, T_moved), models[name]) for one in unseen]
+    assert all(one.status == "found" for one in found)
+    away = np.linalg.norm(np.stack([one.T_world_obj[:2, 3] for one in found]) - usual, axis=1)
+    # Taken for a motion of the object, that of the camera would be more than a centimetre.
+    assert away.mean() < 0.002
+
+
 def test_a_camera_that_moved_does_not_help(models, unseen):
     T_moved = se3.from_yaw([0.1, 0.0, 0.0], 0.0)
     moved = {

@@ -216,23 +216,29 @@ def _looks_turned(patch: Patch, seen_with: View, view: View) -> bool:
 
 
 def _match(patch: Patch, seen_with: View | Probe, view: View) -> _Sight | None:
-    """Find a patch near its old place in another view of the same camera; None at the image's border."""
+    """Find a patch near its old place in another view of the same camera; None at the image's border.
+
+    A hand camera may have been a little elsewhere then: the patch is expected where its point is seen now.
+    """
     camera = seen_with.camera if isinstance(seen_with, View) else seen_with.calibration
-    T_world_cam = seen_with.T_world_cam
-    uv, depth = project(camera, T_world_cam, patch.point_world)
+    uv_then, _ = project(camera, seen_with.T_world_cam, patch.point_world)
+    uv, depth = project(camera, view.T_world_cam, patch.point_world)
+    if not np.isfinite([*uv_then, *uv]).all():
+        return None
+    expected = patch.corner + uv - uv_then
     reach = int(np.ceil(camera.focal_px * REACH_M / depth))
     height, width = patch.image.shape[:2]
-    x, y = patch.corner.astype(int)
+    x, y = np.round(expected).astype(int)
     low = np.maximum([x - reach, y - reach], 0)
-    high = np.minimum([x + width + reach, y + height + reach], [camera.width, camera.height])
+    high = np.clip([x + width + reach, y + height + reach], 0, [camera.width, camera.height])
     window = view.image[low[1] : high[1], low[0] : high[0]]
     if window.shape[0] < height or window.shape[1] < width:
         return None
     scores = np.asarray(cv2.matchTemplate(_lab(window), patch.image, cv2.TM_CCOEFF_NORMED), np.float32)
     _, correlation, _, (u, v) = cv2.minMaxLoc(scores)
-    shift = np.add(low, [u + _vertex(scores[v], u), v + _vertex(scores[:, u], v)]) - patch.corner
+    shift = np.add(low, [u + _vertex(scores[v], u), v + _vertex(scores[:, u], v)]) - expected
     # How the projection moves as the point does, on its horizontal plane.
-    moved, _ = project(camera, T_world_cam, patch.point_world + np.eye(3)[:2] * 1e-3)
+    moved, _ = project(camera, view.T_world_cam, patch.point_world + np.eye(3)[:2] * 1e-3)
     return _Sight(
         patch.point_world + np.append(np.linalg.solve((moved - uv).T / 1e-3, shift), 0.0), float(correlation)
     )
