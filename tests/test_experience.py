@@ -183,7 +183,7 @@ ENTRY = ("entries", 0)
 POSE = (*ENTRY, "key_poses", 0)
 AXIS = {"kind": "slide", "direction": [1.0, 0.0, 0.0], "amount": 0.1}
 SPOILT = {
-    "newer version": (setting("version", value=VERSION + 1), r"version 4.*upgrade"),
+    "newer version": (setting("version", value=VERSION + 1), rf"version {VERSION + 1}.*upgrade"),
     "no version": (without("version"), "version None"),
     "version 0": (setting("version", value=0), "version 0"),
     "other format": (setting("format", value="zip"), "'zip'"),

@@ -23,6 +23,7 @@ from lerobot_openspm.errors import (
     ObservationError,
     OpenSPMError,
 )
+from lerobot_openspm.experience import VERSION
 from lerobot_openspm.modeling_openspm import OpenSPMPolicy
 
 FRONT = "observation.images.front"
@@ -122,7 +123,10 @@ def test_a_truncated_memory_is_refused(load: Callable[..., OpenSPMPolicy], copy:
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"version": 3}, "got version 3, this release reads up to 2; upgrade"),
+        (
+            {"version": VERSION + 1},
+            f"got version {VERSION + 1}, this release reads up to {VERSION}; upgrade",
+        ),
         ({"version": "1"}, "got version '1'"),
         ({"format": "something"}, "got format 'something', expected 'openspm-memory'"),
         ({"entries": {}}, "must be lists"),
