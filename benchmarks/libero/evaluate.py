@@ -98,7 +98,7 @@ def _refuse_others(config: EvaluationConfig, output: Path) -> None:
     kept = output / "made_of.json"
     if kept.exists() and json.loads(kept.read_text()) != made_of:
         raise FileExistsError(
-            f"{output} holds episodes of another policy or settings; choose another --output"
+            f"{output} holds episodes of another policy or settings; remove it, or choose another --output"
         )
     write_json(kept, made_of)
 

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from lerobot_openspm.envs.libero.simulator import OBJECTS, LiberoSimulator, tasks
-from lerobot_openspm.experience import load_experience
+from lerobot_openspm.experience import Experience, load_experience
 from lerobot_openspm.geometry import se3
 from lerobot_openspm.geometry.se3 import Array
 from lerobot_openspm.memory.entry import WORLD, Anchor, MemoryEntry, MemoryKeyPose, RetrievalKey
@@ -40,7 +40,8 @@ def guessing_policy(oracle: Path, folder: Path) -> Path:
     return folder
 
 
-def _guess(task: str, instruction: str, experience) -> MemoryEntry:
+def _guess(task: str, instruction: str, experience: Experience) -> MemoryEntry:
+    """One task's entry, in the frames of the simulator's objects with the world's axes."""
     simulator = LiberoSimulator(task)
     simulator.reset(0)
     sub_tasks = parse_instruction(instruction)
@@ -54,11 +55,11 @@ def _guess(task: str, instruction: str, experience) -> MemoryEntry:
 
     def add(name: str, offset: Array, phase: str, closed: bool, turn: float = 0.0) -> None:
         rotation = se3.from_yaw(np.zeros(3), turn)[:3, :3] @ down
-        T = se3.transform(rotation, middles[name] + offset)
+        T_obj_ee = se3.transform(rotation, middles[name] + offset)
         dwell = phase in ("grasp", "release")
         steps = FINGER_STEPS if dwell else TRAVEL_STEPS
         opening = HELD_SHARE * width if closed else width
-        poses.append(MemoryKeyPose(Anchor(name, WORLD), T, phase, 0.5, closed, opening, steps, dwell))
+        poses.append(MemoryKeyPose(Anchor(name, WORLD), T_obj_ee, phase, 0.5, closed, opening, steps, dwell))
 
     up = np.array([0.0, 0.0, ABOVE_M])
     for sub_task in sub_tasks:

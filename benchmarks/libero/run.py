@@ -47,7 +47,7 @@ def main(config: RunConfig) -> dict[str, Any]:
         )
     root = dataset(config.demos, selected)
     checkpoint, seconds = policy(root, "train")
-    folder = run_folder(config.demos) / "evaluation"
+    folder = run_folder(config.demos, selected) / "evaluation"
     episodes = evaluation(folder, checkpoint, config.states, selected)
     figures, errors = summary(episodes), accuracy(checkpoint, root, episodes)
     worst = {(e["task"], e["state"]): off for e, off in zip(episodes, errors.pop("off_mm"), strict=True)}

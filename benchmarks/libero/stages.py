@@ -20,9 +20,12 @@ TRAIN_CONFIG = Path("configs/openspm_libero_train.yaml")
 DEMOS, STATES = 10, 50
 
 
-def run_folder(demos: int = DEMOS) -> Path:
-    """Where everything made of so many demonstrations a task lies."""
-    return Path("outputs/libero") / f"demos_{demos}"
+def run_folder(demos: int = DEMOS, selected: Sequence[str] | None = None) -> Path:
+    """Where everything made of so many demonstrations a task lies; a part of the tasks has its own folder."""
+    known = list(tasks())
+    chosen = known if selected is None else list(selected)
+    some = "" if chosen == known else "_tasks_" + "_".join(str(known.index(task)) for task in chosen)
+    return Path("outputs/libero") / f"demos_{demos}{some}"
 
 
 def select_tasks(selection: str) -> list[str]:
@@ -45,7 +48,7 @@ def select_tasks(selection: str) -> list[str]:
 
 def dataset(demos: int = DEMOS, selected: Sequence[str] | None = None) -> Path:
     """The demonstrations, recorded if need be."""
-    root = run_folder(demos) / "dataset"
+    root = run_folder(demos, selected) / "dataset"
     names = ",".join(selected) if selected and list(selected) != list(tasks()) else "all"
     collect(CollectConfig(SimulatorConfig("libero", names), episodes=demos, root=str(root), repo_id=REPO_ID))
     return root

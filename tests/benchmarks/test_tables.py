@@ -24,6 +24,10 @@ def put(folder: Path, name: str, **content) -> None:
     (folder / f"{name}.json").write_text(json.dumps({**MACHINE, **content}))
 
 
+def put_main_result(folder: Path, **content) -> None:
+    put(folder, "libero_goal", **RATE, demonstrations=10, mine_and_train_s=200, note="", **content)
+
+
 def page(monkeypatch: pytest.MonkeyPatch, folder: Path) -> str:
     monkeypatch.setattr(tables, "PAGE", folder / "page.md")
     tables.write_page()
@@ -51,17 +55,7 @@ def test_failures_are_told_apart_by_rule(results, monkeypatch):
             ("put_the_bowl", 3, 30.0),
         )
     ]
-    per_task = {"put_the_bowl": RATE}
-    put(
-        results,
-        "libero_goal",
-        **RATE,
-        demonstrations=10,
-        mine_and_train_s=200,
-        note="",
-        per_task=per_task,
-        failed=failed,
-    )
+    put_main_result(results, per_task={"put_the_bowl": RATE}, failed=failed)
     text = page(monkeypatch, results)
     for category in ("perception", "small tolerances", "geometric constraints"):
         assert f"| {category} | 1 |" in text
@@ -72,16 +66,7 @@ def test_failures_are_told_apart_by_rule(results, monkeypatch):
 def test_the_curve_of_few_demonstrations_ends_with_the_main_result(results, monkeypatch):
     for n in (3, 1):
         put(results, f"libero_few_shot_{n}", **RATE, demonstrations=n, mine_and_train_s=9)
-    put(
-        results,
-        "libero_goal",
-        **RATE,
-        demonstrations=10,
-        mine_and_train_s=200,
-        note="",
-        per_task={},
-        failed=[],
-    )
+    put_main_result(results, per_task={}, failed=[])
     rows = [
         line
         for line in page(monkeypatch, results).splitlines()

@@ -11,7 +11,6 @@ from lerobot_openspm.control.executor import ControlSettings, Executor, Hand, St
 from lerobot_openspm.control.transfer import transfer
 from lerobot_openspm.errors import OpenSPMError
 from lerobot_openspm.geometry import se3
-from lerobot_openspm.memory.entry import Axis
 
 HOME = hand_pose(0.0, 0.0, 0.3)
 ROBOT = robot()
@@ -349,41 +348,6 @@ def test_what_is_in_the_way_counts_as_met_when_the_key_pose_is_near(gap, retries
     _, retries, _ = run(executor, world, n_steps=150, until=lambda e: e.index > 1)
     assert (executor.index > 1) == (retries_wanted == 0)
     assert (retries > 0) == (retries_wanted > 0)
-
-
-def drawer(axis=None):
-    """Take a handle, pull it by 0.15 m along the cabinet's x, let go."""
-    axis = axis or Axis("slide", np.array([1.0, 0.0, 0.0]), 0.15)
-    poses = [
-        key_pose("cabinet", hand_pose(0.1, 0.0, 0.2), "approach"),
-        key_pose("cabinet", hand_pose(0.1, 0.0, 0.2), "grasp", closed=True),
-        key_pose("cabinet", hand_pose(0.25, 0.0, 0.2), "open", closed=True, axis=axis),
-        key_pose("cabinet", hand_pose(0.25, 0.0, 0.2), "release"),
-    ]
-    layout = {"cabinet": se3.from_yaw([0.05, 0.1, 0.0], 0.6)}
-    memory = entry("open the top drawer of the cabinet", key_poses=poses, layout=layout)
-    executor = Executor(ControlSettings(), ROBOT)
-    executor.begin(transfer(memory, layout, {}, HOME), Hand(HOME, OPEN_WIDTH))
-    return executor, layout["cabinet"]
-
-
-def test_a_drawer_is_pulled_along_its_axis_from_where_its_handle_was_taken():
-    executor, T_world_obj = drawer()
-    taken = executor.plan[1].T_world_ee @ se3.from_yaw([0.004, -0.006, 0.003], 0.02)
-    executor.begin(executor.plan, Hand(taken, 0.03), 2)
-    target = executor.plan[2]
-    assert_allclose(target.T_world_ee[:3, 3] - taken[:3, 3], 0.15 * T_world_obj[:3, 0], atol=1e-9)
-    assert_allclose(target.T_world_ee[:3, :3], taken[:3, :3])
-    executor.change(drawer()[0].plan)  # a look at something else does not take it back
-    assert_allclose(executor.plan[2].T_world_ee, target.T_world_ee)
-
-
-def test_the_open_loop_follows_an_axis_from_where_the_hand_should_be():
-    executor, _ = drawer()
-    executor = Executor(ControlSettings(execution="open_loop"), ROBOT)
-    executor.begin(drawer()[0].plan, Hand(HOME, OPEN_WIDTH))
-    executor.begin(executor.plan, Hand(HOME, OPEN_WIDTH), 2)
-    assert_allclose(executor.plan[2].T_world_ee, drawer()[0].plan[2].T_world_ee, atol=1e-9)
 
 
 def test_a_correction_that_gets_nowhere_pushes_harder():

@@ -2,6 +2,7 @@
 
 import sys
 from pathlib import Path
+from typing import Any
 
 import pytest
 from lerobot.configs import parser
@@ -13,16 +14,21 @@ from lerobot_openspm.configuration_openspm import OpenSPMConfig
 CONFIGS = Path(__file__).parents[2] / "configs"
 
 
-@pytest.mark.parametrize("robot", ["tabletop", "libero"])
-def test_training(robot: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
-    given = [f"--config_path={CONFIGS}/openspm_{robot}_train.yaml", f"--output_dir={tmp_path}/run"]
-    monkeypatch.setattr(sys, "argv", ["lerobot-train", *given])
+def read(monkeypatch: pytest.MonkeyPatch, kind: type, name: str, *options: str) -> Any:
+    """The configuration that a LeRobot command makes of a file and options."""
+    monkeypatch.setattr(sys, "argv", ["lerobot", f"--config_path={CONFIGS / name}", *options])
 
-    @parser.wrap()
-    def read(cfg: TrainPipelineConfig) -> TrainPipelineConfig:
+    def command(cfg: Any) -> Any:
         return cfg
 
-    config = read()
+    command.__annotations__["cfg"] = kind
+    return parser.wrap()(command)()
+
+
+@pytest.mark.parametrize("robot", ["tabletop", "libero"])
+def test_training(robot: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
+    name = f"openspm_{robot}_train.yaml"
+    config = read(monkeypatch, TrainPipelineConfig, name, f"--output_dir={tmp_path}/run")
     assert isinstance(config.policy, OpenSPMConfig)
     assert config.policy.push_to_hub is False
     assert (CONFIGS.parent / str(config.policy.cameras)).is_file()
@@ -30,14 +36,7 @@ def test_training(robot: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
 
 
 def test_evaluation(monkeypatch: pytest.MonkeyPatch, checkpoint: Path):
-    given = [f"--config_path={CONFIGS}/openspm_libero_eval.yaml", f"--policy.path={checkpoint}"]
-    monkeypatch.setattr(sys, "argv", ["lerobot-eval", *given])
-
-    @parser.wrap()
-    def read(cfg: EvalPipelineConfig) -> EvalPipelineConfig:
-        return cfg
-
-    config = read()
+    config = read(monkeypatch, EvalPipelineConfig, "openspm_libero_eval.yaml", f"--policy.path={checkpoint}")
     assert (config.env.type, config.env.task) == ("libero", "libero_goal")
     assert (config.eval.n_episodes, config.eval.batch_size, config.seed) == (50, 1, 1000)
     assert isinstance(config.policy, OpenSPMConfig)

@@ -1,0 +1,33 @@
+"""A whole experience built by hand: entries, objects of both kinds, a robot, a camera."""
+
+import numpy as np
+from tests.memory.builders import entry, key_pose, robot
+from tests.perception.builders import model, patch_model
+
+from lerobot_openspm.experience import Experience
+from lerobot_openspm.geometry import se3
+from lerobot_openspm.geometry.camera import Camera
+from lerobot_openspm.memory.entry import Axis
+
+SLIDE = Axis("slide", np.array([0.0, -0.6, 0.8]), 0.15)
+
+
+def experience(**changes):
+    T = se3.from_position_rotvec([0.1, 0.2, 0.3], [0.3, 0.2, 0.1])
+    entries = (
+        entry("put the bowl on the plate", source="local/demos#0"),
+        entry("open the top drawer", [key_pose("cabinet", T, "open", axis=SLIDE)], source="local/demos#1"),
+    )
+    fields = {
+        "entries": entries,
+        "objects": {
+            "bowl": model("bowl", 1),
+            "cream cheese box": model("cream cheese box", 2, np.pi),
+            "stove": patch_model("stove"),
+        },
+        "robot": robot(),
+        "cameras": {"observation.images.front": Camera(64, 48, 50.1, 50.2, 31.5, 23.5, "ee", T)},
+        "perception": "demonstrations",
+        "simulator_objects": ("bowl", "plate"),
+    }
+    return Experience(**{**fields, **changes})
