@@ -23,8 +23,9 @@ logger = logging.getLogger(__name__)
 # An object that is not found is looked for again after this many steps.
 LOOK_AGAIN_STEPS = 5
 
-# Poses found while the hand is about are believed from this confidence on. Measured on LIBERO: nine in ten of
-# those above it were within 2 mm of the truth; below it, the hand being in the way, they were centimetres off.
+# Poses found while the hand is about are believed from this confidence on. Measured on LIBERO: nine in ten
+# of those above it were within 2 mm of the truth; below it, the hand being in the way, many were centimetres
+# off.
 SURE = 0.95
 # An object that is seen this far from where it was taken to be has moved; less is the noise of finding it.
 MOVED_M = 0.002
