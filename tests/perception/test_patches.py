@@ -14,6 +14,7 @@ from lerobot_openspm.perception import store
 from lerobot_openspm.perception.learning import learn_objects
 from lerobot_openspm.perception.localise import localise
 from lerobot_openspm.perception.model import PatchModel
+from lerobot_openspm.perception.patch_learning import learn_patches
 from lerobot_openspm.perception.types import Hint, Scene
 
 MIDDLES = {"block": (0.02, -0.15, 0.4), "cup": (0.0, 0.15, 0.0), "distractor": (-0.02, 0.0, 0.0)}
@@ -48,17 +49,56 @@ def unseen():
     return [poses(rng) for _ in range(12)]
 
 
+def place_errors(model, scenes, name):
+    """Distances in metres from the true places, after one constant offset."""
+    estimates = [localise(views_of(scene), model) for scene in scenes]
+    assert all(one.status == "found" for one in estimates)
+    found = np.stack([one.T_world_obj[:2, 3] for one in estimates])
+    offsets = found - np.stack([scene[name][:2, 3] for scene in scenes])
+    return np.linalg.norm(offsets - np.median(offsets, axis=0), axis=1)
+
+
 @pytest.mark.parametrize("name", ["block", "cup"])
 def test_places_are_found_within_a_millimetre_or_two(models, unseen, name):
     assert isinstance(models[name], PatchModel)
-    estimates = [localise(views_of(scene), models[name]) for scene in unseen]
-    assert all(one.status == "found" for one in estimates)
-    found = np.stack([one.T_world_obj[:2, 3] for one in estimates])
-    offsets = found - np.stack([scene[name][:2, 3] for scene in unseen])
-    errors = np.linalg.norm(offsets - np.median(offsets, axis=0), axis=1)
+    errors = place_errors(models[name], unseen, name)
     assert errors.mean() < 0.0015
     # Far better than taking the usual place.
     assert errors.max() < 0.004
+
+
+def several_tasks(n, T_moved=None):
+    """One demonstration each of ``n`` tasks, the first of which grasps the cup and the second the block."""
+    rng = np.random.default_rng(5)
+    placed = [poses(rng) for _ in range(n)]
+    moved = [None if T_moved is None or i % 2 else T_moved for i in range(n)]
+    hints = [
+        Hint("cup", placed[0]["cup"][:3, 3] + [0.03, 0.0, 0.05], "grasp", "first"),
+        Hint("block", placed[1]["block"][:3, 3] + [0.0, 0.02, 0.04], "grasp", "second"),
+    ]
+    given = [(hints[i],) if i < len(hints) else () for i in range(n)]
+    return [Scene(views_of(T, m), g) for T, m, g in zip(placed, moved, given, strict=True)]
+
+
+@pytest.mark.parametrize("shift", [None, (0.008, -0.006, 0.004)])
+def test_one_demonstration_of_each_of_several_tasks_is_enough(unseen, shift):
+    T_moved = None if shift is None else se3.transform(np.eye(3), np.array(shift))
+    models = learn_patches(["block", "cup"], several_tasks(10, T_moved))
+    for name in ("block", "cup"):
+        assert place_errors(models[name], unseen, name).mean() < 0.002, name
+
+
+def test_two_objects_never_follow_the_same_motion():
+    scenes = several_tasks(10)
+    hint = scenes[0].hints[0]
+    twice = [dataclasses.replace(scenes[0], hints=(hint, dataclasses.replace(hint, name="mug"))), *scenes[1:]]
+    models = learn_patches(["block", "cup", "mug"], twice)
+    assert "block" in models
+    assert len({"cup", "mug"} & set(models)) == 1
+
+
+def test_too_few_scenes_to_agree_teach_nothing():
+    assert learn_patches(["block", "cup"], several_tasks(4)) == {}
 
 
 def test_another_image_size_gives_the_same_place(models, unseen):

@@ -29,7 +29,7 @@ from lerobot_openspm.perception.fitting import (
 )
 from lerobot_openspm.perception.localise import COARSE_CUTS_PX, FINE_CUTS_PX, prepare
 from lerobot_openspm.perception.model import KnownObject, ObjectModel
-from lerobot_openspm.perception.patches import MAX_SPREAD_M, learn_patches, spread
+from lerobot_openspm.perception.patch_learning import learn_patches
 from lerobot_openspm.perception.seeding import Picture
 from lerobot_openspm.perception.shape import Posed, Votes
 from lerobot_openspm.perception.types import Scene, View
@@ -81,22 +81,19 @@ def learn_objects(scenes: Sequence[Scene], rng: Generator) -> dict[str, KnownObj
             "no demonstration shows a grasp, contact or release; perception has nothing to learn from"
         )
     floor = min(float(hint.point_world[2]) for scene in scenes for hint in scene.hints) - 0.02
-    models = {}
+    models: dict[str, KnownObject] = {**learn_patches(names, scenes)}
     for name in names:
-        model = learn_object(name, scenes, floor, rng)
+        model = models.get(name) or learn_object(name, scenes, floor, rng)
         if model is not None:
             models[name] = model
     return models
 
 
-def learn_object(name: str, scenes: Sequence[Scene], floor: float, rng: Generator) -> KnownObject | None:
-    """Learn one object from the scenes that hint at it; None, with a warning, if it cannot be learned."""
+def learn_object(name: str, scenes: Sequence[Scene], floor: float, rng: Generator) -> ObjectModel | None:
+    """Learn an object's colours and shape from scenes with hints at it; None, with a warning, if in vain."""
     hinted = [i for i, scene in enumerate(scenes) if any(hint.name == name for hint in scene.hints)]
     if len(hinted) > MAX_SCENES:
         hinted = sorted(rng.choice(hinted, MAX_SCENES, replace=False).tolist())
-    shown = [scenes[i] for i in hinted]
-    if spread(shown, name) < MAX_SPREAD_M and (patches := learn_patches(name, shown)) is not None:
-        return patches
     pictures = [picture for i in hinted for picture in _pictures(i, name, scenes[i], floor)]
     log_odds = seeding.learn_colours(pictures)
     posed, half_size = _first_poses(pictures, log_odds)
