@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import os
 import platform
 import subprocess
@@ -24,9 +25,15 @@ def dataset() -> Path:
     return RUN / "dataset"
 
 
-def policy(variant: str = "train", *options: str) -> tuple[Path, float]:
+def policy(variant: str = "train", *options: str) -> tuple[Path, float | None]:
     """Checkpoint and training seconds of a variant of the policy, trained if need be."""
-    return train(dataset(), RUN / variant, options)
+    checkpoint, seconds = train(dataset(), RUN / variant, options)
+    return checkpoint, known(seconds)
+
+
+def known(seconds: float) -> float | None:
+    """None for the NaN of a training that was resumed: how long it took in all is not known."""
+    return None if math.isnan(seconds) else seconds
 
 
 def evaluation(name: str, checkpoint: Path, *options: str) -> list[Episode]:
@@ -58,5 +65,5 @@ def write(name: str, result: dict[str, Any]) -> dict[str, Any]:
     machine = {"processor": platform.machine(), "cores": os.cpu_count(), "python": platform.python_version()}
     RESULTS.mkdir(exist_ok=True)
     content = {"commit": commit, "machine": machine, **result}
-    (RESULTS / f"{name}.json").write_text(json.dumps(content, indent=1) + "\n")
+    (RESULTS / f"{name}.json").write_text(json.dumps(content, indent=1, allow_nan=False) + "\n")
     return content

@@ -21,10 +21,9 @@ def part(title: str, name: str, render: Callable[[dict[str, Any]], str], script:
 
 def origin(result: dict[str, Any]) -> str:
     """What a result was measured on."""
-    note = (
+    return (
         f"Commit `{result['commit']}`, {result['machine']['cores']} cores ({result['machine']['processor']})."
     )
-    return f"{note} {result['provenance']}" if result.get("provenance") else note
 
 
 def rates(runs: dict[str, Any]) -> str:

@@ -11,8 +11,8 @@ INTRODUCTION = """# Results on the tabletop
 Made by `python -m benchmarks.tables` from `benchmarks/results`; each file there says on what commit and
 machine it was measured. Ten demonstrations a task; seeds from 1000 on. They were measured once before, at an
 earlier commit; in between the rack's shape was mended, judged on scenes of other seeds. Since then control
-has changed (corrections, waiting for the fingers, looking again); of 100 episodes on other seeds 99 succeeded
-with it. The ten tasks share their scenes seed by seed. Rates come with 95 % Wilson intervals."""
+and perception have changed. The ten tasks share their scenes seed by seed. Rates come with 95 % Wilson
+intervals."""
 PAGE = Path(__file__).parent.parent / "docs" / "results.md"
 
 

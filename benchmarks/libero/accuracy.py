@@ -27,12 +27,14 @@ TRUE_PERIODS = {
     "cabinet": 2 * np.pi,
     "stove": 2 * np.pi,
 }
+NOT_FOUND = (float("nan"), float("nan"))
 
 
 def accuracy(checkpoint: Path, dataset: Path, episodes: list[dict[str, Any]]) -> dict[str, Any]:
     """Position and yaw errors, over all objects that an episode's task touches, per object and per task.
 
-    ``off_mm`` holds the largest position error of every episode, in their order.
+    ``off_mm`` holds the largest position error of every episode, in their order; None if an object was not
+    found.
     """
     experience = load_experience(checkpoint)
     config = OpenSPMConfig(
@@ -43,17 +45,23 @@ def accuracy(checkpoint: Path, dataset: Path, episodes: list[dict[str, Any]]) ->
     by_object, by_task = defaultdict(list), defaultdict(list)
     off_mm = []
     for episode in episodes:
-        off_mm.append(0.0)
+        off = [0.0]
         for name, true in episode["true"].items():
-            one = error(_pose(true), _pose(episode["seen"][name]), offsets[name], TRUE_PERIODS[name])
+            seen = episode["seen"].get(name)
+            one = (
+                NOT_FOUND
+                if seen is None
+                else error(_pose(true), _pose(seen), offsets[name], TRUE_PERIODS[name])
+            )
             by_object[name].append(one)
             by_task[episode["task"]].append(one)
-            off_mm[-1] = max(off_mm[-1], round(1000 * one[0], 1))
+            off.append(one[0])
+        off_mm.append(None if np.isnan(off).any() else round(1000 * max(off), 1))
     everything = 1000 * np.concatenate([np.array(found)[:, 0] for found in by_object.values()])
     known = [task for task in tasks() if task in by_task]
     return {
-        "position_mm_mean": round(float(everything.mean()), 2),
-        "position_mm_p95": round(float(np.percentile(everything, 95)), 2),
+        "position_mm_mean": round(float(np.nanmean(everything)), 2),
+        "position_mm_p95": round(float(np.nanpercentile(everything, 95)), 2),
         "objects": {name: summary(np.array(found), TRUE_PERIODS[name]) for name, found in by_object.items()},
         "off_mm": off_mm,
         "tasks": {task: summary(np.array(by_task[task]), _turning(by_task[task])) for task in known},

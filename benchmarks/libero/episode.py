@@ -13,6 +13,7 @@ from lerobot_openspm.control.executor import Hand
 from lerobot_openspm.control.row import Row
 from lerobot_openspm.envs.libero.simulator import CAMERAS, SUITE, LiberoSimulator
 from lerobot_openspm.envs.recording import pose_vector
+from lerobot_openspm.memory.instruction import parse_instruction
 from lerobot_openspm.mining.mine import name_simulator_poses
 from lerobot_openspm.modeling_openspm import OpenSPMPolicy
 from lerobot_openspm.observation import Observation
@@ -49,7 +50,7 @@ class Episode:
         actions: Every action ``(n, 7)``, float32.
         row: The policy's state at the end.
         seen: Poses ``T_world_obj`` that the policy found when it planned, by its names.
-        true: The simulator's poses of the same objects at that moment, for measuring alone.
+        true: The simulator's poses of the objects that the instruction names, for measuring alone.
     """
 
     success: bool
@@ -77,7 +78,8 @@ def run_episode(policy: OpenSPMPolicy, simulator: LiberoSimulator) -> Episode:
         if not seen:
             seen = dict(policy._rows[0].layout)
             models = policy.experience.objects if policy.experience else {}
-            true = name_simulator_poses(simulator.object_poses(), list(seen), models)
+            named = [name for one in parse_instruction(simulator.instruction) for name in one.objects]
+            true = name_simulator_poses(simulator.object_poses(), list(dict.fromkeys(named)), models)
         success = simulator.step(action)
         actions.append(action)
     return Episode(success, np.stack(actions), policy._rows[0], seen, true)

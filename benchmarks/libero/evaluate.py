@@ -9,12 +9,14 @@ two action by action. Every episode is written down as it ends; a second run doe
 
 from __future__ import annotations
 
-import hashlib
 import json
+import logging
 import multiprocessing
 import os
 import sys
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from itertools import count
 from pathlib import Path
 from typing import Any
 
@@ -24,13 +26,15 @@ import torch
 from benchmarks.libero.episode import Episode, initial_states, run_episode
 from tqdm import tqdm
 
-from lerobot_openspm.cli.pipeline import rate
-from lerobot_openspm.control.executor import Execution
+from lerobot_openspm.cli.pipeline import digest, rate
+from lerobot_openspm.control.executor import Execution, Status
 from lerobot_openspm.envs.libero.simulator import LiberoSimulator, tasks
 from lerobot_openspm.envs.seeds import TUNING_SEED_START
-from lerobot_openspm.files import write_json
+from lerobot_openspm.files import write_beside
 from lerobot_openspm.geometry import se3
 from lerobot_openspm.modeling_openspm import OpenSPMPolicy
+
+logger = logging.getLogger(__name__)
 
 SEED = 1000
 # Tuning scenes of the benchmark, apart from those that tests use.
@@ -47,7 +51,7 @@ class EvaluationConfig:
         task: A task's name, several with commas, or "all".
         episodes: Initial states a task, from the first on.
         tuning: Draw as many scenes from tuning seeds instead of taking the benchmark's initial states.
-        processes: Episodes at a time.
+        processes: Episodes at a time, each in a process of its own; a single one stays in this process.
         image_size: Pixels; lerobot-eval's default.
         execution: Of the policy; the checkpoint's if not given.
     """
@@ -62,45 +66,57 @@ class EvaluationConfig:
     execution: Execution | None = None
 
 
+# Settings, task, number of the initial state.
+type Job = tuple[EvaluationConfig, str, int]
+
+
 def evaluate(config: EvaluationConfig) -> list[dict[str, Any]]:
-    """Run the episodes that are missing, and return all of them."""
+    """Run the episodes that are missing, and return all of them.
+
+    Episodes of another policy, other settings or other code are set aside, not mixed in.
+    """
     output = Path(config.output)
     output.mkdir(parents=True, exist_ok=True)
     log = output / "episodes.jsonl"
-    _refuse_others(config, output)
+    _set_others_aside(config, output, log)
+    _drop_torn_line(log)
     wanted = list(tasks()) if config.task == "all" else config.task.split(",")
     if unknown := [task for task in wanted if task not in tasks()]:
         raise ValueError(f"libero_goal has no tasks {unknown}, expected some of {', '.join(tasks())}")
     done = {(e["task"], e["state"]) for e in _read(log)}
     jobs = [(config, task, i) for task in wanted for i in range(config.episodes) if (task, i) not in done]
-    context = multiprocessing.get_context("spawn")
-    with context.Pool(config.processes) as pool, log.open("a") as file:
-        for episode in tqdm(
-            pool.imap_unordered(evaluate_one, jobs), total=len(jobs), unit="episode", disable=not jobs
-        ):
+    with log.open("a") as file:
+        for episode in tqdm(_run(jobs, config.processes), total=len(jobs), unit="episode", disable=not jobs):
             file.write(json.dumps(episode) + "\n")
             file.flush()
     return [e for e in _read(log) if e["task"] in wanted and e["state"] < config.episodes]
 
 
-def _refuse_others(config: EvaluationConfig, output: Path) -> None:
-    """Keep episodes of different policies or settings apart.
+def _run(jobs: Sequence[Job], processes: int) -> Iterator[dict[str, Any]]:
+    if processes == 1:
+        yield from map(evaluate_one, jobs)
+    else:
+        with multiprocessing.get_context("spawn").Pool(processes) as pool:
+            yield from pool.imap_unordered(evaluate_one, jobs)
 
-    Raises:
-        FileExistsError: The folder holds episodes of something else.
-    """
-    names = ("model.safetensors", "memory.json", "config.json")
-    files = [Path(config.checkpoint) / name for name in names]
-    made_of = {
-        "policy": [hashlib.sha256(file.read_bytes()).hexdigest() for file in files],
-        **{key: getattr(config, key) for key in ("tuning", "image_size", "execution")},
-    }
-    kept = output / "made_of.json"
-    if kept.exists() and json.loads(kept.read_text()) != made_of:
-        raise FileExistsError(
-            f"{output} holds episodes of another policy or settings; remove it, or choose another --output"
-        )
-    write_json(kept, made_of)
+
+def _set_others_aside(config: EvaluationConfig, output: Path, log: Path) -> None:
+    """Keep apart what was made of something else, and note what the next episodes are made of."""
+    files = [Path(config.checkpoint) / name for name in ("model.safetensors", "memory.json", "config.json")]
+    code = [Path(__file__), Path(__file__).with_name("episode.py")]
+    settings = [f"{key}={getattr(config, key)}" for key in ("tuning", "image_size", "execution")]
+    made_of, kept = digest([*code, *files], settings), output / "made_of.sha256"
+    if log.exists() and (not kept.exists() or kept.read_text() != made_of):
+        aside = next(p for i in count(1) if not (p := output / f"episodes_before_{i}.jsonl").exists())
+        logger.warning("%s holds episodes of another policy, settings or code; set aside as %s", log, aside)
+        log.rename(aside)
+    write_beside(kept, made_of.encode())
+
+
+def _drop_torn_line(log: Path) -> None:
+    """Forget an episode that was being written when a run was killed; it is run again."""
+    if log.exists() and (text := log.read_text()) and not text.endswith("\n"):
+        write_beside(log, text[: text.rfind("\n") + 1].encode())
 
 
 def summary(episodes: list[dict[str, Any]]) -> dict[str, Any]:
@@ -117,11 +133,24 @@ def summary(episodes: list[dict[str, Any]]) -> dict[str, Any]:
             for task, es in own.items()
         },
         "failed": [
-            {key: e[key] for key in ("task", "state", "status", "phase", "attempts")}
+            {**{key: e[key] for key in ("task", "state", "seed", "attempts")}, "reason": reason(e)}
             for e in episodes
             if not e["success"]
         ],
     }
+
+
+def reason(episode: dict[str, Any]) -> str:
+    """Why an episode failed, as far as the policy can tell."""
+    match episode["status"]:
+        case Status.DONE:
+            return "every key pose was met, but the goal does not hold"
+        case Status.RUNNING:
+            return f"time was up at {episode['phase']}"
+        case Status.NO_PROGRESS:
+            return f"gave up at {episode['phase']}"
+        case status:
+            return status.replace("_", " ")
 
 
 def mean_steps(episodes: list[dict[str, Any]]) -> float | None:
@@ -130,16 +159,17 @@ def mean_steps(episodes: list[dict[str, Any]]) -> float | None:
     return round(float(np.mean(steps)), 1) if steps else None
 
 
-def evaluate_one(job: tuple[EvaluationConfig, str, int]) -> dict[str, Any]:
+def evaluate_one(job: Job) -> dict[str, Any]:
     """Run one episode, with a policy and a simulator kept by the process."""
     config, task, state = job
     policy, simulator = _policy(config), _simulator(task, config.image_size)
+    seed = (TUNING_SEED if config.tuning else SEED) + state
     if config.tuning:
-        simulator.reset(TUNING_SEED + state)
-        _move_hand(simulator, np.random.default_rng(TUNING_SEED + state))
+        simulator.reset(seed)
+        _move_hand(simulator, np.random.default_rng(seed))
     else:
-        simulator.reset_to(SEED + state, initial_states(task)[state])
-    return {"task": task, "state": state, **_told(run_episode(policy, simulator))}
+        simulator.reset_to(seed, initial_states(task)[state])
+    return {"task": task, "state": state, "seed": seed, **_told(run_episode(policy, simulator))}
 
 
 def _move_hand(simulator: LiberoSimulator, rng: np.random.Generator) -> None:

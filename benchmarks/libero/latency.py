@@ -33,7 +33,7 @@ def main() -> dict[str, Any]:
     layout, vector = acting.config.layouts()[0], simulator.state().astype(float)
     hand = Hand(layout.poses(vector), float(layout.openings(vector)))
     images = {key: LazyImages(simulator)[key] for key in LazyImages(simulator)}
-    observation = Observation(simulator.instruction, vector, hand, images)
+    observation = Observation(simulator.instruction, vector, hand, images, None)
     with torch.inference_mode():
         first = _times(lambda: (acting.reset(), acting.act([observation])), LOOKS)
         row = acting._rows[0]

@@ -49,11 +49,12 @@ def main(config: NewTaskConfig) -> dict[str, Any]:
     nine, _ = policy(
         root, f"without_{config.task}", episodes=first_episodes(root, DEMOS, without=config.task)
     )
-    folder = run_folder() / f"taught_{config.task}"
+    name = f"{config.task}_{config.demos}"
+    folder = run_folder() / f"taught_{name}"
     taught_s = teach(nine, root, config, folder)
     episodes = evaluation(folder / "evaluation", folder, config.states, [config.task])
     figures = {"task": config.task, "demonstrations": config.demos, "teach_s": taught_s, **summary(episodes)}
-    return write(f"libero_new_task_{config.task}", figures)
+    return write(f"libero_new_task_{name}", figures)
 
 
 def teach(nine: Path, root: Path, config: NewTaskConfig, folder: Path) -> float:

@@ -66,4 +66,7 @@ def main(config: RunConfig) -> dict[str, Any]:
 if __name__ == "__main__":
     logging.basicConfig(level=logging.INFO, format="%(levelname)s %(message)s")
     os.environ.setdefault("MUJOCO_GL", "egl")
-    print(json.dumps(main(draccus.parse(RunConfig, args=sys.argv[1:]))))
+    try:
+        print(json.dumps(main(draccus.parse(RunConfig, args=sys.argv[1:])), allow_nan=False))
+    except ValueError as error:
+        sys.exit(f"make libero: {error}")

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from benchmarks.common import known
 from benchmarks.libero.evaluate import EvaluationConfig, evaluate
 
 from lerobot_openspm.cli.collect import SUMMARY_FILE, CollectConfig, SimulatorConfig, collect
@@ -22,9 +23,9 @@ DEMOS, STATES = 10, 50
 
 def run_folder(demos: int = DEMOS, selected: Sequence[str] | None = None) -> Path:
     """Where everything made of so many demonstrations a task lies; a part of the tasks has its own folder."""
-    known = list(tasks())
-    chosen = known if selected is None else list(selected)
-    some = "" if chosen == known else "_tasks_" + "_".join(str(known.index(task)) for task in chosen)
+    names = list(tasks())
+    chosen = names if selected is None else list(selected)
+    some = "" if chosen == names else "_tasks_" + "_".join(str(names.index(task)) for task in chosen)
     return Path("outputs/libero") / f"demos_{demos}{some}"
 
 
@@ -34,16 +35,18 @@ def select_tasks(selection: str) -> list[str]:
     Raises:
         ValueError: There is no such task.
     """
-    known = list(tasks())
+    names = list(tasks())
     chosen: list[int] = []
     for part in selection.split(","):
-        first, _, last = part.strip().partition("-")
-        if not first.isdecimal() or not (last or first).isdecimal() or int(last or first) >= len(known):
+        first, dash, last = part.strip().partition("-")
+        last = last if dash else first
+        numbers = first.isdecimal() and last.isdecimal()
+        if not numbers or not int(first) <= int(last) < len(names):
             raise ValueError(
-                f"TASKS must be numbers from 0 to {len(known) - 1} like 0-9 or 0,3,5, got {selection}"
+                f"TASKS must be numbers from 0 to {len(names) - 1} like 0-9 or 0,3,5, got {selection}"
             )
-        chosen += range(int(first), int(last or first) + 1)
-    return [known[i] for i in dict.fromkeys(chosen)]
+        chosen += range(int(first), int(last) + 1)
+    return [names[i] for i in dict.fromkeys(chosen)]
 
 
 def dataset(demos: int = DEMOS, selected: Sequence[str] | None = None) -> Path:
@@ -65,8 +68,8 @@ def first_episodes(root: Path, demos: int, without: str | None = None) -> list[i
 
 def policy(
     root: Path, variant: str, *options: str, episodes: Sequence[int] | None = None
-) -> tuple[Path, float]:
-    """Checkpoint and seconds of a variant, mined and trained if need be.
+) -> tuple[Path, float | None]:
+    """Checkpoint and seconds of a variant, mined and trained if need be; None if that was interrupted.
 
     Args:
         root: The demonstrations.
@@ -78,7 +81,8 @@ def policy(
         chosen = json.dumps(list(episodes))
         options = (f"--dataset.episodes={chosen}", f"--policy.memory_episodes={chosen}", *options)
     options = (f"--dataset.repo_id={REPO_ID}", *options)
-    return train(root, root.with_name(variant), options, TRAIN_CONFIG)
+    checkpoint, seconds = train(root, root.with_name(variant), options, TRAIN_CONFIG)
+    return checkpoint, known(seconds)
 
 
 def evaluation(

@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from lerobot_openspm.cli.demo import EVALUATION_SEED
-from lerobot_openspm.cli.pipeline import Episode, _digest, _discard_unless, mean_steps, rate, read_episodes
+from lerobot_openspm.cli.pipeline import Episode, digest, discard_unless, mean_steps, rate, read_episodes
 from lerobot_openspm.envs.seeds import EVALUATION_SEEDS, seed_purpose
 
 
@@ -37,18 +37,18 @@ def test_mean_steps_are_those_of_successes():
 def test_a_result_is_kept_only_for_what_it_was_made_of(tmp_path: Path, caplog: pytest.LogCaptureFixture):
     weights, output = tmp_path / "weights", tmp_path / "run" / "eval"
     weights.write_bytes(b"one")
-    made_of = _digest([weights], ["--policy.execution=open_loop"])
-    _discard_unless(output, made_of)
+    made_of = digest([weights], ["--policy.execution=open_loop"])
+    discard_unless(output, made_of)
     output.mkdir()
     (output / "kept").touch()
-    _discard_unless(output, made_of)
+    discard_unless(output, made_of)
     assert (output / "kept").exists()
     weights.write_bytes(b"two")
     with caplog.at_level(logging.INFO):
-        _discard_unless(output, _digest([weights], ["--policy.execution=open_loop"]))
+        discard_unless(output, digest([weights], ["--policy.execution=open_loop"]))
     assert not output.exists()
     assert "made of something else" in caplog.text
-    assert _digest([weights], []) != _digest([weights], ["--a"])
+    assert digest([weights], []) != digest([weights], ["--a"])
 
 
 def test_the_demo_is_evaluated_on_evaluation_seeds():

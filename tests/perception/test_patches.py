@@ -97,6 +97,36 @@ def test_two_objects_never_follow_the_same_motion():
     assert len({"cup", "mug"} & set(models)) == 1
 
 
+def test_what_is_known_already_is_not_learned_again_under_another_name():
+    scenes = several_tasks(10)
+    known = learn_patches(["cup"], scenes)["cup"]
+    mug = dataclasses.replace(scenes[0].hints[0], name="mug")
+    assert "mug" in learn_patches(["mug"], [dataclasses.replace(scenes[0], hints=(mug,)), *scenes[1:]])
+    again = [dataclasses.replace(scenes[0], hints=(mug,)), *scenes[1:]]
+    assert learn_patches(["mug"], again, [known]) == {}
+
+
+@pytest.mark.parametrize("noise", [0.001, 0.003])
+def test_a_fixture_that_never_moves_is_known_by_patches(noise):
+    rng = np.random.default_rng(6)
+    scenes = []
+    for _ in range(8):
+        placed = poses(rng) | {"block": se3.from_yaw([*MIDDLES["block"][:2], 0.0], MIDDLES["block"][2])}
+        point = placed["block"][:3, 3] + [0.0, 0.02, 0.04] + rng.normal(0, noise, 3)
+        scenes.append(Scene(views_of(placed), (Hint("block", point, "grasp", "edge"),)))
+    block = learn_patches(["block"], scenes)["block"]
+    found = [localise(scene.views, block) for scene in scenes]
+    assert all(one.status == "found" for one in found)
+    assert np.ptp([one.T_world_obj[:2, 3] for one in found], axis=0).max() < 0.001
+
+
+@pytest.mark.parametrize("name", ["block", "cup"])
+def test_the_covariance_tells_how_far_off_places_are(models, unseen, name):
+    claimed = np.sqrt(np.trace(localise(views_of(unseen[0]), models[name]).covariance[:2, :2]))
+    rms = np.sqrt(np.mean(place_errors(models[name], unseen, name) ** 2))
+    assert rms / 3 < claimed < max(3 * rms, 0.001)
+
+
 def test_too_few_scenes_to_agree_teach_nothing():
     assert learn_patches(["block", "cup"], several_tasks(4)) == {}
 

@@ -59,8 +59,8 @@ def train(
     checkpoint, done = output / "checkpoints" / "last" / "pretrained_model", output / DONE
     if not config_file.is_file():
         raise FileNotFoundError(f"no {config_file} here: run this from a checkout of the project")
-    made_of = _digest([config_file, dataset / "meta" / "info.json", dataset / SUMMARY_FILE], options)
-    _discard_unless(output, made_of)
+    made_of = digest([config_file, dataset / "meta" / "info.json", dataset / SUMMARY_FILE], options)
+    discard_unless(output, made_of)
     if not done.exists():
         start_s = time.monotonic()
         config = checkpoint / "train_config.json"
@@ -90,8 +90,8 @@ def evaluate(
     were finished before an interruption are not run again.
     """
     log, seeds = output / "episodes.jsonl", range(seed, seed + episodes)
-    made_of = _digest([checkpoint / name for name in ("model.safetensors", "memory.json")], options)
-    _discard_unless(output, made_of)
+    made_of = digest([checkpoint / name for name in ("model.safetensors", "memory.json")], options)
+    discard_unless(output, made_of)
     output.mkdir(parents=True, exist_ok=True)
     finished = Counter(e.task for e in read_episodes(log, seeds))
     left = [task for task in TASK_NAMES if finished[task] < episodes]
@@ -110,16 +110,16 @@ def evaluate(
     return found
 
 
-def _digest(files: Sequence[Path], options: Sequence[str]) -> str:
+def digest(files: Sequence[Path], options: Sequence[str]) -> str:
     """What a result is made of, the code too, so that a kept one is only used again for the same."""
-    digest = hashlib.sha256("\n".join(options).encode())
+    found = hashlib.sha256("\n".join(options).encode())
     code = sorted(Path(lerobot_openspm.__file__).parent.rglob("*.py"))
     for file in [*code, *files]:
-        digest.update(file.read_bytes())
-    return digest.hexdigest()
+        found.update(file.read_bytes())
+    return found.hexdigest()
 
 
-def _discard_unless(output: Path, made_of: str) -> None:
+def discard_unless(output: Path, made_of: str) -> None:
     """Remove a kept result, finished or not, that was made of something else; note what comes next."""
     # Beside the folder, because lerobot-train insists on making that itself.
     kept = output.with_name(f"{output.name}.sha256")

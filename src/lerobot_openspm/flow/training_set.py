@@ -40,27 +40,28 @@ class TrainingSet:
         counts = np.bincount(phase[drawable], minlength=int(phase.max()) + 1)
         weights = np.where(drawable, 1.0 / np.sqrt(np.maximum(counts[phase], 1)), 0.0)
         self._weights = torch.as_tensor(weights, dtype=torch.float32)
-        self._row_of_index = torch.full((int(frames.index.max()) + 1,), -1, dtype=torch.long)
-        self._row_of_index[torch.as_tensor(frames.index)] = torch.arange(len(frames))
+        # Rows by ascending dataset index, and those indices.
+        self._index, self._rows = torch.as_tensor(frames.index).sort()
 
     def draw(self, index: Tensor, draws: int, training: bool) -> tuple[Tensor, Tensor]:
         """Samples for a batch of frames: `draws` for each, the first of them the frame itself.
 
-        A frame that belongs to no segment (a pause, or after the last key pose) is replaced by another one.
+        A frame that belongs to no segment (a pause, or after the last key pose) is replaced: in training by a
+        random one, else by the last one before it that does, which is of the same episode.
 
         Args:
             index: Dataset index ``(b,)``.
             draws: Samples per frame.
-            training: Whether replacements may be drawn at random; otherwise they follow from the index.
+            training: Whether replacements are drawn at random.
 
         Returns:
             Conditions ``(b * draws, condition_dim)`` and chunks ``(b * draws, H, 7)``, frame by frame.
         """
         index = index.cpu().flatten()
-        known = self._row_of_index[index.clamp(max=len(self._row_of_index) - 1)]
-        rows = torch.where(index < len(self._row_of_index), known, -1)
-        spare = self._sample(len(rows)) if training else self._fixed_drawable(index)
-        rows = torch.where(rows < 0, spare, rows)
+        before = (torch.searchsorted(self._index, index, right=True) - 1).clamp(min=0)
+        rows = self._rows[before]
+        if training:
+            rows = torch.where(self._index[before] == index, rows, self._sample(len(rows)))
         others = self._sample(len(rows) * (draws - 1)).view(len(rows), draws - 1)
         rows = torch.cat([rows[:, None], others], dim=1).flatten()
         return self._conditions[rows], self._chunks[rows]
@@ -69,7 +70,3 @@ class TrainingSet:
         return (
             torch.multinomial(self._weights, n, replacement=True) if n else torch.zeros(0, dtype=torch.long)
         )
-
-    def _fixed_drawable(self, index: Tensor) -> Tensor:
-        drawable = torch.nonzero(self._weights)[:, 0]
-        return drawable[index % len(drawable)]

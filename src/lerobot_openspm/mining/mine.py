@@ -134,7 +134,7 @@ def layouts_in_scenes(
             replace(scene, hints=tuple(hint for hint in scene.hints if hint.name in named))
             for scene in scenes
         ]
-        learned = learn_objects(unknown, rng)
+        learned = learn_objects(unknown, rng, known.values())
         models |= learned
         if missing := [name for name in named if name not in learned]:
             logger.warning("could not learn what %s looks like; no key pose will be anchored there", missing)

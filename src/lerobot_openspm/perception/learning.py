@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -61,12 +61,15 @@ TURN_GAIN = 0.008
 YAW_MARGIN = np.deg2rad(20)
 
 
-def learn_objects(scenes: Sequence[Scene], rng: Generator) -> dict[str, KnownObject]:
+def learn_objects(
+    scenes: Sequence[Scene], rng: Generator, known: Iterable[KnownObject] = ()
+) -> dict[str, KnownObject]:
     """Learn every object that some scene hints at.
 
     Args:
         scenes: First frames and hints of the demonstrations of all tasks.
         rng: Chooses among the demonstrations of an object where there are more than needed.
+        known: Objects that are known already; none of the new ones is one of them.
 
     Returns:
         Models by name. An object that cannot be learned (never visible, no consistent colour) is left out,
@@ -81,7 +84,7 @@ def learn_objects(scenes: Sequence[Scene], rng: Generator) -> dict[str, KnownObj
             "no demonstration shows a grasp, contact or release; perception has nothing to learn from"
         )
     floor = min(float(hint.point_world[2]) for scene in scenes for hint in scene.hints) - 0.02
-    models: dict[str, KnownObject] = {**learn_patches(names, scenes)}
+    models: dict[str, KnownObject] = {**learn_patches(names, scenes, known)}
     for name in names:
         model = models.get(name) or learn_object(name, scenes, floor, rng)
         if model is not None:

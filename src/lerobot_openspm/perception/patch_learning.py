@@ -19,7 +19,7 @@ import numpy as np
 
 from lerobot_openspm.geometry.camera import project
 from lerobot_openspm.geometry.se3 import Array
-from lerobot_openspm.perception.model import Patch, PatchModel, Probe
+from lerobot_openspm.perception.model import KnownObject, Patch, PatchModel, Probe
 from lerobot_openspm.perception.patches import as_seen, cut, localise_patches, match
 from lerobot_openspm.perception.types import Hint, Scene, View
 
@@ -41,7 +41,7 @@ FOLLOWED_SHARE, COVERAGE = 0.5, 0.9
 # Patches that follow one object agree within this, and it takes so many to be believed.
 AGREEMENT_M, MIN_AGREEING = 0.0025, 3
 # A group has to explain this much of where the hand went, unless it went to about the same place every time.
-EXPLAINED_SHARE, STILL_M = 0.8, 0.004
+EXPLAINED_SHARE, STILL_M = 0.8, 0.006
 # It may explain it so much worse than the group that does best.
 RESIDUAL_RATIO = 1.3
 # Without touches to ask, a group must move, or it may be the table; and be seen in so many scenes.
@@ -88,26 +88,30 @@ class _Trail:
 
 @dataclass(frozen=True)
 class _Candidate:
-    """An object to learn: the scenes looked at, its hints in them, and its groups, the largest first."""
+    """An object to learn: the scenes looked at, and its groups in them, the largest first."""
 
     name: str
     scenes: Sequence[Scene]
     groups: list[list[_Trail]]
 
 
-def learn_patches(names: Sequence[str], scenes: Sequence[Scene]) -> dict[str, PatchModel]:
+def learn_patches(
+    names: Sequence[str], scenes: Sequence[Scene], known: Iterable[KnownObject] = ()
+) -> dict[str, PatchModel]:
     """Learn the objects that hardly move; the others are left out.
 
     Args:
         names: The objects.
         scenes: First frames of all demonstrations, with hints at the objects.
+        known: Other objects, whose motions are not theirs.
     """
     candidates = [_candidate(name, scenes) for name in names if _spread(scenes, name) < MAX_SPREAD_M]
     # What many patches agree on is claimed first: what they follow is not another object.
     candidates.sort(key=lambda one: -max((len(group) for group in one.groups), default=0))
     learned: dict[str, PatchModel] = {}
     for one in candidates:
-        free = (g for g in one.groups if not _claimed(g[0], one.scenes, learned.values()))
+        claimants = [*known, *learned.values()]
+        free = (group for group in one.groups if not _claimed(group[0], one.scenes, claimants))
         models = (_model(one.name, group, one.scenes) for group in free)
         if model := next((model for model in models if model is not None), None):
             learned[one.name] = model
@@ -236,10 +240,12 @@ def _residual(points: Array, hints: Sequence[Hint], places: Sequence[Sequence[Hi
     return float(np.sqrt(np.nanmean(np.concatenate(left) ** 2)))
 
 
-def _claimed(trail: _Trail, scenes: Sequence[Scene], known: Iterable[PatchModel]) -> bool:
-    """Whether a trail follows an object that is known already."""
+def _claimed(trail: _Trail, scenes: Sequence[Scene], known: Iterable[KnownObject]) -> bool:
+    """Whether a trail follows an object that is known by patches already."""
     size = float(np.nanmedian(np.linalg.norm(trail.motion, axis=1)))
     for model in known:
+        if not isinstance(model, PatchModel):
+            continue
         found = [localise_patches(scene.views, model) for scene in scenes]
         points = np.stack(
             [one.T_world_obj[:2, 3] if one.status == "found" else np.full(2, np.nan) for one in found]

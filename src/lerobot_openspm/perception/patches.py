@@ -132,7 +132,8 @@ def localise_patches(views: Mapping[str, View], model: PatchModel) -> PoseEstima
     )
     # Height and direction are taken to be the demonstrated ones; they are not measured.
     covariance = np.diag([0.0, 0.0, REACH_M**2, UNKNOWN_YAW_STD**2])
-    covariance[:2, :2] = np.linalg.inv(information)
+    # The probes look at the same pixels and err together: many are no surer than one.
+    covariance[:2, :2] = len(correlations) * np.linalg.inv(information)
     place = np.linalg.solve(information, weighted)
     return PoseEstimate(status, se3.from_yaw(np.append(place, model.height), 0.0), covariance, confidence, {})
 

@@ -33,9 +33,18 @@ DO_NOTHING = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, -1.0)
 
 
 def tasks() -> dict[str, str]:
-    """Names of the suite's tasks with their instructions, in LIBERO's order."""
-    from libero.libero import benchmark  # pyright: ignore[reportMissingImports]
+    """Names of the suite's tasks with their instructions, in LIBERO's order.
 
+    Raises:
+        RuntimeError: LIBERO was never set up, and there is nobody to answer its question.
+    """
+    try:
+        from libero.libero import benchmark  # pyright: ignore[reportMissingImports]
+    except EOFError as error:
+        raise RuntimeError(
+            "LIBERO asks once, when it is first imported, whether its datasets go to a folder of yours, and "
+            "there is no terminal to answer on; answer for it with: echo N | python -c 'import libero.libero'"
+        ) from error
     return {task.name: task.language for task in benchmark.get_benchmark_dict()[SUITE]().tasks}
 
 

@@ -1,0 +1,131 @@
+"""LIBERO's harness keeps what it has measured, and never mixes it with anything else."""
+
+import json
+from pathlib import Path
+
+import pytest
+from benchmarks.libero import evaluate as harness
+from benchmarks.libero import stages
+from benchmarks.libero.evaluate import EvaluationConfig, evaluate, reason, summary
+
+TASKS = {name: name.replace("_", " ") for name in ("push_the_plate", "put_the_bowl", "turn_on_the_stove")}
+
+
+@pytest.fixture(autouse=True)
+def suite(monkeypatch: pytest.MonkeyPatch) -> None:
+    for module in (harness, stages):
+        monkeypatch.setattr(module, "tasks", lambda: TASKS)
+
+
+@pytest.fixture
+def ran(monkeypatch: pytest.MonkeyPatch) -> list[tuple[str, int]]:
+    """Which episodes were run, in order."""
+    found: list[tuple[str, int]] = []
+
+    def run_one(job: harness.Job):
+        _, task, state = job
+        found.append((task, state))
+        success = state != 1
+        told = {"steps": 100 + state, "success": success, "status": "done", "phase": "retreat", "attempts": 0}
+        return {"task": task, "state": state, "seed": harness.SEED + state, **told}
+
+    monkeypatch.setattr(harness, "evaluate_one", run_one)
+    return found
+
+
+@pytest.fixture
+def config(tmp_path: Path) -> EvaluationConfig:
+    checkpoint = tmp_path / "checkpoint"
+    checkpoint.mkdir()
+    for name in ("model.safetensors", "memory.json", "config.json"):
+        (checkpoint / name).write_text(name)
+    return EvaluationConfig(str(checkpoint), str(tmp_path / "episodes"), episodes=2, processes=1)
+
+
+def log(config: EvaluationConfig) -> Path:
+    return Path(config.output) / "episodes.jsonl"
+
+
+def test_every_task_and_state_is_run_once(config, ran):
+    episodes = evaluate(config)
+    assert ran == [(task, state) for task in TASKS for state in (0, 1)]
+    assert evaluate(config) == episodes
+    assert len(ran) == 6
+
+
+def test_an_interrupted_run_goes_on_where_it_stopped(config, ran):
+    whole = evaluate(config)
+    lines = log(config).read_text().splitlines(keepends=True)
+    # The fifth episode was being written when the run was killed.
+    log(config).write_text("".join(lines[:4]) + lines[4][:20])
+    del ran[:]
+    assert evaluate(config) == whole
+    assert ran == [("turn_on_the_stove", 0), ("turn_on_the_stove", 1)]
+    assert [json.loads(line)["state"] for line in log(config).read_text().splitlines()] == [0, 1] * 3
+
+
+@pytest.mark.parametrize("change", ["policy", "settings"])
+def test_episodes_of_something_else_are_set_aside(config, ran, change):
+    evaluate(config)
+    old = log(config).read_text()
+    if change == "policy":
+        (Path(config.checkpoint) / "memory.json").write_text("other")
+    else:
+        config.execution = "open_loop"
+    evaluate(config)
+    assert len(ran) == 12
+    assert (Path(config.output) / "episodes_before_1.jsonl").read_text() == old
+
+
+def test_tasks_may_be_chosen_and_unknown_ones_are_refused(config, ran):
+    config.task = "put_the_bowl"
+    evaluate(config)
+    assert ran == [("put_the_bowl", 0), ("put_the_bowl", 1)]
+    config.task = "fly"
+    with pytest.raises(ValueError, match="no tasks"):
+        evaluate(config)
+
+
+def test_the_summary_counts_and_says_why(config, ran):
+    figures = summary(evaluate(config))
+    assert (figures["success"], figures["n"], figures["mean_steps"]) == (0.5, 6, 100.0)
+    assert figures["per_task"]["put_the_bowl"]["success"] == 0.5
+    assert {(one["task"], one["state"], one["seed"]) for one in figures["failed"]} == {
+        (task, 1, harness.SEED + 1) for task in TASKS
+    }
+    assert "goal does not hold" in figures["failed"][0]["reason"]
+
+
+@pytest.mark.parametrize(
+    ("status", "words"),
+    [("no_progress", "gave up at lift"), ("running", "time was up at lift"), ("infeasible", "infeasible")],
+)
+def test_reasons(status, words):
+    assert reason({"status": status, "phase": "lift"}) == words
+
+
+@pytest.mark.parametrize(
+    ("selection", "expected"), [("0-2", [0, 1, 2]), ("2,0", [2, 0]), ("1,0-1", [1, 0]), (" 1 ", [1])]
+)
+def test_tasks_are_selected_by_number(selection, expected):
+    assert stages.select_tasks(selection) == [list(TASKS)[i] for i in expected]
+
+
+@pytest.mark.parametrize("selection", ["", "3", "2-1", "a", "0-", "-1", "0,,1"])
+def test_numbers_that_are_no_tasks_are_refused(selection):
+    with pytest.raises(ValueError, match="TASKS must be"):
+        stages.select_tasks(selection)
+
+
+def test_fewer_demonstrations_are_the_first_of_every_task(tmp_path):
+    episodes = [{"task": task} for task in TASKS for _ in range(3)]
+    (tmp_path / "meta").mkdir()
+    (tmp_path / stages.SUMMARY_FILE).write_text(json.dumps({"episodes": episodes}))
+    assert stages.first_episodes(tmp_path, 2) == [0, 1, 3, 4, 6, 7]
+    assert stages.first_episodes(tmp_path, 1, without="put_the_bowl") == [0, 6]
+
+
+def test_a_part_of_the_suite_has_a_folder_of_its_own():
+    names = list(TASKS)
+    assert stages.run_folder(3, names) == stages.run_folder(3)
+    assert stages.run_folder(3, names[:1]) != stages.run_folder(3, names[1:2])

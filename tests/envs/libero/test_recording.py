@@ -1,0 +1,73 @@
+"""Demonstrations of LIBERO: in the public dataset's layout, and never from a state it is evaluated on."""
+
+import numpy as np
+import pytest
+
+from lerobot_openspm.envs.libero import recording
+from lerobot_openspm.envs.libero.simulator import DO_NOTHING, LiberoSimulator, tasks
+from lerobot_openspm.envs.seeds import DEMO_SEED_START
+
+pytest.importorskip("libero.libero", reason="needs lerobot[libero]")
+pytestmark = pytest.mark.libero
+
+TASKS = (
+    "put_the_bowl_on_the_plate",
+    "push_the_plate_to_the_front_of_the_stove",
+    "open_the_top_drawer_and_put_the_bowl_inside",
+)
+# What the benchmark's states place anew; fixtures are drawn by the seed.
+MOVABLE = ("bowl", "cheese", "bottle", "plate")
+NEAR_M = 1e-3
+
+
+def evaluation_states(task: str) -> np.ndarray:
+    from lerobot.envs.libero import _get_suite, get_task_init_states
+
+    return np.asarray(get_task_init_states(_get_suite("libero_goal"), list(tasks()).index(task)))
+
+
+def away(simulator: LiberoSimulator, states: np.ndarray) -> float:
+    """How far the furthest movable object is from its place in the most similar evaluation state, metres."""
+    model, poses, apart = simulator.sim.model._model, simulator.object_poses(), []
+    for name in MOVABLE:
+        address = model.jnt_qposadr[model.body(simulator.root_body(name)).jntadr[0]]
+        # A flattened state is the time, the positions, the velocities.
+        apart.append(np.linalg.norm(states[:, 1 + address : 3 + address] - poses[name][:2, 3], axis=1))
+    return float(np.max(apart, axis=0).min())
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_no_demonstration_starts_from_an_evaluation_state(task):
+    simulator, states = LiberoSimulator(task), evaluation_states(task)
+    for seed in range(DEMO_SEED_START, DEMO_SEED_START + 5):
+        simulator.reset(seed)
+        assert away(simulator, states) > 3 * NEAR_M
+    # What the check would say if one did.
+    simulator.reset_to(DEMO_SEED_START, states[7])
+    assert away(simulator, states) < NEAR_M
+    simulator.close()
+
+
+def test_recording_only_ever_draws_scenes_by_their_seed(monkeypatch):
+    def refuse(*_):
+        raise AssertionError("a demonstration was begun from a given state")
+
+    monkeypatch.setattr(LiberoSimulator, "reset_to", refuse)
+    monkeypatch.setattr(recording, "expert_actions", lambda *_: iter([np.array(DO_NOTHING)] * 2))
+    episode = recording.LiberoSource().record(TASKS[0], DEMO_SEED_START, 64, 64)
+    assert (episode.seed, episode.status, episode.success) == (DEMO_SEED_START, "failed", False)
+
+
+def test_the_layout_is_the_public_datasets(monkeypatch):
+    monkeypatch.setattr(recording, "expert_actions", lambda *_: iter([np.array(DO_NOTHING)]))
+    source = recording.LiberoSource()
+    episode = source.record(TASKS[0], DEMO_SEED_START, 256, 256)
+    assert source.cameras == ("image", "image2")
+    shapes = {name: images.shape for name, images in episode.images.items()}
+    assert shapes == dict.fromkeys(source.cameras, (1, 256, 256, 3))
+    assert episode.columns["observation.state"].shape == (1, 8)
+    assert episode.columns["action"].shape == (1, 7)
+    motors = ["x", "y", "z", "roll", "pitch", "yaw"]
+    assert source.names["observation.state"] == {"motors": [*motors, "gripper", "gripper"]}
+    assert source.names["action"] == {"motors": [*motors, "gripper"]}
+    assert episode.instruction == tasks()[TASKS[0]]
