@@ -6,7 +6,7 @@ stands in for it. It gets the simulator's object poses and sizes, which the poli
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +15,7 @@ from lerobot_openspm.envs.libero.simulator import OBJECTS, LiberoSimulator, task
 from lerobot_openspm.experience import Experience, load_experience
 from lerobot_openspm.geometry import se3
 from lerobot_openspm.geometry.se3 import Array
-from lerobot_openspm.memory.entry import WORLD, Anchor, MemoryEntry, MemoryKeyPose, RetrievalKey
+from lerobot_openspm.memory.entry import WORLD, Anchor, MemoryEntry, MemoryKeyPose, RetrievalKey, SubTask
 from lerobot_openspm.memory.instruction import parse_instruction
 from lerobot_openspm.mining.mine import name_simulator_poses
 from lerobot_openspm.modeling_openspm import OpenSPMPolicy
@@ -48,45 +48,63 @@ def _guess(task: str, instruction: str, experience: Experience) -> MemoryEntry:
     names = list(dict.fromkeys(name for sub_task in sub_tasks for name in sub_task.objects))
     layout = name_simulator_poses(simulator.object_poses(), names, experience.objects)
     middles = {name: _middle(simulator, name) for name in names}
-    width = experience.robot.open_width
-    down = simulator.ee_pose()[:3, :3]
+    hand = _Guesser(middles, simulator.ee_pose()[:3, :3], experience.robot.open_width)
     simulator.close()
-    poses: list[MemoryKeyPose] = []
-
-    def add(name: str, offset: Array, phase: str, closed: bool, turn: float = 0.0) -> None:
-        rotation = se3.from_yaw(np.zeros(3), turn)[:3, :3] @ down
-        T_obj_ee = se3.transform(rotation, middles[name] + offset)
-        dwell = phase in ("grasp", "release")
-        steps = FINGER_STEPS if dwell else TRAVEL_STEPS
-        opening = HELD_SHARE * width if closed else width
-        poses.append(MemoryKeyPose(Anchor(name, WORLD), T_obj_ee, phase, 0.5, closed, opening, steps, dwell))
-
-    up = np.array([0.0, 0.0, ABOVE_M])
-    for sub_task in sub_tasks:
-        target, landmark = sub_task.target, sub_task.landmark or sub_task.target
-        add(target, up, "approach", False)
-        add(target, np.zeros(3), "approach", False)
-        if sub_task.operation == "push":
-            add(landmark, np.array([0.10, 0.0, 0.0]), "push", False)
-            continue
-        add(target, np.zeros(3), "grasp", True)
-        if sub_task.operation == "put":
-            add(target, up, "lift", True)
-            add(landmark, 2 * up, "pre-place", True)
-            add(landmark, up, "place", True)
-        elif sub_task.operation == "open":
-            add(target, np.array([0.0, PULL_M, 0.0]), "open", True)
-        else:
-            add(target, np.zeros(3), "turn", True, QUARTER_TURN_RAD)
-        last = poses[-1]
-        poses.append(replace(last, phase="release", closed=False, dwell=True, n_steps=FINGER_STEPS))
-        poses.append(
-            replace(
-                last, phase="retreat", closed=False, T_obj_ee=se3.transform(np.eye(3), up) @ last.T_obj_ee
-            )
-        )
+    poses = tuple(pose for sub_task in sub_tasks for pose in hand.follow(sub_task))
     key = RetrievalKey(sub_tasks, tuple(pose.phase for pose in poses))
-    return MemoryEntry(key, instruction, tuple(poses), 1.0, 1, "geometric guess", layout)
+    return MemoryEntry(key, instruction, poses, 1.0, 1, "geometric guess", layout)
+
+
+@dataclass(frozen=True)
+class _Guesser:
+    """Guesses key poses from where objects are.
+
+    Attributes:
+        middles: Middle of each object ``(3,)`` from its origin.
+        down: Orientation of the hand at home ``(3, 3)``, which points down.
+        open_width: Opening of the fingers when they are open.
+    """
+
+    middles: dict[str, Array]
+    down: Array
+    open_width: float
+
+    def follow(self, sub_task: SubTask) -> list[MemoryKeyPose]:
+        """Grasp the target's middle from above, do what is asked, let go and rise."""
+        target, landmark = sub_task.target, sub_task.landmark or sub_task.target
+        up = np.array([0.0, 0.0, ABOVE_M])
+        arrival = [
+            self._pose(target, up, "approach", False),
+            self._pose(target, np.zeros(3), "approach", False),
+        ]
+        if sub_task.operation == "push":
+            return [*arrival, self._pose(landmark, np.array([0.10, 0.0, 0.0]), "push", False)]
+        if sub_task.operation == "put":
+            way = [
+                self._pose(target, up, "lift", True),
+                self._pose(landmark, 2 * up, "pre-place", True),
+                self._pose(landmark, up, "place", True),
+            ]
+        elif sub_task.operation == "open":
+            way = [self._pose(target, np.array([0.0, PULL_M, 0.0]), "open", True)]
+        else:
+            way = [self._pose(target, np.zeros(3), "turn", True, QUARTER_TURN_RAD)]
+        last = replace(way[-1], closed=False, opening=self.open_width)
+        return [
+            *arrival,
+            self._pose(target, np.zeros(3), "grasp", True),
+            *way,
+            replace(last, phase="release", dwell=True, n_steps=FINGER_STEPS),
+            replace(last, phase="retreat", T_obj_ee=se3.transform(np.eye(3), up) @ last.T_obj_ee),
+        ]
+
+    def _pose(self, name: str, offset: Array, phase: str, closed: bool, turn: float = 0.0) -> MemoryKeyPose:
+        rotation = se3.from_yaw(np.zeros(3), turn)[:3, :3] @ self.down
+        T_obj_ee = se3.transform(rotation, self.middles[name] + offset)
+        dwell = phase == "grasp"
+        steps = FINGER_STEPS if dwell else TRAVEL_STEPS
+        opening = HELD_SHARE * self.open_width if closed else self.open_width
+        return MemoryKeyPose(Anchor(name, WORLD), T_obj_ee, phase, 0.5, closed, opening, steps, dwell)
 
 
 def _middle(simulator: LiberoSimulator, noun: str) -> Array:

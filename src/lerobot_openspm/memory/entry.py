@@ -87,6 +87,8 @@ AXIS_KINDS: dict[str, AxisKind] = {"open": "slide", "turn": "turn"}
 class Axis:
     """What an anchor that moves along a constraint allows: a drawer slides, a knob turns.
 
+    The axis of a turn runs through the hand, which holds a knob at its middle.
+
     Attributes:
         kind: Whether it is a direction to slide in or an axis to turn about.
         direction: Unit vector ``(3,)`` in the anchor's frame.
