@@ -20,6 +20,8 @@ from benchmarks.libero.stages import DEMOS, STATES, dataset, evaluation, policy,
 
 from lerobot_openspm.envs.libero.simulator import tasks
 
+logger = logging.getLogger(__name__)
+
 
 @dataclass
 class RunConfig:
@@ -45,9 +47,12 @@ def main(config: RunConfig) -> dict[str, Any]:
         raise ValueError(
             f"STATES must be 1 to {STATES} and DEMOS at least 1, got {config.states}, {config.demos}"
         )
+    logger.info("recording %d demonstrations of each of %d tasks", config.demos, len(selected))
     root = dataset(config.demos, selected)
+    logger.info("mining and training")
     checkpoint, seconds = policy(root, "train")
     folder = run_folder(config.demos, selected) / "evaluation"
+    logger.info("evaluating %d tasks from %d initial states", len(selected), config.states)
     episodes = evaluation(folder, checkpoint, config.states, selected)
     figures, errors = summary(episodes), accuracy(checkpoint, root, episodes)
     worst = {(e["task"], e["state"]): off for e, off in zip(episodes, errors.pop("off_mm"), strict=True)}

@@ -43,7 +43,8 @@ def select_tasks(selection: str) -> list[str]:
         numbers = first.isdecimal() and last.isdecimal()
         if not numbers or not int(first) <= int(last) < len(names):
             raise ValueError(
-                f"TASKS must be numbers from 0 to {len(names) - 1} like 0-9 or 0,3,5, got {selection}"
+                f"TASKS must be numbers and ascending ranges from 0 to {len(names) - 1}, like 0-9 or 0,3,5, "
+                f"got {selection}; they stand for {', '.join(f'{i} {name}' for i, name in enumerate(names))}"
             )
         chosen += range(int(first), int(last) + 1)
     return [names[i] for i in dict.fromkeys(chosen)]

@@ -113,7 +113,7 @@ def test_tasks_are_selected_by_number(selection, expected):
 
 @pytest.mark.parametrize("selection", ["", "3", "2-1", "a", "0-", "-1", "0,,1"])
 def test_numbers_that_are_no_tasks_are_refused(selection):
-    with pytest.raises(ValueError, match="TASKS must be"):
+    with pytest.raises(ValueError, match="TASKS must be numbers"):
         stages.select_tasks(selection)
 
 
