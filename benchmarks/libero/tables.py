@@ -249,9 +249,9 @@ def _new_tasks(results: list[dict[str, Any]]) -> str:
 
 def _losses(result: dict[str, Any]) -> str:
     last = (
-        f"At the end: training {result['training'][-1]}, on samples as they are drawn, perturbed copies and "
-        f"rare phases more often; validation {result['validation'][-1]}, on all frames of the held-out "
-        "demonstrations."
+        f"At the end: training {result['training'][-1]}, validation {result['validation'][-1]}. Both over "
+        "all frames as they were recorded, with the same noise for every checkpoint; training itself also "
+        "draws perturbed copies, and rare phases more often."
     )
     return f"![Training and validation loss](images/{result['plot']})\n\n{last}"
 
