@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterable, Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -62,7 +62,7 @@ YAW_MARGIN = np.deg2rad(20)
 
 
 def learn_objects(
-    scenes: Sequence[Scene], rng: Generator, known: Iterable[KnownObject] = ()
+    scenes: Sequence[Scene], rng: Generator, known: Collection[KnownObject] = ()
 ) -> dict[str, KnownObject]:
     """Learn every object that some scene hints at.
 

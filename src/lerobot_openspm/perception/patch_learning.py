@@ -11,7 +11,7 @@ tasks is enough.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass, replace
 
 import cv2
@@ -96,7 +96,7 @@ class _Candidate:
 
 
 def learn_patches(
-    names: Sequence[str], scenes: Sequence[Scene], known: Iterable[KnownObject] = ()
+    names: Sequence[str], scenes: Sequence[Scene], known: Collection[KnownObject] = ()
 ) -> dict[str, PatchModel]:
     """Learn the objects that hardly move; the others are left out.
 

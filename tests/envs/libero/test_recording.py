@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from benchmarks.libero.episode import initial_states
 
 from lerobot_openspm.envs.libero import recording
 from lerobot_openspm.envs.libero.simulator import DO_NOTHING, LiberoSimulator, tasks
@@ -20,12 +21,6 @@ MOVABLE = ("bowl", "cheese", "bottle", "plate")
 NEAR_M = 1e-3
 
 
-def evaluation_states(task: str) -> np.ndarray:
-    from lerobot.envs.libero import _get_suite, get_task_init_states
-
-    return np.asarray(get_task_init_states(_get_suite("libero_goal"), list(tasks()).index(task)))
-
-
 def away(simulator: LiberoSimulator, states: np.ndarray) -> float:
     """How far the furthest movable object is from its place in the most similar evaluation state, metres."""
     model, poses, apart = simulator.sim.model._model, simulator.object_poses(), []
@@ -38,7 +33,7 @@ def away(simulator: LiberoSimulator, states: np.ndarray) -> float:
 
 @pytest.mark.parametrize("task", TASKS)
 def test_no_demonstration_starts_from_an_evaluation_state(task):
-    simulator, states = LiberoSimulator(task), evaluation_states(task)
+    simulator, states = LiberoSimulator(task), initial_states(task)
     for seed in range(DEMO_SEED_START, DEMO_SEED_START + 5):
         simulator.reset(seed)
         assert away(simulator, states) > 3 * NEAR_M
