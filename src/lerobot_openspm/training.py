@@ -125,4 +125,5 @@ def training_set(dataset_meta: Any, config: OpenSPMConfig, robot: RobotModel) ->
         perturbed(frames, robot, config.perturbation_m, config.perturbation_rad, rng)
         for _ in range(PERTURBED_COPIES if config.perturbation_m > 0 or config.perturbation_rad > 0 else 0)
     ]
-    return TrainingSet(frames, copies, np.asarray(allowed), config.conditioning)
+    starts = np.sort([episode.from_index for episode in episodes])
+    return TrainingSet(frames, copies, np.asarray(allowed), starts, config.conditioning)

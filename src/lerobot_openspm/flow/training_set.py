@@ -18,6 +18,7 @@ class TrainingSet:
         frames: The demonstrated frames, each looked up by its dataset index.
         perturbed: Further copies of them, only ever drawn at random.
         allowed: Episodes that may be drawn from; a held-out one is only ever looked up.
+        starts: Dataset index of each episode's first frame, ascending.
         conditioning: What the model is told.
     """
 
@@ -26,6 +27,7 @@ class TrainingSet:
         frames: SegmentFrames,
         perturbed: list[SegmentFrames],
         allowed: NDArray[np.int64],
+        starts: NDArray[np.int64],
         conditioning: Conditioning,
     ):
         copies = [frames, *perturbed]
@@ -40,6 +42,7 @@ class TrainingSet:
         counts = np.bincount(phase[drawable], minlength=int(phase.max()) + 1)
         weights = np.where(drawable, 1.0 / np.sqrt(np.maximum(counts[phase], 1)), 0.0)
         self._weights = torch.as_tensor(weights, dtype=torch.float32)
+        self._starts = torch.as_tensor(starts)
         # Rows by ascending dataset index, and those indices.
         self._index, self._rows = torch.as_tensor(frames.index).sort()
 
@@ -47,7 +50,7 @@ class TrainingSet:
         """Samples for a batch of frames: `draws` for each, the first of them the frame itself.
 
         A frame that belongs to no segment (a pause, or after the last key pose) is replaced: in training by a
-        random one, else by the last one before it that does, which is of the same episode.
+        random one, else by the last one before it in its episode that does, or the first one after it.
 
         Args:
             index: Dataset index ``(b,)``.
@@ -59,6 +62,8 @@ class TrainingSet:
         """
         index = index.cpu().flatten()
         before = (torch.searchsorted(self._index, index, right=True) - 1).clamp(min=0)
+        start = self._starts[(torch.searchsorted(self._starts, index, right=True) - 1).clamp(min=0)]
+        before = torch.where(self._index[before] < start, before + 1, before).clamp(max=len(self._rows) - 1)
         rows = self._rows[before]
         if training:
             rows = torch.where(self._index[before] == index, rows, self._sample(len(rows)))
