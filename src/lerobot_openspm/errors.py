@@ -27,3 +27,7 @@ class InstructionError(OpenSPMError):
 
 class ObservationError(OpenSPMError):
     """An observation lacks a camera, has images of another size, or is not finite."""
+
+
+class PerceptionError(OpenSPMError):
+    """A perception backend cannot be used: a package, weights, a worker or a phrase is missing."""

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,11 +26,50 @@ class View:
         image: RGB image ``(H, W, 3)``, uint8.
         camera: Intrinsics, already scaled to ``H x W``.
         T_world_cam: Camera pose ``(4, 4)`` at that moment.
+        depth: Metres along the optical axis ``(H, W)``, float32, 0 where not measured; None without a depth
+            stream.
+        labels: Number of the object that each pixel shows ``(H, W)``, int32; None unless the observation
+            brings masks.
     """
 
     image: NDArray[np.uint8]
     camera: Camera
     T_world_cam: Array
+    depth: NDArray[np.float32] | None = None
+    labels: NDArray[np.int32] | None = None
+
+
+@dataclass(frozen=True)
+class Segmentation:
+    """One instance of a phrase in one view: the paper's mask, bounding box and confidence.
+
+    Attributes:
+        mask: Its pixels ``(H, W)``; at least one.
+        confidence: From 0 to 1.
+    """
+
+    mask: Mask
+    confidence: float
+
+    @property
+    def box(self) -> Array:
+        """First and last column and row ``(4,)`` of the mask: u_min, v_min, u_max, v_max, pixels."""
+        u, v = np.flatnonzero(self.mask.any(0)), np.flatnonzero(self.mask.any(1))
+        return np.array([u[0], v[0], u[-1], v[-1]], float)
+
+
+class Segmenter(Protocol):
+    """Finds objects by phrase in the views of one moment."""
+
+    def segment(
+        self, views: Mapping[str, View], phrases: Sequence[str]
+    ) -> dict[str, dict[str, tuple[Segmentation, ...]]]:
+        """By phrase and camera: the instances seen, the most confident first, none where there is none.
+
+        Raises:
+            PerceptionError: A phrase that this segmenter cannot know, or a view that lacks what it needs.
+        """
+        ...
 
 
 @dataclass(frozen=True)
