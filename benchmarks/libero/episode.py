@@ -76,13 +76,13 @@ def run_episode(policy: OpenSPMPolicy, simulator: LiberoSimulator) -> Episode:
         with torch.inference_mode():
             action = action_layout.encode_actions(policy.act([observation])[0]).astype(np.float32)
         if not seen:
-            seen = dict(policy._rows[0].layout)
+            seen = dict(policy.rows[0].layout)
             models = policy.experience.objects if policy.experience else {}
             named = [name for one in parse_instruction(simulator.instruction) for name in one.objects]
             true = name_simulator_poses(simulator.object_poses(), list(dict.fromkeys(named)), models)
         success = simulator.step(action)
         actions.append(action)
-    return Episode(success, np.stack(actions), policy._rows[0], seen, true)
+    return Episode(success, np.stack(actions), policy.rows[0], seen, true)
 
 
 @functools.cache

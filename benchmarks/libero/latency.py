@@ -36,7 +36,7 @@ def main() -> dict[str, Any]:
     observation = Observation(simulator.instruction, vector, hand, images, None)
     with torch.inference_mode():
         first = _times(lambda: (acting.reset(), acting.act([observation])), LOOKS)
-        row = acting._rows[0]
+        row = acting.rows[0]
         chunk = _times(lambda: acting._chunk(row, row.query(hand)), CHUNKS)
     horizon = acting.config.chunk_size
     return write(

@@ -38,10 +38,13 @@ class OpenSPMConfig(PreTrainedConfig):
         state_rotation: How the state writes the rotation, where its names are wrong about it: "axis_angle",
             "quat", "euler" or "none".
         action_rotation: Likewise for the action.
-        control_hz: How often the robot takes an action, where it is known. Only compared with what the
-            dataset says of itself: OpenSPM counts steps.
+        control_hz: How often the robot takes an action; what the dataset says of itself if not given. Actions
+            are counted in steps; only how long something was not seen is told in seconds.
+        hand_radius_m: Radius of the hand, which hides from the cameras what is behind it.
         perception: "demonstrations" finds objects in the images, by what the demonstrations showed of them.
             "oracle" takes their poses from the simulator, for ablations only.
+        tracking: Whether objects are followed through the episode, and key poses with them. Otherwise they
+            are found once, at its start, as in the paper.
         memory_episodes: Episodes that may enter the memory and the training samples; all if not given. Name
             them when some are held out: the policy is shown the whole dataset otherwise.
         memory_update: What happens to a checkpoint's memory when training goes on from it: "keep" it,
@@ -84,9 +87,11 @@ class OpenSPMConfig(PreTrainedConfig):
     state_rotation: str | None = None
     action_rotation: str | None = None
     control_hz: float | None = None
+    hand_radius_m: float = 0.08
 
     # Memory and perception.
     perception: PerceptionSource = "demonstrations"
+    tracking: bool = True
     memory_episodes: list[int] | None = None
     memory_update: MemoryUpdate = "keep"
     weight_semantic: float = 1.0
@@ -144,7 +149,8 @@ class OpenSPMConfig(PreTrainedConfig):
             )
         positive = (
             "hidden_dim", "num_inference_steps", "samples_per_frame", "residual_m", "residual_rad",
-            "passing_m", "passing_rad", "max_jump_m", "max_jump_rad", "optimizer_lr", "scheduler_decay_steps",
+            "passing_m", "passing_rad", "hand_radius_m", "max_jump_m", "max_jump_rad", "optimizer_lr",
+            "scheduler_decay_steps",
         )  # fmt: skip
         for name in positive:
             if not getattr(self, name) > 0:  # NaN is not either

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -27,10 +27,14 @@ from lerobot_openspm.flow.network import VelocityField
 from lerobot_openspm.flow.training_set import TrainingSet
 from lerobot_openspm.geometry.camera import load_cameras
 from lerobot_openspm.observation import Observation, split_batch
-from lerobot_openspm.perceive import find_objects
+from lerobot_openspm.perceive import Eyes
+from lerobot_openspm.perception.tracker import TrackerSettings
 from lerobot_openspm.training import mine_experience, training_set
 
 logger = logging.getLogger(__name__)
+
+# Of checkpoints that do not say how often their robot acts.
+DEFAULT_CONTROL_HZ = 20.0
 
 
 class OpenSPMPolicy(PreTrainedPolicy):
@@ -71,7 +75,8 @@ class OpenSPMPolicy(PreTrainedPolicy):
 
     def reset(self) -> None:
         """Forget the running episodes."""
-        self._rows: list[Row] = []
+        self.rows: list[Row] = []
+        self._eyes: list[Eyes] = []
 
     @torch.no_grad()
     def select_action(self, batch: dict[str, Tensor], **kwargs: Any) -> Tensor:
@@ -111,10 +116,10 @@ class OpenSPMPolicy(PreTrainedPolicy):
 
     def _observe(self, observations: Sequence[Observation]) -> list[tuple[Row, Observation]]:
         """Each environment's state, brought up to its observation."""
-        pairs = list(zip(self._rows_of(observations), observations, strict=True))
-        for row, observation in pairs:
-            row.observe(observation.hand, partial(self._find, observation))
-        return pairs
+        rows = self._rows_of(observations)
+        for row, eyes, observation in zip(rows, self._eyes, observations, strict=True):
+            row.observe(observation.hand, partial(eyes.look, observation))
+        return list(zip(rows, observations, strict=True))
 
     def _encode(self, actions: np.ndarray) -> Tensor:
         """Actions ``(..., 7)`` in the robot's own layout."""
@@ -123,26 +128,26 @@ class OpenSPMPolicy(PreTrainedPolicy):
 
     def _rows_of(self, observations: Sequence[Observation]) -> list[Row]:
         """The state of each environment; a new one where the episode or its instruction is new."""
-        if len(self._rows) != len(observations):
-            self._rows = [self._new_row(observation) for observation in observations]
+        if len(self.rows) != len(observations):
+            self.rows = [self._new_row(observation) for observation in observations]
+            self._eyes = [self._new_eyes() for _ in observations]
         for i, observation in enumerate(observations):
-            if self._rows[i].instruction != observation.instruction:
-                self._rows[i] = self._new_row(observation)
-        return self._rows
+            if self.rows[i].instruction != observation.instruction:
+                self.rows[i], self._eyes[i] = self._new_row(observation), self._new_eyes()
+        return self.rows
 
     def _new_row(self, observation: Observation) -> Row:
         experience = self._require_experience()
         config = self.config
         knowledge = Knowledge(
             experience.entries, experience.yaw_periods, experience.robot, config.score_weights,
-            config.transfer_limits, config.control_settings,
+            config.transfer_limits, config.control_settings, TrackerSettings(), config.tracking,
+            1 / (config.control_hz or DEFAULT_CONTROL_HZ),
         )  # fmt: skip
         return Row(knowledge, observation.instruction, observation.fingerprint(), config.noise_seed)
 
-    def _find(
-        self, observation: Observation, names: Sequence[str], min_confidence: float
-    ) -> Mapping[str, np.ndarray]:
-        return find_objects(names, observation, self._require_experience(), min_confidence)
+    def _new_eyes(self) -> Eyes:
+        return Eyes(self._require_experience(), self.config.hand_radius_m)
 
     def _chunk(self, row: Row, query: Query) -> np.ndarray:
         """Generate one chunk ``(chunk_size, 7)`` in the world. Rows go one by one, so batches act alike."""

@@ -51,24 +51,43 @@ class Observation:
         ]
         return zlib.crc32(b"".join(parts))
 
-    def views(self, cameras: Mapping[str, Camera]) -> dict[str, View]:
+    def views(
+        self, cameras: Mapping[str, Camera], strict: bool = True
+    ) -> tuple[dict[str, View], dict[str, str]]:
         """Images of the calibrated cameras with the cameras' present poses.
 
+        Args:
+            cameras: The calibration.
+            strict: Whether a camera without a usable image is an error.
+
+        Returns:
+            Views by camera, and why there is none for the others.
+
         Raises:
-            ObservationError: A calibrated camera is missing, or its image is no finite RGB picture.
+            ObservationError: A calibrated camera is missing, or its image is no finite RGB picture; only if
+                strict.
             CalibrationError: An image has another shape than the calibration.
         """
-        views = {}
+        views, absent = {}, {}
         for key, camera in cameras.items():
-            if key not in self.images:
-                raise ObservationError(
-                    f"the observation has no camera {key!r} that the calibration names; it has "
-                    f"{sorted(self.images)}. Rename with --rename_map, or pass --policy.cameras=FILE"
-                )
-            image = _as_uint8(self.images[key], key)
+            try:
+                image = self._image(key)
+            except ObservationError as error:
+                if strict:
+                    raise
+                absent[key] = str(error)
+                continue
             scaled = camera.scaled(image.shape[1], image.shape[0])
             views[key] = View(image, scaled, scaled.T_world_cam(self.hand.T_world_ee))
-        return views
+        return views, absent
+
+    def _image(self, key: str) -> NDArray[np.uint8]:
+        if key not in self.images:
+            raise ObservationError(
+                f"the observation has no camera {key!r} that the calibration names; it has "
+                f"{sorted(self.images)}. Rename with --rename_map, or pass --policy.cameras=FILE"
+            )
+        return _as_uint8(self.images[key], key)
 
     def simulator_layout(self, names: Sequence[str]) -> dict[str, Array]:
         """Simulator poses ``T_world_obj`` by name (oracle ablation only)."""

@@ -1,29 +1,83 @@
-"""Finding objects in an observation, as the experience's perception does it."""
+"""One environment's eyes: which cameras can be believed, and where the objects are."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 
+import numpy as np
+
+from lerobot_openspm.control.row import Sighting
 from lerobot_openspm.experience import Experience
 from lerobot_openspm.geometry.se3 import Array
 from lerobot_openspm.mining.mine import name_simulator_poses
 from lerobot_openspm.observation import Observation
+from lerobot_openspm.perception.camera_watch import CameraWatch
 from lerobot_openspm.perception.localise import localise, prepare
+from lerobot_openspm.perception.occlusion import hand_mask
+from lerobot_openspm.perception.types import PoseEstimate, View
+
+# How exact the simulator's poses are taken to be (oracle ablation only): metres and radians.
+ORACLE_STD = 1e-4
 
 
-def find_objects(
-    names: Sequence[str], observation: Observation, experience: Experience, min_confidence: float = 0.0
-) -> dict[str, Array]:
-    """Poses ``T_world_obj`` ``(4, 4)`` of those of the named objects that are found with this confidence."""
-    if experience.perception == "oracle":
-        poses = observation.simulator_layout(experience.simulator_objects)
-        return name_simulator_poses(poses, names, experience.objects)
-    views = observation.views(experience.cameras)
-    prepared = {key: prepare(view) for key, view in views.items()}
-    known = [name for name in names if name in experience.objects]
-    estimates = {name: localise(prepared, experience.objects[name]) for name in known}
-    return {
-        name: estimate.T_world_obj
-        for name, estimate in estimates.items()
-        if estimate.status == "found" and estimate.confidence >= min_confidence
-    }
+@dataclass
+class Eyes:
+    """What one environment looks through.
+
+    Attributes:
+        experience: What objects and cameras are known.
+        hand_radius_m: Radius of the hand, which hides what is behind it.
+    """
+
+    experience: Experience
+    hand_radius_m: float
+    _watch: CameraWatch = field(default_factory=CameraWatch)
+    _has_looked: bool = False
+
+    def look(
+        self, observation: Observation, names: Sequence[str], expected: Mapping[str, Array], time_s: float
+    ) -> Sighting:
+        """Look for objects.
+
+        Args:
+            observation: What there is to see.
+            names: The objects.
+            expected: Poses ``T_world_obj`` ``(4, 4)`` of those that were seen before; they are looked for
+                there first.
+            time_s: Seconds since the episode began.
+
+        Raises:
+            ObservationError: A camera is missing or broken at the very first look.
+        """
+        if self.experience.perception == "oracle":
+            return Sighting(self._simulator_poses(observation, names), {})
+        views, absent = observation.views(self.experience.cameras, strict=not self._has_looked)
+        self._has_looked = True
+        T_world_ee = observation.hand.T_world_ee
+        faults = self._watch.check(views, absent, T_world_ee, time_s)
+        good = {camera: view for camera, view in views.items() if camera not in faults}
+        return Sighting(self._find(good, names, expected, T_world_ee) if good else {}, faults)
+
+    def _find(
+        self,
+        views: Mapping[str, View],
+        names: Sequence[str],
+        expected: Mapping[str, Array],
+        T_world_ee: Array,
+    ) -> dict[str, PoseEstimate]:
+        prepared = {camera: prepare(view) for camera, view in views.items()}
+        hidden = {camera: hand_mask(view, T_world_ee, self.hand_radius_m) for camera, view in views.items()}
+        return {
+            name: localise(
+                prepared, self.experience.objects[name], hidden=hidden, T_expected=expected.get(name)
+            )
+            for name in names
+            if name in self.experience.objects
+        }
+
+    def _simulator_poses(self, observation: Observation, names: Sequence[str]) -> dict[str, PoseEstimate]:
+        poses = observation.simulator_layout(self.experience.simulator_objects)
+        named = name_simulator_poses(poses, names, self.experience.objects)
+        covariance = ORACLE_STD**2 * np.eye(4)
+        return {name: PoseEstimate("found", T, covariance, 1.0, {}) for name, T in named.items()}

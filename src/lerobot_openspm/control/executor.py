@@ -23,6 +23,8 @@ logger = logging.getLogger(__name__)
 
 Execution = Literal["open_loop", "closed_loop", "closed_loop_trc"]
 
+# Phases that end with the hand on an object.
+CONTACTS = ("grasp", "release", "push", "open", "turn")
 # An opening below this share of the demonstrated one means that the fingers hold nothing.
 HELD_SHARE = 0.4
 # Where the demonstration's fingers stood further apart than this share of open, they held something.
@@ -45,6 +47,8 @@ class Status(StrEnum):
     OBJECT_NOT_FOUND = "object_not_found"
     INFEASIBLE = "infeasible"  # no entry passes the transfer checks here
     NO_PROGRESS = "no_progress"  # retries are used up
+    OBJECT_LOST = "object_lost"  # what is needed now was seen before and is gone; looked for until it is back
+    CAMERA_FAULT = "camera_fault"  # a camera gave no sound picture for too long
 
 
 @dataclass(frozen=True)
@@ -283,6 +287,21 @@ class Executor:
             return False
         logger.info("trying key pose %d (%s) again: %s", self.index, phase, why)
         return True
+
+    def stop(self, status: Status) -> None:
+        """Hold still for a reason."""
+        self.status = status
+        self._queue.clear()
+
+    def entry_index(self) -> int:
+        """The first key pose of the way to the present one, at the same anchor and after the last contact."""
+        index, place = self.index, self.plan[self.index].memory.anchor.place
+        while index > 0:
+            before = self.plan[index - 1].memory
+            if before.anchor.place != place or before.phase in CONTACTS:
+                break
+            index -= 1
+        return index
 
     def retry_index(self) -> int:
         """The first key pose of the approach that the present one depends on."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import zlib
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -17,31 +17,61 @@ from lerobot_openspm.geometry.se3 import Array
 from lerobot_openspm.memory.entry import MemoryEntry
 from lerobot_openspm.memory.retrieval import Scored, ScoreWeights, retrieve, semantic_candidates
 from lerobot_openspm.memory.robot import RobotModel
+from lerobot_openspm.perception.camera_watch import Fault
+from lerobot_openspm.perception.tracker import Tracker, TrackerSettings, TrackStatus
+from lerobot_openspm.perception.types import PoseEstimate
 
 logger = logging.getLogger(__name__)
 
-# An object that is not found is looked for again after this many steps.
+# An object that is not found is looked for again after this many steps; while things go well, all are.
 LOOK_AGAIN_STEPS = 5
+# What looks wrong is looked at again after this many.
+SECOND_LOOK_STEPS = 3
 
-# Poses found while the hand is about are believed from this confidence on. Measured on LIBERO: nine in ten
-# of those above it were within 2 mm of the truth; below it, the hand being in the way, many were centimetres
-# off.
-SURE = 0.95
-# An object that is seen this far from where it was taken to be has moved; less is the noise of finding it.
-MOVED_M = 0.002
+# Without a sound picture of every camera the hand goes on for so long, then holds still, then gives up.
+BLIND_S, GIVE_UP_S = 0.5, 2.0
+
+# An object that is this far from where the key poses took it to be takes them along; less is noise.
+MOVED_M, MOVED_RAD = 0.002, 0.05
 
 # An entry whose key poses lie this much differently to one another here counts as 1/e alike.
 SHAPE_SCALE_M = 0.1
 # An entry that can be executed at all scores at least this.
 MIN_USABLE_SCORE = 1e-3
 
-# Names of objects, least confidence -> poses T_world_obj of those that are found in the present images.
-Look = Callable[[Sequence[str], float], Mapping[str, Array]]
+
+@dataclass(frozen=True)
+class Sighting:
+    """What one look brought.
+
+    Attributes:
+        estimates: By name, for the objects that were looked for.
+        faults: Cameras whose pictures cannot be used.
+    """
+
+    estimates: Mapping[str, PoseEstimate]
+    faults: Mapping[str, Fault]
+
+
+# Names of objects, poses T_world_obj at which some are expected, seconds since the start -> what is seen.
+Look = Callable[[Sequence[str], Mapping[str, Array], float], Sighting]
 
 
 @dataclass(frozen=True)
 class Knowledge:
-    """What every environment shares: the memory, the robot, how to choose and how to follow."""
+    """What every environment shares: the memory, the robot, how to choose and how to follow.
+
+    Attributes:
+        entries: The memory bank.
+        yaw_periods: Angle by object that turns it into itself, radians.
+        robot: The robot.
+        weights: Of retrieval.
+        limits: Of transferred key poses.
+        settings: How key poses are followed.
+        tracker: When poses are believed.
+        tracking: Whether objects are looked for again once a plan is made.
+        step_s: Seconds that a control step takes.
+    """
 
     entries: Sequence[MemoryEntry]
     yaw_periods: Mapping[str, float]
@@ -49,6 +79,9 @@ class Knowledge:
     weights: ScoreWeights
     limits: TransferLimits
     settings: ControlSettings
+    tracker: TrackerSettings = field(default_factory=TrackerSettings)
+    tracking: bool = True
+    step_s: float = 0.05
 
 
 class Row:
@@ -57,17 +90,24 @@ class Row:
     Attributes:
         instruction: What is to be done.
         executor: Follows the plan.
+        tracker: Follows the objects.
         ranked: The entries of the last retrieval with their scores, best first.
-        layout: Poses ``T_world_obj`` of the objects found so far.
+        layout: Poses ``T_world_obj`` that the plan was made with: of what the hand has touched, from before.
+        faults: Cameras that were no use at the last look.
+        is_paused: Whether the hand holds still until something is seen again.
     """
 
     def __init__(self, knowledge: Knowledge, instruction: str, fingerprint: int, noise_seed: int):
         self._knowledge = knowledge
         self.instruction = instruction
         self.executor = Executor(knowledge.settings, knowledge.robot)
+        self.tracker = Tracker(knowledge.yaw_periods, knowledge.tracker)
         self.ranked: list[Scored] = []
         self.layout: dict[str, Array] = {}
-        self._idle_steps = 0
+        self.faults: Mapping[str, Fault] = {}
+        self.is_paused = False
+        self._step = -1
+        self._looked_at_step = -LOOK_AGAIN_STEPS
         self._planned_from = np.eye(4)  # the hand's pose when the plan was made
         # Told by what the episode shows first, so that it does not matter in which batch or row it runs.
         self._noise_key = (noise_seed, zlib.crc32(instruction.encode()), fingerprint)
@@ -78,20 +118,27 @@ class Row:
         return self.executor.status
 
     def observe(self, hand: Hand, look: Look) -> None:
-        """Take in a new observation: plan, advance, look again where a key pose was reached, try again."""
+        """Take in a new observation: plan, advance, look around, go where things are now, try again."""
+        self._step += 1
+        self.tracker.predict(self._knowledge.step_s)
         if self.status in (Status.WAITING, Status.OBJECT_NOT_FOUND, Status.INFEASIBLE):
-            if self._idle_steps % LOOK_AGAIN_STEPS == 0:
+            if self._waited_steps >= LOOK_AGAIN_STEPS:
                 self._plan(hand, look)
-            self._idle_steps += 1
-        index = self.executor.index
-        if self.status is Status.RUNNING and self.executor.advance(hand):
-            self._try_again(hand, look)
-        elif self.executor.index != index and self._knowledge.settings.execution != "open_loop":
-            self._look_again(look)
+        elif self.status is Status.OBJECT_LOST:
+            if self._waited_steps >= SECOND_LOOK_STEPS:
+                self._look_around(hand, look)
+        elif self.status is Status.RUNNING:
+            index = self.executor.index
+            is_to_retry = not self.is_paused and self.executor.advance(hand)
+            self._carry(index, hand)
+            if is_to_retry:
+                self._try_again(hand, look)
+            elif self._is_time_to_look(index):
+                self._look_around(hand, look)
 
     def next_action(self, hand: Hand) -> Array | None:
         """The next canonical action ``(7,)``, or None when a chunk is needed."""
-        return self.executor.next_action(hand)
+        return self.executor.hold() if self.is_paused else self.executor.next_action(hand)
 
     def query(self, hand: Hand) -> Query:
         """The condition of the next chunk."""
@@ -101,10 +148,15 @@ class Row:
         """Standard normal noise of the next chunk, a function of (seed, episode, chunk) alone."""
         return np.random.default_rng([*self._noise_key, self.executor.replans]).standard_normal(shape)
 
+    # Planning.
+
     def _plan(self, hand: Hand, look: Look) -> None:
         candidates = semantic_candidates(self.instruction, self._knowledge.entries)
         names = list(dict.fromkeys(name for entry, _ in candidates for name in entry.objects))
-        self.layout |= look(names, 0.0)
+        self._see(names, hand, look)
+        if self.status is Status.CAMERA_FAULT:
+            return
+        self.layout |= self.tracker.poses(hand.T_world_ee)
         self.ranked = retrieve(
             candidates, lambda entry: self._geometric_score(entry, hand.T_world_ee), self._knowledge.weights
         )
@@ -119,39 +171,137 @@ class Row:
             self._planned_from = hand.T_world_ee
             self.executor.begin(self._transfer(best, hand.T_world_ee), hand)
 
-    def _look_again(self, look: Look) -> None:
-        """Find what the hand has not touched yet again, and move the key poses along if it has moved."""
-        target, index = self.executor.target, self.executor.index
-        if target is None or target.memory.dwell:  # done, or the fingers hide what they are around
-            return
-        touched = {pose.memory.anchor.place for pose in self.executor.plan[:index] if _touches(pose)}
-        untouched = [name for name in self._anchors(index) if name not in touched]
-        found: Mapping[str, Array] = look(untouched, SURE) if untouched else {}
-        moved = {name: T for name, T in found.items() if _distance(T, self.layout[name]) > MOVED_M}
-        if moved and self._update(moved):
-            logger.info("%r: moved: %s", self.instruction, ", ".join(moved))
-            self.executor.change(self._transfer(self.ranked[0].entry, self._planned_from))
-
     def _try_again(self, hand: Hand, look: Look) -> None:
         """Find the objects of the remaining key poses again and go back to the approach of this contact."""
         index = self.executor.retry_index()
         self._planned_from = hand.T_world_ee
-        self._update(look(self._anchors(index), SURE))
-        self.executor.begin(self._transfer(self.ranked[0].entry, self._planned_from), hand, index)
+        if self._knowledge.tracking:
+            self.tracker.forget(self.tracker.held)  # it is not in the hand, so it may be anywhere
+            ahead = self._anchors(index)
+            self._see(ahead, hand, look)
+            self._update(ahead, hand)
+        if self.status is Status.RUNNING:
+            self._begin(index, hand)
+
+    # Looking.
+
+    @property
+    def _waited_steps(self) -> int:
+        return self._step - self._looked_at_step
+
+    def _is_time_to_look(self, index_before: int) -> bool:
+        if not self._knowledge.tracking or self._knowledge.settings.execution == "open_loop":
+            return False
+        target = self.executor.target
+        if target is None or (target.memory.dwell and not self.is_paused):
+            return False  # done, or the fingers hide what they are around
+        if self.is_paused or self.faults or self.tracker.doubtful:
+            return self._waited_steps >= SECOND_LOOK_STEPS
+        return self.executor.index != index_before or self._waited_steps >= LOOK_AGAIN_STEPS
+
+    def _see(self, names: Sequence[str], hand: Hand, look: Look) -> frozenset[str]:
+        """Look for objects; the names of those that are somewhere else than before."""
+        waited_s = min(self._waited_steps, LOOK_AGAIN_STEPS) * self._knowledge.step_s
+        expected = {k: T for k, T in self.tracker.poses(hand.T_world_ee).items() if k in names}
+        sighting = look(names, expected, self._step * self._knowledge.step_s)
+        self._looked_at_step, self.faults = self._step, sighting.faults
+        for camera, fault in self.faults.items():
+            if fault.seconds > GIVE_UP_S:
+                logger.warning("%r: stopping, camera %r: %s", self.instruction, camera, fault.reason)
+                self.executor.stop(Status.CAMERA_FAULT)
+        return self.tracker.look(sighting.estimates, hand.T_world_ee, waited_s)
+
+    def _look_around(self, hand: Hand, look: Look) -> None:
+        """Look at what the remaining key poses need and what is in the hand; act on what has changed."""
+        untouched, held = self._untouched(), self.tracker.held
+        moved = self._see([*untouched, *(held - set(untouched))], hand, look)
+        if self.status is Status.CAMERA_FAULT:
+            return
+        if dropped := moved & held:
+            logger.info("%r: dropped: %s", self.instruction, ", ".join(sorted(dropped)))
+            index = self.executor.retry_index()
+            self._update(self._anchors(index), hand)
+            self._begin(index, hand)
+        elif changed := self._update(untouched, hand):
+            logger.info("%r: moved: %s", self.instruction, ", ".join(sorted(changed)))
+            self._follow(bool(moved & set(self._now_needed())), hand)
+        self._wait_for_what_is_needed(hand)
+
+    def _follow(self, jumped: bool, hand: Hand) -> None:
+        """Go to where the key poses are now; from further off, if what is approached has jumped aside."""
+        if jumped and self.status is Status.RUNNING:
+            self._begin(self.executor.entry_index(), hand)
+        else:
+            self.executor.change(self._transfer(self.ranked[0].entry, self._planned_from))
+
+    def _wait_for_what_is_needed(self, hand: Hand) -> None:
+        """Hold still without sound pictures, and while what the hand is on its way to is not to be seen."""
+        statuses = {name: self.tracker.status(name) for name in self._now_needed()}
+        blind = any(fault.seconds > BLIND_S for fault in self.faults.values())
+        if lost := [name for name, status in statuses.items() if status is TrackStatus.LOST]:
+            if self.status is Status.RUNNING:
+                logger.info("%r: lost: %s", self.instruction, ", ".join(lost))
+            self.executor.stop(Status.OBJECT_LOST)
+        elif self.status is Status.OBJECT_LOST:
+            self._begin(self.executor.entry_index(), hand)
+        self.is_paused = blind or TrackStatus.STALE in statuses.values()
+
+    def _carry(self, index_before: int, hand: Hand) -> None:
+        """Tell the tracker what the hand took hold of, pushes or let go on the key poses just passed."""
+        for i in range(index_before, self.executor.index):
+            passed, after = self.executor.plan[i].memory, self.executor.plan[i + 1].memory
+            is_carried = passed.phase == "grasp" and after.phase not in ("open", "turn")
+            if is_carried or (after.phase == "push" and passed.phase != "push"):
+                self.tracker.hold(passed.anchor.place, hand.T_world_ee)
+            elif passed.phase in ("release", "push"):
+                self.tracker.release(self.tracker.held, hand.T_world_ee)
+        if self.status is Status.DONE:
+            self.tracker.release(self.tracker.held, hand.T_world_ee)
 
     def _anchors(self, index: int) -> list[str]:
         """Objects of the key poses from one on."""
         ahead = self.ranked[0].entry.key_poses[index:]
         return list(dict.fromkeys(name for pose in ahead for name in pose.anchor.objects))
 
-    def _update(self, found: Mapping[str, Array]) -> bool:
-        """Believe new poses, unless the hand could not follow key poses there."""
+    def _untouched(self) -> list[str]:
+        """Objects of the key poses to come that still are where they were seen."""
+        index = self.executor.index
+        touched = {pose.memory.anchor.place for pose in self.executor.plan[:index] if _touches(pose)}
+        return [name for name in self._anchors(index) if name not in touched]
+
+    def _now_needed(self) -> list[str]:
+        """Objects that the present key pose is relative to, unless the hand has touched them."""
+        untouched = self._untouched()
+        return [
+            name
+            for name in self.executor.plan[self.executor.index].memory.anchor.objects
+            if name in untouched
+        ]
+
+    # Believing.
+
+    def _begin(self, index: int, hand: Hand) -> None:
+        self._planned_from = hand.T_world_ee
+        self.tracker.release(self.tracker.held, hand.T_world_ee)
+        self.executor.begin(self._transfer(self.ranked[0].entry, self._planned_from), hand, index)
+
+    def _update(self, names: Sequence[str], hand: Hand) -> set[str]:
+        """Take over where objects are now, unless the hand could not follow key poses there.
+
+        Returns:
+            Those that are elsewhere than before.
+        """
+        poses = self.tracker.poses(hand.T_world_ee)
+        changed = {name for name in names if name in poses and _is_moved(poses[name], self.layout[name])}
+        if not changed:
+            return changed
         entry, believed = self.ranked[0].entry, self.layout
-        self.layout = {**believed, **found}
+        self.layout = {**believed, **{name: poses[name] for name in changed}}
         if problems := self._problems(entry, self._planned_from):
             logger.info("%r: not believed: %s", self.instruction, "; ".join(problems))
             self.layout = believed
-        return not problems
+            return set()
+        return changed
 
     def _geometric_score(self, entry: MemoryEntry, T_world_ee: Array) -> float:
         """``S_geo``: 0 if an entry cannot be executed here, else how like its demonstration it would be."""
@@ -173,5 +323,6 @@ def _touches(target: Target) -> bool:
     return target.memory.phase in ("grasp", "push", "open", "turn")
 
 
-def _distance(T: Array, other: Array) -> float:
-    return float(se3.distances(T, other)[0])
+def _is_moved(T: Array, other: Array) -> bool:
+    metres, radians = se3.distances(T, other)
+    return bool(metres > MOVED_M or radians > MOVED_RAD)

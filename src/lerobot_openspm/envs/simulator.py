@@ -154,6 +154,14 @@ class TabletopSimulator:
         left, right = (float(self.data.qpos[self._qpos[name]]) for name in ("finger_left", "finger_right"))
         return np.array([max(left, 0.0), min(right, 0.0)])
 
+    def put(self, name: str, T_world_obj: np.ndarray) -> None:
+        """Put a movable object somewhere else at once, at rest: somebody moved it, or it slipped and fell."""
+        start = self._qpos[name]
+        x, y, z, w = Rotation.from_matrix(T_world_obj[:3, :3]).as_quat()
+        self.data.qpos[start : start + 7] = (*T_world_obj[:3, 3], w, x, y, z)
+        self.data.qvel[self._dof[name] : self._dof[name] + 6] = 0.0
+        mujoco.mj_forward(self.model, self.data)
+
     def joint_position(self, name: str) -> float:
         """Metres a drawer is pulled out, or radians the knob is turned."""
         return float(self.data.qpos[self._qpos[name]])

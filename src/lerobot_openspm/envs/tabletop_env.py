@@ -116,7 +116,15 @@ class TabletopEnv(gym.Env):
         return self._observe(), self._info("running")
 
     def step(self, action: np.ndarray) -> tuple[dict, float, bool, bool, dict[str, Any]]:
-        """Apply one action; success has to hold for `SUCCESS_HOLD_STEPS` steps in a row.
+        """Apply one action and render; see :meth:`advance`."""
+        reward, terminated, truncated, info = self.advance(action)
+        return self._observe(), reward, terminated, truncated, info
+
+    def advance(self, action: np.ndarray) -> tuple[float, bool, bool, dict[str, Any]]:
+        """Apply one action, rendering nothing; success has to hold for `SUCCESS_HOLD_STEPS` steps in a row.
+
+        Returns:
+            Reward, terminated, truncated and info, as Gymnasium means them.
 
         Raises:
             ValueError: The action has the wrong shape or is not finite.
@@ -129,12 +137,12 @@ class TabletopEnv(gym.Env):
         self.simulator.apply(np.clip(action, -1.0, 1.0))
         self._steps += 1
         if self.simulator.is_unstable():
-            return self._observe(), 0.0, True, False, self._info("unstable")
+            return 0.0, True, False, self._info("unstable")
         self._held = self._held + 1 if TASKS[self.task].is_done(self.simulator) else 0
         if self._held >= SUCCESS_HOLD_STEPS:
-            return self._observe(), 1.0, True, False, self._info("success")
+            return 1.0, True, False, self._info("success")
         truncated = self._steps >= self._max_episode_steps
-        return self._observe(), 0.0, False, truncated, self._info("time_limit" if truncated else "running")
+        return 0.0, False, truncated, self._info("time_limit" if truncated else "running")
 
     def _info(self, status: str) -> dict[str, Any]:
         if status != "running" and self._episode_log is not None:

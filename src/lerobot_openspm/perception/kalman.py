@@ -4,8 +4,8 @@ The state of one object is the paper's: position, velocity, local orientation er
 numbers. Orientation lives on the manifold: the error is a small rotation about the reference orientation, in
 the axes of the frame the filter works in; a prediction adds to it, and every update moves it into the
 reference and sets it to zero. It is written as twice the Gibbs vector, axis times twice the tangent of half
-the angle, which for the angles that errors have is the rotation vector and is quicker to come by. Everything is
-batched over objects ``(n, ...)``; nothing in here knows of images.
+the angle, which for the angles that errors have is the rotation vector and is quicker to come by. Everything
+is batched over objects ``(n, ...)``; nothing in here knows of images.
 """
 
 from __future__ import annotations

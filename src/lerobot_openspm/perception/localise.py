@@ -5,24 +5,30 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Literal
 
 import numpy as np
 
 from lerobot_openspm.errors import ObservationError
 from lerobot_openspm.geometry import se3
-from lerobot_openspm.geometry.camera import intersect_plane
+from lerobot_openspm.geometry.camera import intersect_plane, project
 from lerobot_openspm.geometry.se3 import Array
 from lerobot_openspm.perception import colour
 from lerobot_openspm.perception.blobs import find_blobs
 from lerobot_openspm.perception.fitting import COARSE_PX, Cloud, Evidence, Fit, Freedom, fit
 from lerobot_openspm.perception.model import KnownObject, ObjectModel, PatchModel
 from lerobot_openspm.perception.patches import localise_patches
-from lerobot_openspm.perception.types import UNKNOWN_YAW_STD, PoseEstimate, View
+from lerobot_openspm.perception.types import UNKNOWN_YAW_STD, Mask, PoseEstimate, View
 
 COARSE_CUTS_PX = (30.0, 30.0, 20.0, 12.0)
 FINE_CUTS_PX = (6.0, 4.0, 3.0, 3.0)
 BLOBS_PER_VIEW = 3
 MAX_CANDIDATES = 3
+# An object that is followed: how far from where it is expected it is looked for before everywhere else, and
+# how well it must be seen there for that to be left out.
+NEARBY_CUTS_PX = (12.0, 6.0, 4.0, 3.0)
+NEARBY_M, NEARBY_HEIGHT_M, NEARBY_RAD = 0.03, 0.003, 0.3
+NEARBY_CONFIDENCE = 0.9
 # Relative to the overlap that is typical of the object's demonstrations.
 FOUND_CONFIDENCE = 0.5
 RIVAL_SHARE = 0.93
@@ -58,7 +64,11 @@ def prepare(view: View) -> Prepared:
 
 
 def localise(
-    views: Mapping[str, View | Prepared], model: KnownObject, freedom: Freedom | None = None
+    views: Mapping[str, View | Prepared],
+    model: KnownObject,
+    freedom: Freedom | None = None,
+    hidden: Mapping[str, Mask] | None = None,
+    T_expected: Array | None = None,
 ) -> PoseEstimate:
     """Find an object in the views of one moment.
 
@@ -68,6 +78,8 @@ def localise(
         freedom: Prior around the start poses; by default the object stands on its support plane, at any place
             and any yaw within the range that its demonstrations showed. An object known by patches is sought
             near its demonstrated places, whatever this says.
+        hidden: Pixels ``(H, W)`` by camera name that something may be in front of; no evidence.
+        T_expected: Pose ``(4, 4)`` at which the object is looked for first; elsewhere only if it is not there.
 
     Raises:
         ObservationError: There is no view, or one is malformed.
@@ -75,23 +87,69 @@ def localise(
     if not views:
         raise ObservationError("no camera views to look for an object in; pass at least one")
     prepared = [view if isinstance(view, Prepared) else prepare(view) for view in views.values()]
+    hidden = hidden or {}
     if isinstance(model, PatchModel):
-        return localise_patches({name: one.view for name, one in zip(views, prepared, strict=True)}, model)
-    evidence = [Evidence(one.view, colour.foreground(one.bins, model.log_odds)) for one in prepared]
+        pictures = {name: one.view for name, one in zip(views, prepared, strict=True)}
+        return localise_patches(pictures, model, hidden, T_expected)
+    evidence = [
+        Evidence(
+            one.view,
+            colour.foreground(one.bins, model.log_odds),
+            None if name not in hidden else 1 - hidden[name].astype(np.float32),
+        )
+        for name, one in zip(views, prepared, strict=True)
+    ]
     masks = {name: one.probability > 0.5 for name, one in zip(views, evidence, strict=True)}
+    cloud = Cloud(model.points.astype(float), model.spacing)
+    if T_expected is not None:
+        there = fit(evidence, cloud, T_expected, _nearby(model), NEARBY_CUTS_PX)
+        if there.score >= NEARBY_CONFIDENCE * model.typical_overlap:
+            return _estimate("found", there, model, masks, seen_share(evidence, cloud, there.T_world_obj))
     fits = search(evidence, model, freedom or Freedom())
     if not fits:
-        return PoseEstimate("not_found", np.eye(4), _ignorance(), 0.0, masks)
+        share = 1.0 if T_expected is None else seen_share(evidence, cloud, T_expected)
+        return PoseEstimate("not_found", np.eye(4), _ignorance(), 0.0, masks, share)
     best = fits[0]
-    confidence = float(np.clip(best.score / max(model.typical_overlap, 1e-3), 0, 1))
-    status = "found" if confidence >= FOUND_CONFIDENCE else "not_found"
+    status = "found" if best.score >= FOUND_CONFIDENCE * model.typical_overlap else "not_found"
     if status == "found" and len(fits) > 1 and fits[1].score > RIVAL_SHARE * best.score:
         status = "ambiguous"
+    place = best.T_world_obj if status == "found" or T_expected is None else T_expected
+    return _estimate(status, best, model, masks, seen_share(evidence, cloud, place))
+
+
+def _estimate(
+    status: Literal["found", "not_found", "ambiguous"],
+    best: Fit,
+    model: ObjectModel,
+    masks: dict[str, Mask],
+    share: float,
+) -> PoseEstimate:
+    confidence = float(np.clip(best.score / max(model.typical_overlap, 1e-3), 0, 1))
     covariance = best.covariance.copy()
     if model.yaw_period == 0:
         covariance[3, :] = covariance[:, 3] = 0
         covariance[3, 3] = UNKNOWN_YAW_STD**2
-    return PoseEstimate(status, canonical(best.T_world_obj, model), covariance, confidence, masks)
+    return PoseEstimate(status, canonical(best.T_world_obj, model), covariance, confidence, masks, share)
+
+
+def _nearby(model: ObjectModel) -> Freedom:
+    """An object that is followed may have been lifted or tilted a little, and keeps about its yaw."""
+    return Freedom(NEARBY_M, NEARBY_HEIGHT_M, 0.0 if model.yaw_period == 0 else NEARBY_RAD)
+
+
+def seen_share(evidence: Sequence[Evidence], cloud: Cloud, T_world_obj: Array) -> float:
+    """Share of a model's points that the view that shows it best has in the picture, not hidden."""
+    points = se3.apply(T_world_obj, cloud.points)
+    shares = [0.0]
+    for one in evidence:
+        uv, depth = project(one.view.camera, one.view.T_world_cam, points)
+        uv = np.nan_to_num(uv, nan=-1.0)
+        size = np.array([one.view.camera.width, one.view.camera.height])
+        inside = (depth > 0) & (uv >= 0).all(1) & (uv <= size - 1).all(1)
+        if one.visible is not None:
+            inside[inside] = one.visible[tuple(np.rint(uv[inside]).astype(int).T[::-1])] > 0.5
+        shares.append(float(inside.mean()))
+    return max(shares)
 
 
 def search(evidence: Sequence[Evidence], model: ObjectModel, freedom: Freedom) -> list[Fit]:

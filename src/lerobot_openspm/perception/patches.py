@@ -19,7 +19,7 @@ from lerobot_openspm.geometry import se3
 from lerobot_openspm.geometry.camera import project
 from lerobot_openspm.geometry.se3 import Array
 from lerobot_openspm.perception.model import Patch, PatchModel, Picture, Probe
-from lerobot_openspm.perception.types import UNKNOWN_YAW_STD, PoseEstimate, View
+from lerobot_openspm.perception.types import UNKNOWN_YAW_STD, Mask, PoseEstimate, View
 
 # How far from each patch's own place an object is sought.
 REACH_M = 0.035
@@ -30,6 +30,8 @@ MIN_CONTRAST = 4.0
 FOUND_CORRELATION = 0.5
 # A hand camera sees the patch as in the demonstrations only from the same place.
 MAX_CAMERA_SHIFT_M, MAX_CAMERA_TURN_RAD = 0.02, 0.10
+# A patch of which more is hidden is not looked for.
+MAX_HIDDEN_SHARE = 0.2
 
 
 @dataclass(frozen=True)
@@ -103,19 +105,30 @@ def _lab(image: NDArray[np.uint8]) -> Picture:
     return np.asarray(cv2.cvtColor(np.ascontiguousarray(image), cv2.COLOR_RGB2LAB), np.uint8)
 
 
-def localise_patches(views: Mapping[str, View], model: PatchModel) -> PoseEstimate:
+def localise_patches(
+    views: Mapping[str, View],
+    model: PatchModel,
+    hidden: Mapping[str, Mask] | None = None,
+    T_expected: Array | None = None,
+) -> PoseEstimate:
     """Find an object known by patches in the views of one moment.
 
     Args:
         views: Views by camera name. Those of a camera that has moved since the patches were taken do not
             help.
         model: The object.
+        hidden: Pixels ``(H, W)`` by camera name that something may be in front of; patches there do not help.
+        T_expected: Pose ``(4, 4)`` at which the object is expected. Out of the patches' reach nothing can be
+            said of it.
     """
     information, weighted = np.zeros((2, 2)), np.zeros(2)
     correlations = []
     for probe in model.probes:
         view = as_seen(views.get(probe.camera), probe)
-        found = [] if view is None else [match(patch, probe, view) for patch in probe.patches]
+        covered = (hidden or {}).get(probe.camera)
+        if view is None or (covered is not None and _is_covered(probe, covered)):
+            continue
+        found = [match(patch, probe, view) for patch in probe.patches]
         sights = [one for one in found if one is not None]
         if not sights:
             continue
@@ -124,8 +137,10 @@ def localise_patches(views: Mapping[str, View], model: PatchModel) -> PoseEstima
         weighted += weight @ np.median([one.point_world[:2] for one in sights], axis=0)
         correlations.append(float(np.median([one.correlation for one in sights])))
     unknown = np.diag([1.0, 1.0, 1.0, UNKNOWN_YAW_STD**2])
+    # Without a patch in sight, and of an object that is elsewhere, the images tell nothing.
+    visible = float(bool(correlations) and _is_in_reach(model, T_expected))
     if not correlations:
-        return PoseEstimate("not_found", np.eye(4), unknown, 0.0, {})
+        return PoseEstimate("not_found", np.eye(4), unknown, 0.0, {}, visible)
     confidence = float(np.clip(np.mean(correlations) / max(model.typical_correlation, 1e-3), 0, 1))
     status = (
         "found" if np.mean(correlations) >= FOUND_CORRELATION * model.typical_correlation else "not_found"
@@ -135,7 +150,32 @@ def localise_patches(views: Mapping[str, View], model: PatchModel) -> PoseEstima
     # The probes look at the same pixels and err together: many are no surer than one.
     covariance[:2, :2] = len(correlations) * np.linalg.inv(information)
     place = np.linalg.solve(information, weighted)
-    return PoseEstimate(status, se3.from_yaw(np.append(place, model.height), 0.0), covariance, confidence, {})
+    T_world_obj = se3.from_yaw(np.append(place, model.height), 0.0)
+    return PoseEstimate(status, T_world_obj, covariance, confidence, {}, visible)
+
+
+def _is_in_reach(model: PatchModel, T_expected: Array | None) -> bool:
+    """Whether an object is expected where its patches are looked for."""
+    if T_expected is None:
+        return True
+    places = np.stack([patch.point_world for probe in model.probes for patch in probe.patches])
+    away = np.linalg.norm(places - T_expected[:3, 3], axis=1)
+    return bool(away.min() <= REACH_M)
+
+
+def _is_covered(probe: Probe, hidden: Mask) -> bool:
+    """Whether much of where a probe's patches lie may be hidden."""
+    height, width = hidden.shape
+    scale = np.array([width / probe.calibration.width, height / probe.calibration.height])
+    shares = []
+    for patch in probe.patches:
+        size = np.array([patch.image.shape[1], patch.image.shape[0]])
+        low, high = (
+            np.floor(patch.corner * scale).astype(int),
+            np.ceil((patch.corner + size) * scale).astype(int),
+        )
+        shares.append(hidden[low[1] : high[1], low[0] : high[0]].mean())
+    return float(np.median(shares)) > MAX_HIDDEN_SHARE
 
 
 def as_seen(view: View | None, probe: Probe) -> View | None:

@@ -115,6 +115,8 @@ class PoseEstimate:
         covariance: ``(4, 4)`` over x, y, z in metres and yaw in radians.
         confidence: From 0 to 1; 1 is how well the object is typically found in its demonstrations.
         masks: Foreground mask ``(H, W)`` by camera name.
+        visible: Share of the object that is in sight in the view that shows it best, where the hand is not in
+            the way: at its place if it was found, else where it was expected.
     """
 
     status: Literal["found", "not_found", "ambiguous"]
@@ -122,3 +124,4 @@ class PoseEstimate:
     covariance: Array
     confidence: float
     masks: dict[str, Mask]
+    visible: float = 1.0

@@ -1,0 +1,110 @@
+"""One episode of a policy in a simulator, rendered only when the policy looks, with a place to interfere."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+import torch
+
+from lerobot_openspm.control.executor import Hand
+from lerobot_openspm.control.row import Row
+from lerobot_openspm.envs.recording import pose_vector
+from lerobot_openspm.modeling_openspm import OpenSPMPolicy
+from lerobot_openspm.observation import Observation
+
+IMAGES = "observation.images."
+
+
+class World(Protocol):
+    """A simulator as an episode needs it."""
+
+    @property
+    def instruction(self) -> str:
+        """What is to be done."""
+        ...
+
+    @property
+    def max_steps(self) -> int:
+        """When to stop trying."""
+        ...
+
+    def state(self) -> np.ndarray:
+        """``observation.state``."""
+        ...
+
+    def image(self, name: str) -> np.ndarray:
+        """A camera's present image ``(H, W, 3)``, uint8."""
+        ...
+
+    def object_poses(self) -> dict[str, np.ndarray]:
+        """True poses ``T_world_obj`` ``(4, 4)``."""
+        ...
+
+    def step(self, action: np.ndarray) -> tuple[bool, bool]:
+        """Apply an action; whether the episode is over now, and whether its goal was reached."""
+        ...
+
+
+class LazyImages(Mapping[str, torch.Tensor]):
+    """The present images by LeRobot's names, rendered when one is asked for."""
+
+    def __init__(self, world: World, cameras: tuple[str, ...]) -> None:
+        self._world, self._cameras = world, cameras
+        self._made: dict[str, torch.Tensor] = {}
+
+    def __getitem__(self, key: str) -> torch.Tensor:
+        if key not in self._made:
+            image = torch.from_numpy(self._world.image(key.removeprefix(IMAGES)))
+            self._made[key] = image.permute(2, 0, 1).contiguous().float() / 255
+        return self._made[key]
+
+    def __contains__(self, key: object) -> bool:
+        return key in self._cameras
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._cameras)
+
+    def __len__(self) -> int:
+        return len(self._cameras)
+
+
+@dataclass(frozen=True)
+class Episode:
+    """What happened: whether the goal was reached, all actions ``(n, 7)``, the policy's state at the end."""
+
+    success: bool
+    actions: np.ndarray
+    row: Row
+
+
+def run_episode(
+    policy: OpenSPMPolicy, world: World, interfere: Callable[[int, Row | None], None] | None = None
+) -> Episode:
+    """Act from the world's present state until it says that the episode is over.
+
+    Args:
+        policy: What acts.
+        world: Where.
+        interfere: Called before every step with its number and the policy's state, None before the first; may
+            change the world, or note what is true.
+    """
+    policy.reset()
+    state_layout, action_layout = policy.config.layouts()
+    cameras = tuple(policy.config.image_features)
+    actions: list[np.ndarray] = []
+    over = success = False
+    while not over and len(actions) < world.max_steps:
+        if interfere is not None:
+            interfere(len(actions), policy.rows[0] if policy.rows else None)
+        vector = world.state().astype(float)
+        hand = Hand(state_layout.poses(vector), float(state_layout.openings(vector)))
+        poses = pose_vector(world.object_poses()) if policy.config.perception == "oracle" else None
+        observation = Observation(world.instruction, vector, hand, LazyImages(world, cameras), poses)
+        with torch.inference_mode():
+            action = action_layout.encode_actions(policy.act([observation])[0]).astype(np.float32)
+        over, success = world.step(action)
+        actions.append(action)
+    return Episode(success, np.stack(actions), policy.rows[0])

@@ -1,0 +1,106 @@
+"""The tabletop as a world to measure in, and the disturbances it can suffer."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from lerobot_openspm.envs import layout, scene
+from lerobot_openspm.envs.tabletop_env import RENDER_SIZE, TabletopEnv
+from lerobot_openspm.envs.tasks import TASKS
+from lerobot_openspm.geometry import se3
+from lerobot_openspm.memory.instruction import parse_instruction
+
+MAX_TRIES = 10_000
+
+
+class TabletopWorld:
+    """One task of the tabletop from one seed."""
+
+    def __init__(self, env: TabletopEnv, seed: int) -> None:
+        self.env = env
+        env.reset(seed=seed)
+        self.instruction = env.task_description
+        self.max_steps = 300
+
+    def state(self) -> np.ndarray:
+        """``observation.state`` (8,)."""
+        return self.env.state()
+
+    def image(self, name: str) -> np.ndarray:
+        """A camera's present image (256, 256, 3), uint8."""
+        return self.env.simulator.render(name, RENDER_SIZE, RENDER_SIZE)
+
+    def object_poses(self) -> dict[str, np.ndarray]:
+        """True ``T_world_obj`` (4, 4) by name."""
+        return self.env.object_poses()
+
+    def step(self, action: np.ndarray) -> tuple[bool, bool]:
+        """Apply an action; whether the episode is over, and whether its goal was reached."""
+        _, terminated, truncated, info = self.env.advance(action)
+        return terminated or truncated, bool(info["is_success"])
+
+
+# Tasks in which something is grasped, and what.
+GRASPED = {
+    name: next(object_ for object_ in scene.MOVABLE_NAMES if object_ in sub_task.target.split())
+    for name, task in TASKS.items()
+    for sub_task in parse_instruction(task.instruction)
+    if sub_task.operation == "put"
+}
+
+
+@dataclass
+class Disturbance:
+    """Moves the object that is to be grasped 5 to 15 cm away, once.
+
+    Attributes:
+        world: Where.
+        kind: ``"displaced"`` moves it as the hand comes near it for the first time; ``"dropped"`` takes it
+            out of the hand after it was lifted.
+        rng: Decides how near or how high, and where to.
+        step: When it happened; None while it has not.
+    """
+
+    world: TabletopWorld
+    kind: str
+    rng: np.random.Generator
+    step: int | None = None
+
+    def __post_init__(self) -> None:
+        self._name = GRASPED[self.world.env.task]
+        simulator = self.world.env.simulator
+        self._start = simulator.object_poses()[self._name]
+        self._near_m = self.rng.uniform(0.08, 0.25)
+        self._lifted_m = self.rng.uniform(0.03, 0.08)
+
+    def __call__(self, step: int, row: object) -> None:
+        """Interfere if the moment has come."""
+        if self.step is None and self._is_time():
+            self.world.env.simulator.put(self._name, self._elsewhere())
+            self.step = step
+
+    def _is_time(self) -> bool:
+        simulator = self.world.env.simulator
+        at, hand = simulator.object_poses()[self._name][:3, 3], simulator.ee_pose()[:3, 3]
+        held = "hand" in simulator.touching(self._name)
+        if self.kind == "dropped":
+            return held and bool(at[2] - self._start[2, 3] > self._lifted_m)
+        return not held and bool(np.linalg.norm(at - hand) < self._near_m)
+
+    def _elsewhere(self) -> np.ndarray:
+        """A free place on the table, 5 to 15 cm away as seen from above, turned as before."""
+        simulator = self.world.env.simulator
+        poses = simulator.object_poses()
+        placed = {name: layout.Placement(T[0, 3], T[1, 3], float(se3.yaw_of(T))) for name, T in poses.items()}
+        here = placed[self._name]
+        for _ in range(MAX_TRIES):
+            distance, angle = self.rng.uniform(0.05, 0.15), self.rng.uniform(0, 2 * math.pi)
+            there = layout.Placement(
+                here.x + distance * math.cos(angle), here.y + distance * math.sin(angle), here.yaw
+            )
+            if layout.is_admissible({**placed, self._name: there}):
+                return se3.from_yaw([there.x, there.y, self._start[2, 3]], there.yaw)
+        raise layout.LayoutError(f"no free place for the {self._name} within 15 cm in {MAX_TRIES} tries")
