@@ -4,7 +4,7 @@ import json
 
 import numpy as np
 from benchmarks.common import EVALUATION_SEED, dataset, policy, write
-from benchmarks.object_frames import error, offset, summary
+from lerobot_openspm.bench.object_frames import error, offset, summary
 from lerobot.datasets import LeRobotDatasetMetadata
 from tqdm import trange
 

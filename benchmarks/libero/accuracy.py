@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 from benchmarks.libero.stages import REPO_ID
-from benchmarks.object_frames import error, offset, summary
+from lerobot_openspm.bench.object_frames import error, offset, summary
 from lerobot.datasets import LeRobotDatasetMetadata
 
 from lerobot_openspm.configuration_openspm import OpenSPMConfig

@@ -10,9 +10,10 @@ from typing import Any
 import numpy as np
 import torch
 from benchmarks.common import write
-from benchmarks.libero.episode import LazyImages
 from benchmarks.libero.stages import dataset, policy
 
+from lerobot_openspm.bench.episode import LazyImages
+from lerobot_openspm.bench.libero import LiberoWorld
 from lerobot_openspm.control.executor import Hand
 from lerobot_openspm.envs.libero.simulator import LiberoSimulator
 from lerobot_openspm.envs.seeds import TUNING_SEED_START
@@ -32,7 +33,7 @@ def main() -> dict[str, Any]:
     simulator.reset(TUNING_SEED_START)
     layout, vector = acting.config.layouts()[0], simulator.state().astype(float)
     hand = Hand(layout.poses(vector), float(layout.openings(vector)))
-    images = {key: LazyImages(simulator)[key] for key in LazyImages(simulator)}
+    images = dict(LazyImages(LiberoWorld(simulator), tuple(acting.config.image_features)))
     observation = Observation(simulator.instruction, vector, hand, images, None)
     with torch.inference_mode():
         first = _times(lambda: (acting.reset(), acting.act([observation])), LOOKS)
