@@ -158,9 +158,10 @@ def reconstruction_from(arrays: Arrays) -> Reconstruction:
     """
     for name, shape in ANSWER.items():
         _expect(name in arrays and arrays[name].shape == shape, name, arrays, f"shape {shape}")
-    points = arrays.get("points")
-    many = points is not None and points.ndim == 2 and points.shape[1] == 3
-    _expect(many and len(arrays["points"]) >= 8, "points", arrays, "shape (n, 3) with n at least 8")
+    many = np.ndim(arrays.get("points", 0)) == 2 and arrays["points"].shape[1] == 3
+    most = sam3d_worker.MAX_POINTS
+    fits = many and 8 <= len(arrays["points"]) <= most
+    _expect(fits, "points", arrays, f"shape (n, 3) with n at least 8 and at most {most}")
     for name in (*ANSWER, "points"):
         _expect(bool(np.isfinite(arrays[name]).all()), name, arrays, "finite numbers")
     values = {name: np.asarray(arrays[name], float) for name in (*ANSWER, "points")}
@@ -173,7 +174,7 @@ def reconstruction_from(arrays: Arrays) -> Reconstruction:
     slack = 0.01 * extents.max()
     inside = bool((np.abs(values["points"] - values["centre"]) <= extents / 2 + slack).all())
     _expect(inside, "points", arrays, "points within the box")
-    R_cam_obj = FLIP @ se3.matrix_from_quat_xyzw(quat_wxyz[[1, 2, 3, 0]] / norm).T
+    R_cam_obj = FLIP @ se3.matrix_from_quat_xyzw(quat_wxyz[[1, 2, 3, 0]]).T
     T_cam_obj = se3.transform(R_cam_obj, FLIP @ values["translation"])
     centre = se3.apply(T_cam_obj, (values["centre"] * scale)[None])[0]
     points_cam = se3.apply(T_cam_obj, values["points"] * scale)

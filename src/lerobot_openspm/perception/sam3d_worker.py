@@ -205,7 +205,19 @@ def reconstruct(inference: Callable[..., Mapping[str, Any]], request: Message) -
         pointmap = torch.from_numpy(np.array(pointmap, np.float32))
     image, mask = np.array(request.arrays["image"]), request.arrays["mask"] > 0
     output = inference(image, mask, seed=request.seed, pointmap=pointmap)
-    gaussian = output["gaussian"][0]
+    low, high, points = _surface(output["gaussian"][0])
+    return {
+        "rotation_wxyz": _numpy(output["rotation"]).reshape(4),
+        "translation": _numpy(output["translation"]).reshape(3),
+        "scale": _numpy(output["scale"]).reshape(3),
+        "centre": (low + high) / 2,
+        "extents": high - low,
+        "points": points.astype(np.float32),
+    }
+
+
+def _surface(gaussian: Any) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any]]:
+    """Corners (3,), (3,) of the box around the opaque Gaussians, and at most MAX_POINTS of them (n, 3)."""
     opaque = _numpy(gaussian.get_opacity).reshape(-1) > 0.9
     points = _numpy(gaussian.get_xyz)[opaque]
     if len(points) < 8:
@@ -214,14 +226,7 @@ def reconstruct(inference: Callable[..., Mapping[str, Any]], request: Message) -
     low, high = np.quantile(points, [0.005, 0.995], axis=0)
     points = points[((points >= low) & (points <= high)).all(axis=1)]
     chosen = np.unique(np.linspace(0, len(points) - 1, MAX_POINTS).astype(int))
-    return {
-        "rotation_wxyz": _numpy(output["rotation"]).reshape(4),
-        "translation": _numpy(output["translation"]).reshape(3),
-        "scale": _numpy(output["scale"]).reshape(3),
-        "centre": (low + high) / 2,
-        "extents": high - low,
-        "points": points[chosen].astype(np.float32),
-    }
+    return low, high, points[chosen]
 
 
 def _numpy(tensor: Any) -> NDArray[np.float64]:
