@@ -4,10 +4,10 @@ import json
 
 import numpy as np
 from benchmarks.common import EVALUATION_SEED, dataset, policy, write
-from lerobot_openspm.bench.object_frames import error, offset, summary
 from lerobot.datasets import LeRobotDatasetMetadata
 from tqdm import trange
 
+from lerobot_openspm.bench.object_frames import error, offset, summary
 from lerobot_openspm.cli.pipeline import REPO_ID
 from lerobot_openspm.configuration_openspm import OpenSPMConfig
 from lerobot_openspm.envs.tabletop_env import TabletopEnv

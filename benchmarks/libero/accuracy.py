@@ -8,9 +8,9 @@ from typing import Any
 
 import numpy as np
 from benchmarks.libero.stages import REPO_ID
-from lerobot_openspm.bench.object_frames import error, offset, summary
 from lerobot.datasets import LeRobotDatasetMetadata
 
+from lerobot_openspm.bench.object_frames import error, offset, summary
 from lerobot_openspm.configuration_openspm import OpenSPMConfig
 from lerobot_openspm.envs.libero.simulator import tasks
 from lerobot_openspm.experience import load_experience

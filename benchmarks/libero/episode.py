@@ -14,6 +14,7 @@ from lerobot_openspm.envs.libero.simulator import SUITE, LiberoSimulator
 from lerobot_openspm.memory.instruction import parse_instruction
 from lerobot_openspm.mining.mine import name_simulator_poses
 from lerobot_openspm.modeling_openspm import OpenSPMPolicy
+from lerobot_openspm.observation import Observation
 
 
 @dataclass(frozen=True)
@@ -42,14 +43,12 @@ def run_episode(policy: OpenSPMPolicy, simulator: LiberoSimulator) -> Episode:
     seen: dict[str, np.ndarray] = {}
     true: dict[str, np.ndarray] = {}
 
-    def note(step: int, row: Row | None) -> None:
-        # Before the second step the first look has been taken, and nothing has moved much.
-        if row is None:
-            true.update(name_simulator_poses(simulator.object_poses(), list(dict.fromkeys(named)), models))
-        elif not seen:
+    def note(step: int, observation: Observation, row: Row) -> None:
+        if step == 0:
             seen.update(row.layout)
+            true.update(name_simulator_poses(simulator.object_poses(), list(dict.fromkeys(named)), models))
 
-    done = run_in_world(policy, LiberoWorld(simulator), note)
+    done = run_in_world(policy, LiberoWorld(simulator), note=note)
     return Episode(done.success, done.actions, done.row, seen, true)
 
 

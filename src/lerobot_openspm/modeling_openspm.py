@@ -66,6 +66,7 @@ class OpenSPMPolicy(PreTrainedPolicy):
         self.experience: Experience | None = None
         self._training_set: TrainingSet | None = None
         if dataset_meta is not None:
+            config.control_hz = config.control_hz or float(dataset_meta.fps)
             self.experience = mine_experience(dataset_meta, config)
             self._training_set = training_set(dataset_meta, config, self.experience.robot)
             self.flow.action_scale.copy_(self._training_set.action_scale)
@@ -137,17 +138,22 @@ class OpenSPMPolicy(PreTrainedPolicy):
         return self.rows
 
     def _new_row(self, observation: Observation) -> Row:
-        experience = self._require_experience()
+        experience = self.require_experience()
         config = self.config
         knowledge = Knowledge(
             experience.entries, experience.yaw_periods, experience.robot, config.score_weights,
             config.transfer_limits, config.control_settings, TrackerSettings(), config.tracking,
-            1 / (config.control_hz or DEFAULT_CONTROL_HZ),
+            self.step_s,
         )  # fmt: skip
         return Row(knowledge, observation.instruction, observation.fingerprint(), config.noise_seed)
 
+    @property
+    def step_s(self) -> float:
+        """Seconds that a control step takes."""
+        return 1 / (self.config.control_hz or DEFAULT_CONTROL_HZ)
+
     def _new_eyes(self) -> Eyes:
-        return Eyes(self._require_experience(), self.config.hand_radius_m)
+        return Eyes(self.require_experience(), self.config.hand_radius_m)
 
     def _chunk(self, row: Row, query: Query) -> np.ndarray:
         """Generate one chunk ``(chunk_size, 7)`` in the world. Rows go one by one, so batches act alike."""
@@ -163,7 +169,7 @@ class OpenSPMPolicy(PreTrainedPolicy):
             chunk[0].cpu().numpy().astype(float), query.T_world_target, self.config.conditioning
         )
         # The fingers do what the key pose says; the flow model's last number only says it less surely.
-        actions[:, 6] = self._require_experience().robot.command(bool(query.closed))
+        actions[:, 6] = self.require_experience().robot.command(bool(query.closed))
         return actions
 
     # Learning.
@@ -196,7 +202,7 @@ class OpenSPMPolicy(PreTrainedPolicy):
     # Persistence: the memory travels with the weights.
 
     def _save_pretrained(self, save_directory: Path, state_dict: dict[str, Tensor] | None = None) -> None:
-        experience = self._require_experience()  # before anything is written
+        experience = self.require_experience()  # before anything is written
         super()._save_pretrained(save_directory, state_dict=state_dict)
         # The calibration travels as a file of the checkpoint, not as a path that exists on one machine.
         replace(self.config, cameras=None)._save_pretrained(Path(save_directory))
@@ -267,7 +273,8 @@ class OpenSPMPolicy(PreTrainedPolicy):
             )
             self._training_set = training_set(dataset_meta, self.config, self.experience.robot)
 
-    def _require_experience(self) -> Experience:
+    def require_experience(self) -> Experience:
+        """What was mined. Raises MemoryFormatError when nothing was."""
         if self.experience is None:
             raise MemoryFormatError(
                 "this policy has no memory; train it with lerobot-train --policy.type=openspm, or load a "

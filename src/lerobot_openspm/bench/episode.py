@@ -81,15 +81,18 @@ class Episode:
 
 
 def run_episode(
-    policy: OpenSPMPolicy, world: World, interfere: Callable[[int, Row | None], None] | None = None
+    policy: OpenSPMPolicy,
+    world: World,
+    interfere: Callable[[int], None] | None = None,
+    note: Callable[[int, Observation, Row], None] | None = None,
 ) -> Episode:
     """Act from the world's present state until it says that the episode is over.
 
     Args:
         policy: What acts.
         world: Where.
-        interfere: Called before every step with its number and the policy's state, None before the first; may
-            change the world, or note what is true.
+        interfere: Called with the number of the step before it is observed; may change the world.
+        note: Called with what was observed and the policy's state, before the action is applied.
     """
     policy.reset()
     state_layout, action_layout = policy.config.layouts()
@@ -98,13 +101,15 @@ def run_episode(
     over = success = False
     while not over and len(actions) < world.max_steps:
         if interfere is not None:
-            interfere(len(actions), policy.rows[0] if policy.rows else None)
+            interfere(len(actions))
         vector = world.state().astype(float)
         hand = Hand(state_layout.poses(vector), float(state_layout.openings(vector)))
         poses = pose_vector(world.object_poses()) if policy.config.perception == "oracle" else None
         observation = Observation(world.instruction, vector, hand, LazyImages(world, cameras), poses)
         with torch.inference_mode():
             action = action_layout.encode_actions(policy.act([observation])[0]).astype(np.float32)
+        if note is not None:
+            note(len(actions), observation, policy.rows[0])
         over, success = world.step(action)
         actions.append(action)
     return Episode(success, np.stack(actions), policy.rows[0])

@@ -73,10 +73,10 @@ class Disturbance:
         self._name = GRASPED[self.world.env.task]
         simulator = self.world.env.simulator
         self._start = simulator.object_poses()[self._name]
-        self._near_m = self.rng.uniform(0.08, 0.25)
+        self._near_m = self.rng.uniform(0.16, 0.30)
         self._lifted_m = self.rng.uniform(0.03, 0.08)
 
-    def __call__(self, step: int, row: object) -> None:
+    def __call__(self, step: int) -> None:
         """Interfere if the moment has come."""
         if self.step is None and self._is_time():
             self.world.env.simulator.put(self._name, self._elsewhere())

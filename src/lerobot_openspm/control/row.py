@@ -93,7 +93,7 @@ class Row:
         tracker: Follows the objects.
         ranked: The entries of the last retrieval with their scores, best first.
         layout: Poses ``T_world_obj`` that the plan was made with: of what the hand has touched, from before.
-        faults: Cameras that were no use at the last look.
+        sighting: What the last look brought; None before the first.
         is_paused: Whether the hand holds still until something is seen again.
     """
 
@@ -104,7 +104,7 @@ class Row:
         self.tracker = Tracker(knowledge.yaw_periods, knowledge.tracker)
         self.ranked: list[Scored] = []
         self.layout: dict[str, Array] = {}
-        self.faults: Mapping[str, Fault] = {}
+        self.sighting: Sighting | None = None
         self.is_paused = False
         self._step = -1
         self._looked_at_step = -LOOK_AGAIN_STEPS
@@ -186,6 +186,16 @@ class Row:
     # Looking.
 
     @property
+    def faults(self) -> Mapping[str, Fault]:
+        """Cameras that were no use at the last look."""
+        return {} if self.sighting is None else self.sighting.faults
+
+    @property
+    def has_just_looked(self) -> bool:
+        """Whether the last observation was looked at."""
+        return self._looked_at_step == self._step
+
+    @property
     def _waited_steps(self) -> int:
         return self._step - self._looked_at_step
 
@@ -203,13 +213,13 @@ class Row:
         """Look for objects; the names of those that are somewhere else than before."""
         waited_s = min(self._waited_steps, LOOK_AGAIN_STEPS) * self._knowledge.step_s
         expected = {k: T for k, T in self.tracker.poses(hand.T_world_ee).items() if k in names}
-        sighting = look(names, expected, self._step * self._knowledge.step_s)
-        self._looked_at_step, self.faults = self._step, sighting.faults
+        self.sighting = look(names, expected, self._step * self._knowledge.step_s)
+        self._looked_at_step = self._step
         for camera, fault in self.faults.items():
             if fault.seconds > GIVE_UP_S:
                 logger.warning("%r: stopping, camera %r: %s", self.instruction, camera, fault.reason)
                 self.executor.stop(Status.CAMERA_FAULT)
-        return self.tracker.look(sighting.estimates, hand.T_world_ee, waited_s)
+        return self.tracker.look(self.sighting.estimates, hand.T_world_ee, waited_s)
 
     def _look_around(self, hand: Hand, look: Look) -> None:
         """Look at what the remaining key poses need and what is in the hand; act on what has changed."""

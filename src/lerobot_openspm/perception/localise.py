@@ -79,7 +79,8 @@ def localise(
             and any yaw within the range that its demonstrations showed. An object known by patches is sought
             near its demonstrated places, whatever this says.
         hidden: Pixels ``(H, W)`` by camera name that something may be in front of; no evidence.
-        T_expected: Pose ``(4, 4)`` at which the object is looked for first; elsewhere only if it is not there.
+        T_expected: Pose ``(4, 4)`` at which the object is looked for first; elsewhere only if it is not
+            there.
 
     Raises:
         ObservationError: There is no view, or one is malformed.

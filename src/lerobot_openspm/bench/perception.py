@@ -1,0 +1,172 @@
+"""Errors of the poses that the policy follows, at the start and all through episodes, and what they cost."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from lerobot_openspm.bench.episode import World, run_episode
+from lerobot_openspm.bench.truth import Truth, pose_error, true_period
+from lerobot_openspm.control.row import Row
+from lerobot_openspm.geometry.se3 import Array
+from lerobot_openspm.modeling_openspm import OpenSPMPolicy
+from lerobot_openspm.observation import Observation
+from lerobot_openspm.perceive import Eyes
+from lerobot_openspm.perception import kalman
+from lerobot_openspm.perception.localise import localise, prepare
+from lerobot_openspm.perception.tracker import Tracker, TrackerSettings
+from lerobot_openspm.perception.types import View
+
+# What the policy follows, each picture's own estimate, what would be followed with the first camera alone.
+VARIANTS = ("filtered", "unfiltered", "one_view")
+WARM_UP = 20
+
+
+# Of an object at one moment: task, step, object, whether the hand held it, metres and radians off.
+type Sample = tuple[str, int, str, bool, float, float]
+
+
+def measure_episode(
+    policy: OpenSPMPolicy, world: World, task: str, offsets: Mapping[str, Array]
+) -> tuple[bool, dict[str, list[Sample]]]:
+    """Run one episode and compare poses with the truth at every step.
+
+    All variants see the same pictures at the same moments; only the first one is acted on.
+
+    Returns:
+        Whether it succeeded, and the samples by variant; NaN where nothing is known of an object.
+    """
+    truth, shadow = Truth(world.object_poses(), offsets), _Shadow(policy)
+    samples: dict[str, list[Sample]] = {variant: [] for variant in VARIANTS}
+
+    def compare(step: int, observation: Observation, row: Row) -> None:
+        if not row.ranked:
+            return
+        T_world_ee = observation.hand.T_world_ee
+        true = truth.now(world.object_poses())
+        shadow.follow(observation, row)
+        known = {
+            "filtered": row.tracker.poses(T_world_ee),
+            "unfiltered": shadow.seen,
+            "one_view": shadow.tracker.poses(T_world_ee),
+        }
+        for name in (name for name in row.ranked[0].entry.objects if name in offsets):
+            held = name in row.tracker.held
+            for variant, poses in known.items():
+                error = (np.nan, np.nan)
+                if name in poses:
+                    error = pose_error(true[name], poses[name], true_period(name))
+                samples[variant].append((task, step, name, held, *error))
+
+    return run_episode(policy, world, note=compare).success, samples
+
+
+class _Shadow:
+    """What each picture alone tells, and what would be followed with the first camera alone."""
+
+    def __init__(self, policy: OpenSPMPolicy) -> None:
+        experience = policy.require_experience()
+        first = next(iter(experience.cameras))
+        one_camera = replace(experience, cameras={first: experience.cameras[first]})
+        self._eyes = Eyes(one_camera, policy.config.hand_radius_m)
+        self._step_s = policy.step_s
+        self.tracker = Tracker(experience.yaw_periods, TrackerSettings())
+        self.seen: dict[str, Array] = {}
+        self._time_s = self._looked_at_s = 0.0
+
+    def follow(self, observation: Observation, row: Row) -> None:
+        """Look when the policy has looked, hold what it holds."""
+        self._time_s += self._step_s
+        self.tracker.predict(self._step_s)
+        hand = observation.hand.T_world_ee
+        if row.has_just_looked and row.sighting is not None:
+            estimates = row.sighting.estimates
+            self.seen |= {name: e.T_world_obj for name, e in estimates.items() if e.status == "found"}
+            sighting = self._eyes.look(observation, list(estimates), self.tracker.poses(hand), self._time_s)
+            self.tracker.look(sighting.estimates, hand, self._time_s - self._looked_at_s)
+            self._looked_at_s = self._time_s
+        for name in row.tracker.held - self.tracker.held:
+            self.tracker.hold(name, hand)
+        self.tracker.release(self.tracker.held - row.tracker.held, hand)
+
+
+def summary(samples: Sequence[Sample]) -> dict[str, Any]:
+    """Mean and 95th percentile of position errors, mean of orientation errors, and what was not known."""
+    metres, radians = (np.array([sample[i] for sample in samples], float) for i in (4, 5))
+    known = np.isfinite(metres)
+    if not known.any():
+        return {"poses": len(samples), "unknown": len(samples)}
+    return {
+        "poses": len(samples),
+        "unknown": int((~known).sum()),
+        "position_mm_mean": round(1000 * float(metres[known].mean()), 2),
+        "position_mm_p95": round(1000 * float(np.percentile(metres[known], 95)), 2),
+        "orientation_deg_mean": round(float(np.rad2deg(radians[known].mean())), 2),
+    }
+
+
+def summarise(samples: Mapping[str, Sequence[Sample]]) -> dict[str, Any]:
+    """All variants; of the first one also by task, by object, at the start and in the hand."""
+    own = samples[VARIANTS[0]]
+    parts = {
+        "start": [s for s in own if s[1] == 0],
+        "held": [s for s in own if s[3]],
+    }
+    return {
+        "variants": {variant: summary(found) for variant, found in samples.items()},
+        **{part: summary(found) for part, found in parts.items()},
+        "tasks": _grouped(own, 0),
+        "objects": _grouped(own, 2),
+    }
+
+
+def _grouped(samples: Sequence[Sample], by: int) -> dict[str, Any]:
+    keys = dict.fromkeys(str(sample[by]) for sample in samples)
+    return {key: summary([sample for sample in samples if sample[by] == key]) for key in keys}
+
+
+def milliseconds(
+    policy: OpenSPMPolicy, views: Mapping[str, View], names: Sequence[str], n: int
+) -> dict[str, Any]:
+    """Time of finding objects in the views of one moment, never seen before and then followed.
+
+    Args:
+        policy: Whose objects.
+        views: Of one moment.
+        names: The objects to find.
+        n: Runs.
+    """
+    objects = policy.require_experience().objects
+    found = {name: localise(views, objects[name]).T_world_obj for name in names}
+
+    def look(expected: Mapping[str, Array]) -> None:
+        prepared = {camera: prepare(view) for camera, view in views.items()}
+        for name in names:
+            localise(prepared, objects[name], T_expected=expected.get(name))
+
+    first, followed = _times(lambda: look({}), n), _times(lambda: look(found), n)
+    return {"views": len(views), "objects": len(names), "first_ms": first, "followed_ms": followed}
+
+
+def filter_microseconds(objects: int, n: int = 2000) -> dict[str, float]:
+    """Time of one prediction and update of the Kalman filter."""
+    T, R = np.tile(np.eye(4), (objects, 1, 1)), np.tile(1e-6 * np.eye(6), (objects, 1, 1))
+    belief = kalman.begin(T, R, 0.01, 0.1)
+    step = kalman.motion(0.05, TrackerSettings().linear, TrackerSettings().angular)
+    times = _times(lambda: kalman.update(kalman.predict(belief, step), T, R), n)
+    return {name: round(1000 * value, 1) for name, value in times.items()}
+
+
+def _times(run: Callable[[], object], n: int) -> dict[str, float]:
+    """Milliseconds of a call: median and 99th percentile of n."""
+    spent = []
+    for _ in range(n + WARM_UP):
+        start_s = time.perf_counter()
+        run()
+        spent.append(1000 * (time.perf_counter() - start_s))
+    kept = np.array(spent[WARM_UP:])
+    return {"median": round(float(np.median(kept)), 4), "p99": round(float(np.percentile(kept, 99)), 4)}
