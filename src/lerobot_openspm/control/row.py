@@ -176,7 +176,9 @@ class Row:
         index = self.executor.retry_index()
         self._planned_from = hand.T_world_ee
         if self._knowledge.tracking:
-            self.tracker.forget(self.tracker.held)  # it is not in the hand, so it may be anywhere
+            # What should be in the hand is not, or what was to be met is not there: it may be anywhere.
+            attempted = self.executor.plan[index : self.executor.index + 1]
+            self.tracker.doubt({pose.memory.anchor.place for pose in attempted}, hand.T_world_ee)
             ahead = self._anchors(index)
             self._see(ahead, hand, look)
             self._update(ahead, hand)

@@ -73,6 +73,7 @@ class _Track:
         rival: Where it was seen last, if that was not where it was expected; ``T_world_obj``.
         missed_s: For how long it has been looked for in vain.
         hidden: Whether the last look could not tell.
+        doubted: Whether the next sure sight is believed wherever it is.
     """
 
     belief: kalman.Belief
@@ -81,6 +82,7 @@ class _Track:
     rival: Array | None = None
     missed_s: float = 0.0
     hidden: bool = False
+    doubted: bool = False
 
 
 @dataclass
@@ -164,10 +166,12 @@ class Tracker:
             if track is not None and track.held:
                 self._carry(track, T_world_ee, held=False)
 
-    def forget(self, names: Iterable[str]) -> None:
-        """Take the next sight of objects for the first."""
-        for name in tuple(names):
-            self._tracks.pop(name, None)
+    def doubt(self, names: Iterable[str], T_world_ee: Array) -> None:
+        """Objects need not be where they are taken to be; the next sure sight of them is believed at once."""
+        self.release(names, T_world_ee)
+        for name in names:
+            if name in self._tracks:
+                self._tracks[name].doubted = True
 
     @property
     def held(self) -> frozenset[str]:
@@ -200,10 +204,11 @@ class Tracker:
                 track.belief, (T_mount_world @ T_world_obj)[None], _turned(R, T_mount_world)[None]
             )
             if innovation.accepted[0]:
-                track.belief, track.rival, track.missed_s, track.hidden = belief, None, 0.0, False
+                track.belief, track.rival, track.missed_s = belief, None, 0.0
+                track.hidden = track.doubted = False
                 track.smoothed = self._smoothed(track.smoothed, belief.T[0])
                 return False
-        rival, track.rival = track.rival, T_world_obj
+        rival, track.rival = T_world_obj if track.doubted else track.rival, T_world_obj
         if rival is None or np.linalg.norm(rival[:3, 3] - T_world_obj[:3, 3]) > self.settings.agree_m:
             return False
         self._begin(name, T_world_obj, estimate.covariance)
