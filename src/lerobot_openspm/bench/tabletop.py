@@ -3,17 +3,21 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from lerobot_openspm.envs import layout, scene
+from lerobot_openspm.envs.simulator import TabletopSimulator
 from lerobot_openspm.envs.tabletop_env import RENDER_SIZE, TabletopEnv
 from lerobot_openspm.envs.tasks import TASKS
 from lerobot_openspm.geometry import se3
+from lerobot_openspm.geometry.camera import Camera
 from lerobot_openspm.memory.instruction import parse_instruction
 
 MAX_TRIES = 10_000
+MAX_CAMERA_SHIFT_M, MAX_CAMERA_TURN_DEG = 0.10, 10.0
 
 
 class TabletopWorld:
@@ -104,3 +108,24 @@ class Disturbance:
             if layout.is_admissible({**placed, self._name: there}):
                 return se3.from_yaw([there.x, there.y, self._start[2, 3]], there.yaw)
         raise layout.LayoutError(f"no free place for the {self._name} within 15 cm in {MAX_TRIES} tries")
+
+
+def move_cameras(
+    simulator: TabletopSimulator, cameras: Mapping[str, Camera], rng: np.random.Generator
+) -> dict[str, Camera]:
+    """Put the cameras that are fixed in the world up to 10 cm and 10 degrees elsewhere.
+
+    Returns:
+        The calibration of where they are now.
+    """
+    moved = dict(cameras)
+    for key, camera in cameras.items():
+        if camera.mount != "world":
+            continue
+        axis, way = rng.standard_normal((2, 3))
+        turn = np.deg2rad(rng.uniform(0, MAX_CAMERA_TURN_DEG)) * axis / np.linalg.norm(axis)
+        shift = rng.uniform(0, MAX_CAMERA_SHIFT_M) * way / np.linalg.norm(way)
+        T_world_cam = se3.apply_increment(camera.T_mount_cam, np.concatenate([shift, turn]))
+        simulator.place_camera(key.rsplit(".", 1)[1], T_world_cam)
+        moved[key] = replace(camera, T_mount_cam=T_world_cam)
+    return moved

@@ -162,6 +162,14 @@ class TabletopSimulator:
         self.data.qvel[self._dof[name] : self._dof[name] + 6] = 0.0
         mujoco.mj_forward(self.model, self.data)
 
+    def place_camera(self, name: str, T_world_cam: np.ndarray) -> None:
+        """Put a camera that is fixed in the world elsewhere; the pose is OpenCV's (4, 4): x right, y down."""
+        index = self.model.camera(name).id
+        R_world_mujoco = T_world_cam[:3, :3] @ np.diag([1.0, -1.0, -1.0])
+        self.model.cam_pos[index] = T_world_cam[:3, 3]
+        self.model.cam_quat[index] = np.roll(Rotation.from_matrix(R_world_mujoco).as_quat(), 1)
+        mujoco.mj_forward(self.model, self.data)
+
     def joint_position(self, name: str) -> float:
         """Metres a drawer is pulled out, or radians the knob is turned."""
         return float(self.data.qpos[self._qpos[name]])

@@ -18,7 +18,7 @@ from lerobot_openspm.perception.blobs import find_blobs
 from lerobot_openspm.perception.fitting import COARSE_PX, Cloud, Evidence, Fit, Freedom, fit
 from lerobot_openspm.perception.model import KnownObject, ObjectModel, PatchModel
 from lerobot_openspm.perception.patches import localise_patches
-from lerobot_openspm.perception.types import UNKNOWN_YAW_STD, Mask, PoseEstimate, View
+from lerobot_openspm.perception.types import UNKNOWN_YAW_STD, Mask, PoseEstimate, Support, View
 
 COARSE_CUTS_PX = (30.0, 30.0, 20.0, 12.0)
 FINE_CUTS_PX = (6.0, 4.0, 3.0, 3.0)
@@ -130,7 +130,17 @@ def _estimate(
     if model.yaw_period == 0:
         covariance[3, :] = covariance[:, 3] = 0
         covariance[3, 3] = UNKNOWN_YAW_STD**2
-    return PoseEstimate(status, canonical(best.T_world_obj, model), covariance, confidence, masks, share)
+    T_world_obj = canonical(best.T_world_obj, model)
+    support = _support(best, model, masks)
+    return PoseEstimate(status, T_world_obj, covariance, confidence, masks, share, support)
+
+
+def _support(best: Fit, model: ObjectModel, masks: Mapping[str, Mask]) -> Support:
+    """What a fit rests on: views that explain the mask equally well are consistent."""
+    seen = best.overlaps[np.isfinite(best.overlaps)]
+    consistency = float(seen.min() / max(seen.max(), 1e-6)) if len(seen) else 0.0
+    area = float(sum(np.count_nonzero(mask) for mask in masks.values()))
+    return Support("shape", area, consistency, model.typical_overlap)
 
 
 def _nearby(model: ObjectModel) -> Freedom:

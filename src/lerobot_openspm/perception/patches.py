@@ -19,13 +19,17 @@ from lerobot_openspm.geometry import se3
 from lerobot_openspm.geometry.camera import project
 from lerobot_openspm.geometry.se3 import Array
 from lerobot_openspm.perception.model import Patch, PatchModel, Picture, Probe
-from lerobot_openspm.perception.types import UNKNOWN_YAW_STD, Mask, PoseEstimate, View
+from lerobot_openspm.perception.types import UNKNOWN_YAW_STD, Mask, PoseEstimate, Support, View
 
 # How far from each patch's own place an object is sought.
 REACH_M = 0.035
 MIN_PATCH_PX = 7
 # A patch with less contrast than this, in CIELAB levels, is found everywhere.
 MIN_CONTRAST = 4.0
+# A patch is looked for at the height it was learned at; an object this much above or below is another matter.
+MAX_LIFT_M = 0.005
+# Probes whose places differ by this much are 1/e consistent.
+CONSISTENT_M = 0.005
 # Of the typical correlation.
 FOUND_CORRELATION = 0.5
 # A hand camera sees the patch as in the demonstrations only from the same place.
@@ -122,7 +126,7 @@ def localise_patches(
             said of it.
     """
     information, weighted = np.zeros((2, 2)), np.zeros(2)
-    correlations = []
+    correlations, places, area_px = [], [], 0.0
     for probe in model.probes:
         view = as_seen(views.get(probe.camera), probe)
         covered = (hidden or {}).get(probe.camera)
@@ -134,13 +138,13 @@ def localise_patches(
             continue
         weight = np.eye(2) / probe.std_m**2
         information += weight
-        weighted += weight @ np.median([one.point_world[:2] for one in sights], axis=0)
+        places.append(np.median([one.point_world[:2] for one in sights], axis=0))
+        weighted += weight @ places[-1]
+        area_px += float(np.mean([patch.image[..., 0].size for patch in probe.patches]))
         correlations.append(float(np.median([one.correlation for one in sights])))
     unknown = np.diag([1.0, 1.0, 1.0, UNKNOWN_YAW_STD**2])
-    # Without a patch in sight, and of an object that is elsewhere, the images tell nothing.
-    visible = float(bool(correlations) and _is_in_reach(model, T_expected))
     if not correlations:
-        return PoseEstimate("not_found", np.eye(4), unknown, 0.0, {}, visible)
+        return PoseEstimate("not_found", np.eye(4), unknown, 0.0, {}, visible=0.0)
     confidence = float(np.clip(np.mean(correlations) / max(model.typical_correlation, 1e-3), 0, 1))
     status = (
         "found" if np.mean(correlations) >= FOUND_CORRELATION * model.typical_correlation else "not_found"
@@ -151,16 +155,25 @@ def localise_patches(
     covariance[:2, :2] = len(correlations) * np.linalg.inv(information)
     place = np.linalg.solve(information, weighted)
     T_world_obj = se3.from_yaw(np.append(place, model.height), 0.0)
-    return PoseEstimate(status, T_world_obj, covariance, confidence, {}, visible)
+    visible = float(_can_tell(model, status == "found", T_expected))
+    apart = np.linalg.norm(np.stack(places) - place, axis=1).max()
+    quality = float(np.clip(model.typical_correlation, 0, 1))
+    support = Support("patches", area_px, float(np.exp(-apart / CONSISTENT_M)), quality)
+    return PoseEstimate(status, T_world_obj, covariance, confidence, {}, visible, support)
 
 
-def _is_in_reach(model: PatchModel, T_expected: Array | None) -> bool:
-    """Whether an object is expected where its patches are looked for."""
+def _can_tell(model: PatchModel, found: bool, T_expected: Array | None) -> bool:
+    """Whether patches say anything of an object that is expected somewhere.
+
+    A lifted object looks like one that has moved sideways, and what is expected out of the patches' reach is
+    not missed there.
+    """
     if T_expected is None:
         return True
-    places = np.stack([patch.point_world for probe in model.probes for patch in probe.patches])
-    away = np.linalg.norm(places - T_expected[:3, 3], axis=1)
-    return bool(away.min() <= REACH_M)
+    if abs(T_expected[2, 3] - model.height) > MAX_LIFT_M:
+        return False
+    places = np.stack([patch.point_world[:2] for probe in model.probes for patch in probe.patches])
+    return found or bool(np.linalg.norm(places - T_expected[:2, 3], axis=1).min() <= REACH_M)
 
 
 def _is_covered(probe: Probe, hidden: Mask) -> bool:

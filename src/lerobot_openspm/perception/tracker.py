@@ -17,6 +17,7 @@ from scipy.spatial.transform import Rotation, Slerp
 from lerobot_openspm.geometry import se3
 from lerobot_openspm.geometry.se3 import Array
 from lerobot_openspm.perception import kalman
+from lerobot_openspm.perception.measurement import measurement_covariance
 from lerobot_openspm.perception.types import PoseEstimate
 
 
@@ -47,6 +48,8 @@ class TrackerSettings:
         agree_m: Two looks that differ less than this see the same place.
         stale_s: After being looked for in vain for so long an object is stale ...
         lost_s: ... and lost.
+        hand_m: What is this near the hand may be hidden by it, so it is not missed ...
+        carrying_m: ... and this near while the hand carries something, which hides more.
     """
 
     linear: float = 0.0035
@@ -60,6 +63,8 @@ class TrackerSettings:
     agree_m: float = 0.030
     stale_s: float = 0.5
     lost_s: float = 2.0
+    hand_m: float = 0.20
+    carrying_m: float = 0.30
 
 
 @dataclass
@@ -144,13 +149,13 @@ class Tracker:
             track = self._tracks.get(name)
             if track is None:
                 if estimate.status == "found":
-                    self._begin(name, estimate.T_world_obj, estimate.covariance)
+                    self._begin(name, estimate.T_world_obj, estimate)
                     moved.add(name)
             elif self._is_seen(estimate):
                 if self._take(name, track, estimate, T_world_ee):
                     moved.add(name)
             else:
-                self._miss(track, estimate, waited_s)
+                self._miss(track, estimate, T_world_ee, waited_s)
         return frozenset(moved)
 
     def hold(self, name: str, T_world_ee: Array) -> None:
@@ -178,8 +183,8 @@ class Tracker:
         """Objects that the hand carries."""
         return frozenset(name for name, track in self._tracks.items() if track.held)
 
-    def _begin(self, name: str, T_world_obj: Array, covariance: Array) -> None:
-        belief = kalman.begin(T_world_obj[None], measurement_covariance(covariance)[None])
+    def _begin(self, name: str, T_world_obj: Array, estimate: PoseEstimate) -> None:
+        belief = kalman.begin(T_world_obj[None], measurement_covariance(estimate)[None])
         self._tracks[name] = _Track(belief, T_world_obj)
 
     def _is_seen(self, estimate: PoseEstimate) -> bool:
@@ -195,7 +200,7 @@ class Tracker:
         T_world_obj = nearest_equivalent(
             estimate.T_world_obj, expected, self.yaw_periods.get(name, 2 * np.pi)
         )
-        R = measurement_covariance(estimate.covariance)
+        R = measurement_covariance(estimate)
         apart = float(np.linalg.norm(T_world_obj[:3, 3] - expected[:3, 3]))
         near_m = self.settings.near_held_m if track.held else self.settings.near_m
         if apart <= near_m:
@@ -211,13 +216,19 @@ class Tracker:
         rival, track.rival = T_world_obj if track.doubted else track.rival, T_world_obj
         if rival is None or np.linalg.norm(rival[:3, 3] - T_world_obj[:3, 3]) > self.settings.agree_m:
             return False
-        self._begin(name, T_world_obj, estimate.covariance)
+        self._begin(name, T_world_obj, estimate)
         return True
 
-    def _miss(self, track: _Track, estimate: PoseEstimate, waited_s: float) -> None:
+    def _miss(self, track: _Track, estimate: PoseEstimate, T_world_ee: Array, waited_s: float) -> None:
         """An object that is in sight but not recognised is on its way to being lost; a hidden one is not."""
+        expected = _in_world(track.belief.T[0], track, T_world_ee)
+        near = self.settings.carrying_m if self.held else self.settings.hand_m
         track.rival = None
-        track.hidden = estimate.visible < self.settings.visible or estimate.status == "found"
+        track.hidden = (
+            estimate.visible < self.settings.visible
+            or estimate.status == "found"
+            or float(np.linalg.norm(expected[:3, 3] - T_world_ee[:3, 3])) < near
+        )
         track.missed_s = 0.0 if track.hidden or track.held else track.missed_s + waited_s
 
     def _carry(self, track: _Track, T_new_old: Array, held: bool) -> None:
@@ -239,22 +250,6 @@ class Tracker:
         pair = Rotation.from_matrix([T_before[:3, :3], T_filtered[:3, :3]])
         turned = Slerp([0.0, 1.0], pair)(self.settings.smoothing_rotation)
         return se3.transform(turned.as_matrix(), position)
-
-
-def measurement_covariance(covariance: Array) -> Array:
-    """``(6, 6)`` over position and orientation error, of one ``(4, 4)`` over x, y, z and yaw.
-
-    Objects are taken to stand upright: roll and pitch are as sure as a table is level.
-    """
-    R = np.diag([0.0, 0.0, 0.0, LEVEL_RAD**2, LEVEL_RAD**2, 0.0])
-    at = np.ix_([0, 1, 2, 5], [0, 1, 2, 5])
-    R[at] = covariance
-    R[[0, 1, 2, 5], [0, 1, 2, 5]] += np.array([FLOOR_M**2] * 3 + [FLOOR_RAD**2])
-    return R
-
-
-# What no estimate is better than; it keeps what is not measured at all, such as a height, from being certain.
-LEVEL_RAD, FLOOR_M, FLOOR_RAD = 0.02, 5e-4, 5e-3
 
 
 def nearest_equivalent(T_world_obj: Array, expected: Array, period: float) -> Array:

@@ -106,6 +106,23 @@ class Scene:
 
 
 @dataclass(frozen=True)
+class Support:
+    """What a pose estimate rests on: the grounds of the paper's observation covariance ``R_t``.
+
+    Attributes:
+        kind: How the object is known.
+        area_px: Pixels of the object that were used, over all views.
+        consistency: From 0 to 1: whether the views tell the same.
+        quality: From 0 to 1: how well the learned shape or patches explain the object's own demonstrations.
+    """
+
+    kind: Literal["shape", "patches"]
+    area_px: float
+    consistency: float
+    quality: float
+
+
+@dataclass(frozen=True)
 class PoseEstimate:
     """Where an object is.
 
@@ -117,6 +134,7 @@ class PoseEstimate:
         masks: Foreground mask ``(H, W)`` by camera name.
         visible: Share of the object that is in sight in the view that shows it best, where the hand is not in
             the way: at its place if it was found, else where it was expected.
+        support: What the estimate rests on; None where the covariance says all.
     """
 
     status: Literal["found", "not_found", "ambiguous"]
@@ -125,3 +143,4 @@ class PoseEstimate:
     confidence: float
     masks: dict[str, Mask]
     visible: float = 1.0
+    support: Support | None = None

@@ -1,0 +1,130 @@
+"""How often tasks succeed on the tabletop when objects are moved, dropped, or cameras stand elsewhere."""
+
+from __future__ import annotations
+
+import json
+from collections import defaultdict
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from lerobot_openspm.bench.episode import run_episode
+from lerobot_openspm.bench.tabletop import GRASPED, Disturbance, TabletopWorld, move_cameras
+from lerobot_openspm.cli.pipeline import rate
+from lerobot_openspm.envs.tabletop_env import TabletopEnv
+from lerobot_openspm.envs.tasks import TASK_NAMES
+from lerobot_openspm.modeling_openspm import OpenSPMPolicy
+
+
+@dataclass(frozen=True)
+class Condition:
+    """What is done to an episode.
+
+    Attributes:
+        name: Its name in the results.
+        disturbance: "displaced", "dropped", or None.
+        tracking: Whether the policy tracks.
+        cameras_moved: Whether the fixed cameras stand up to 10 cm and 10 degrees elsewhere, their calibration
+            given.
+    """
+
+    name: str
+    disturbance: str | None = None
+    tracking: bool = True
+    cameras_moved: bool = False
+
+    @property
+    def tasks(self) -> tuple[str, ...]:
+        """The tasks it makes sense for."""
+        return TASK_NAMES if self.disturbance is None else tuple(GRASPED)
+
+
+TRACKING = (
+    Condition("displaced", "displaced"),
+    Condition("dropped", "dropped"),
+    Condition("displaced_untracked", "displaced", tracking=False),
+    Condition("dropped_untracked", "dropped", tracking=False),
+)
+CAMERAS = (Condition("cameras_in_place"), Condition("cameras_moved", cameras_moved=True))
+
+
+@dataclass(frozen=True)
+class Result:
+    """One episode; `disturbed_at` is the step of the disturbance, None where the moment for it never came."""
+
+    condition: str
+    task: str
+    seed: int
+    success: bool
+    steps: int
+    status: str
+    attempts: int
+    disturbed_at: int | None
+
+
+def run(checkpoint: str, condition: Condition, task: str, seed: int) -> Result:
+    """Run one episode under one condition."""
+    torch.set_num_threads(1)
+    policy = OpenSPMPolicy.from_pretrained(checkpoint)
+    policy.config.tracking = condition.tracking
+    env = TabletopEnv(task=task)
+    world = TabletopWorld(env, seed)
+    rng = np.random.default_rng([seed, TASK_NAMES.index(task)])
+    if condition.cameras_moved:
+        experience = policy.require_experience()
+        policy.experience = replace(experience, cameras=move_cameras(env.simulator, experience.cameras, rng))
+    disturbance = Disturbance(world, condition.disturbance, rng) if condition.disturbance else None
+    episode = run_episode(policy, world, disturbance)
+    env.close()
+    return Result(
+        condition.name, task, seed, episode.success, len(episode.actions), episode.row.status.value,
+        episode.row.executor.attempts, disturbance.step if disturbance else None,
+    )  # fmt: skip
+
+
+def jobs(conditions: Sequence[Condition], episodes: int, seed: int) -> list[tuple[Condition, str, int]]:
+    """So many episodes of every condition, the tasks in turn, every task from the same seeds."""
+    return [
+        (condition, condition.tasks[i % len(condition.tasks)], seed + i // len(condition.tasks))
+        for i in range(episodes)
+        for condition in conditions
+    ]
+
+
+def read(log: Path) -> dict[tuple[str, str, int], Result]:
+    """Results that were written down, by condition, task and seed; a torn line is left out."""
+    results = {}
+    for line in log.read_text().splitlines() if log.exists() else []:
+        try:
+            result = Result(**json.loads(line))
+        except ValueError:
+            continue
+        results[result.condition, result.task, result.seed] = result
+    return results
+
+
+def write_line(log: Path, result: Result) -> None:
+    """Write a result down."""
+    with log.open("a") as file:
+        file.write(json.dumps(asdict(result)) + "\n")
+
+
+def summarise(results: Sequence[Result]) -> dict[str, Any]:
+    """Success by condition, of the episodes in which what was to be done was done."""
+    by_condition: dict[str, list[Result]] = defaultdict(list)
+    for result in results:
+        by_condition[result.condition].append(result)
+    summary: dict[str, Any] = {}
+    for name, found in by_condition.items():
+        is_disturbed = any(result.disturbed_at is not None for result in found)
+        counted = [result for result in found if result.disturbed_at is not None or not is_disturbed]
+        summary[name] = {
+            **rate(sum(result.success for result in counted), len(counted)),
+            "undisturbed": len(found) - len(counted),
+            "failed": [[r.task, r.seed, r.status] for r in counted if not r.success],
+        }
+    return summary
