@@ -7,6 +7,7 @@ import numpy as np
 from lerobot_openspm.envs.libero.simulator import LiberoSimulator
 
 MAX_STEPS = 300
+IMAGE_SIZE = 360  # lerobot-eval's default
 
 
 class LiberoWorld:

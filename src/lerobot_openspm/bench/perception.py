@@ -2,16 +2,25 @@
 
 from __future__ import annotations
 
+import contextlib
+import json
 import time
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Callable, Generator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
+import torch
+from lerobot.datasets import LeRobotDatasetMetadata
 
-from lerobot_openspm.bench.episode import World, run_episode
+from lerobot_openspm.bench.episode import IMAGES, World, run_episode
+from lerobot_openspm.bench.object_frames import offset
 from lerobot_openspm.bench.truth import Truth, pose_error, true_period
 from lerobot_openspm.control.row import Row
+from lerobot_openspm.envs.recording import source
+from lerobot_openspm.files import write_json
 from lerobot_openspm.geometry.se3 import Array
 from lerobot_openspm.modeling_openspm import OpenSPMPolicy
 from lerobot_openspm.observation import Observation
@@ -20,14 +29,108 @@ from lerobot_openspm.perception import kalman
 from lerobot_openspm.perception.localise import localise, prepare
 from lerobot_openspm.perception.tracker import Tracker, TrackerSettings
 from lerobot_openspm.perception.types import View
+from lerobot_openspm.training import open_demonstrations
 
 # What the policy follows, each picture's own estimate, what would be followed with the first camera alone.
 VARIANTS = ("filtered", "unfiltered", "one_view")
 WARM_UP = 20
 
 
-# Of an object at one moment: task, step, object, whether the hand held it, metres and radians off.
-type Sample = tuple[str, int, str, bool, float, float]
+COST_RUNS = 50
+# What is timed: the policy's first cameras and objects.
+COST_VIEWS, COST_OBJECTS = 2, 3
+
+
+@dataclass(frozen=True)
+class Setting:
+    """What is measured and where: kind of simulator, checkpoint, its demonstrations and their name."""
+
+    env_type: str
+    checkpoint: str
+    dataset: str
+    repo_id: str
+
+
+def tasks(env_type: str, selection: str) -> list[str]:
+    """Names of the tasks that a selection stands for."""
+    return source(env_type).tasks(selection)
+
+
+@contextlib.contextmanager
+def world(env_type: str, task: str, seed: int) -> Generator[World]:
+    """A task's scene drawn from a seed."""
+    if env_type == "openspm_tabletop":
+        from lerobot_openspm.bench.tabletop import TabletopWorld
+        from lerobot_openspm.envs.tabletop_env import TabletopEnv
+
+        env = TabletopEnv(task=task)
+        yield TabletopWorld(env, seed)
+        env.close()
+    else:
+        from lerobot_openspm.bench.libero import IMAGE_SIZE, LiberoWorld
+        from lerobot_openspm.envs.libero.simulator import LiberoSimulator
+
+        simulator = LiberoSimulator(task, IMAGE_SIZE, render_steps=False)
+        simulator.reset(seed)
+        yield LiberoWorld(simulator)
+        simulator.close()
+
+
+def file_of(folder: Path, task: str, seed: int) -> Path:
+    """Where one episode's samples are kept."""
+    return folder / f"{task}_{seed}.json"
+
+
+def run(setting: Setting, folder: Path, task: str, seed: int) -> None:
+    """Measure one episode and write its samples down."""
+    torch.set_num_threads(1)
+    policy = OpenSPMPolicy.from_pretrained(setting.checkpoint)
+    meta = LeRobotDatasetMetadata(setting.repo_id, root=setting.dataset)
+    demonstrations = open_demonstrations(meta, policy.config)
+    experience = policy.require_experience()
+    offsets = {name: offset(experience, name, demonstrations) for name in experience.objects}
+    with world(setting.env_type, task, seed) as scene:
+        success, samples = measure_episode(policy, scene, task, offsets)
+    write_json(file_of(folder, task, seed), {"success": success, "samples": samples})
+
+
+def read(folder: Path, jobs: Sequence[tuple[str, int]]) -> dict[str, list[Sample]]:
+    """The samples of all episodes by variant."""
+    samples: dict[str, list[Sample]] = {variant: [] for variant in VARIANTS}
+    for task, seed in jobs:
+        for variant, rows in json.loads(file_of(folder, task, seed).read_text())["samples"].items():
+            samples[variant] += [tuple(row) for row in rows]
+    return samples
+
+
+def costs(setting: Setting) -> dict[str, Any]:
+    """What a look at three objects in two views of 256 pixels takes, and a step of the filter; one thread."""
+    torch.set_num_threads(1)
+    cv2.setNumThreads(1)
+    policy = OpenSPMPolicy.from_pretrained(setting.checkpoint)
+    experience = policy.require_experience()
+    task = tasks(setting.env_type, "all")[0]
+    with world(setting.env_type, task, 0) as scene:
+        vector = scene.state().astype(float)
+        T_world_ee = policy.config.layouts()[0].poses(vector)
+        views = {}
+        for key, camera in list(experience.cameras.items())[:COST_VIEWS]:
+            image = scene.image(key.removeprefix(IMAGES))
+            image = np.asarray(cv2.resize(image, (256, 256), interpolation=cv2.INTER_AREA), np.uint8)
+            scaled = camera.scaled(256, 256)
+            views[key] = View(image, scaled, scaled.T_world_cam(T_world_ee))
+    spent = milliseconds(policy, views, list(experience.objects)[:COST_OBJECTS], COST_RUNS)
+    one, twenty = filter_microseconds(1), filter_microseconds(20)
+    return {
+        "ms_per_observation": spent["first_ms"]["median"],
+        "filter_us": one["median"],
+        "cost": {"perception": spent, "filter_us_1_object": one, "filter_us_20_objects": twenty},
+    }
+
+
+# Of an object at one moment: task, step, object, whether the hand held it, metres and radians
+# off; None where nothing is known.
+type Sample = tuple[str, int, str, bool, float | None, float | None]
 
 
 def measure_episode(
@@ -38,7 +141,7 @@ def measure_episode(
     All variants see the same pictures at the same moments; only the first one is acted on.
 
     Returns:
-        Whether it succeeded, and the samples by variant; NaN where nothing is known of an object.
+        Whether it succeeded, and the samples by variant.
     """
     truth, shadow = Truth(world.object_poses(), offsets), _Shadow(policy)
     samples: dict[str, list[Sample]] = {variant: [] for variant in VARIANTS}
@@ -57,10 +160,10 @@ def measure_episode(
         for name in (name for name in row.ranked[0].entry.objects if name in offsets):
             held = name in row.tracker.held
             for variant, poses in known.items():
-                error = (np.nan, np.nan)
+                error: tuple[float | None, float | None] = (None, None)
                 if name in poses:
                     error = pose_error(true[name], poses[name], true_period(name))
-                samples[variant].append((task, step, name, held, *error))
+                samples[variant].append((task, step, name, held, error[0], error[1]))
 
     return run_episode(policy, world, note=compare).success, samples
 
@@ -99,7 +202,8 @@ def summary(samples: Sequence[Sample]) -> dict[str, Any]:
     metres, radians = (np.array([sample[i] for sample in samples], float) for i in (4, 5))
     known = np.isfinite(metres)
     if not known.any():
-        return {"poses": len(samples), "unknown": len(samples)}
+        nothing = dict.fromkeys(("position_mm_mean", "position_mm_p95", "orientation_deg_mean"))
+        return {"poses": len(samples), "unknown": len(samples), **nothing}
     return {
         "poses": len(samples),
         "unknown": int((~known).sum()),
@@ -112,11 +216,14 @@ def summary(samples: Sequence[Sample]) -> dict[str, Any]:
 def summarise(samples: Mapping[str, Sequence[Sample]]) -> dict[str, Any]:
     """All variants; of the first one also by task, by object, at the start and in the hand."""
     own = samples[VARIANTS[0]]
+    overall = summary(own)
     parts = {
         "start": [s for s in own if s[1] == 0],
         "held": [s for s in own if s[3]],
     }
     return {
+        **{key: overall[key] for key in ("position_mm_mean", "position_mm_p95", "orientation_deg_mean")},
+        "n": overall["poses"],
         "variants": {variant: summary(found) for variant, found in samples.items()},
         **{part: summary(found) for part, found in parts.items()},
         "tasks": _grouped(own, 0),

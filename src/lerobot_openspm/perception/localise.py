@@ -28,6 +28,8 @@ MAX_CANDIDATES = 3
 # how well it must be seen there for that to be left out.
 NEARBY_CUTS_PX = (12.0, 6.0, 4.0, 3.0)
 NEARBY_M, NEARBY_HEIGHT_M, NEARBY_RAD = 0.03, 0.003, 0.3
+# An object this far above or below the plane it was learned on does not stand there.
+LIFTED_M = 0.005
 NEARBY_CONFIDENCE = 0.9
 # Relative to the overlap that is typical of the object's demonstrations.
 FOUND_CONFIDENCE = 0.5
@@ -103,7 +105,7 @@ def localise(
     masks = {name: one.probability > 0.5 for name, one in zip(views, evidence, strict=True)}
     cloud = Cloud(model.points.astype(float), model.spacing)
     if T_expected is not None:
-        there = fit(evidence, cloud, T_expected, _nearby(model), NEARBY_CUTS_PX)
+        there = fit(evidence, cloud, T_expected, _nearby(model, T_expected), NEARBY_CUTS_PX)
         if there.score >= NEARBY_CONFIDENCE * model.typical_overlap:
             return _estimate("found", there, model, masks, seen_share(evidence, cloud, there.T_world_obj))
     fits = search(evidence, model, freedom or Freedom())
@@ -143,9 +145,12 @@ def _support(best: Fit, model: ObjectModel, masks: Mapping[str, Mask]) -> Suppor
     return Support("shape", area, consistency, model.typical_overlap)
 
 
-def _nearby(model: ObjectModel) -> Freedom:
-    """An object that is followed may have been lifted or tilted a little, and keeps about its yaw."""
-    return Freedom(NEARBY_M, NEARBY_HEIGHT_M, 0.0 if model.yaw_period == 0 else NEARBY_RAD)
+def _nearby(model: ObjectModel, T_expected: Array) -> Freedom:
+    """An object that is followed keeps about its yaw, and its height but for one in the air."""
+    is_lifted = abs(float(T_expected[2, 3]) - model.height) > LIFTED_M
+    return Freedom(
+        NEARBY_M, NEARBY_HEIGHT_M if is_lifted else 0.0, 0.0 if model.yaw_period == 0 else NEARBY_RAD
+    )
 
 
 def seen_share(evidence: Sequence[Evidence], cloud: Cloud, T_world_obj: Array) -> float:

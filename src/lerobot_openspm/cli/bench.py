@@ -1,0 +1,182 @@
+"""`openspm bench perception|tracking|cameras`: measure a checkpoint in the simulators, resumably."""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+import logging
+import multiprocessing
+from collections.abc import Callable, Iterable, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from lerobot_openspm.envs.gl_backend import set_default_gl_backend
+from lerobot_openspm.errors import OpenSPMError
+
+logger = logging.getLogger(__name__)
+
+# Where `make demo` and `make libero` leave their checkpoints and demonstrations, and what those are called.
+DEFAULTS = {
+    "openspm_tabletop": ("outputs/demo/demos_10", "local/openspm_tabletop"),
+    "libero": ("outputs/libero/demos_10", "local/libero"),
+}
+CHECKPOINT = "train/checkpoints/last/pretrained_model"
+# Seeds of evaluation that no success rate was taken on.
+SEED = 5000
+
+
+@dataclass
+class EnvironmentOption:
+    """Where to measure."""
+
+    type: str = "openspm_tabletop"  # openspm_tabletop, or libero (its suite libero_goal)
+    task: str = "all"  # a task name, a comma list of them, or "all"
+
+
+@dataclass
+class PolicyOption:
+    """What to measure."""
+
+    path: str | None = None  # default: the checkpoint that `make demo` or `make libero` left
+
+
+@dataclass
+class DatasetOption:
+    """The demonstrations, whose simulator poses tell where on each object its learned frame stands."""
+
+    root: str | None = None  # default: those of `make demo` or `make libero`
+    repo_id: str | None = None
+
+
+@dataclass
+class BenchConfig:
+    """Measure a checkpoint in a simulator."""
+
+    env: EnvironmentOption = field(default_factory=EnvironmentOption)
+    policy: PolicyOption = field(default_factory=PolicyOption)
+    dataset: DatasetOption = field(default_factory=DatasetOption)
+    episodes: int = 100  # in all, the tasks in turn; for tracking and cameras, of each kind
+    seed: int = SEED  # of the first scene of every task
+    workers: int = 2  # episodes at a time, each in a process of its own
+    output: str | None = None  # folder for what was measured; default: outputs/bench/<what>_<env.type>
+
+    def __post_init__(self) -> None:
+        if self.env.type not in DEFAULTS:
+            raise ValueError(f"env.type is {self.env.type!r}, expected one of {', '.join(DEFAULTS)}")
+        if self.env.type == "libero" and importlib.util.find_spec("libero") is None:
+            raise ValueError("env.type=libero needs LIBERO; install it with: pip install 'lerobot[libero]'")
+        if self.episodes < 1 or self.workers < 1:
+            raise ValueError(
+                f"episodes and workers must be at least 1, got {self.episodes} and {self.workers}"
+            )
+
+    @property
+    def checkpoint(self) -> Path:
+        """Folder of the checkpoint. Raises FileNotFoundError when there is none."""
+        path = Path(self.policy.path or Path(DEFAULTS[self.env.type][0]) / CHECKPOINT)
+        if not (path / "memory.json").is_file():
+            make = "make demo" if self.env.type == "openspm_tabletop" else "make libero"
+            raise FileNotFoundError(f"no checkpoint of this policy at {path}; pass --policy.path, or {make}")
+        return path
+
+    def folder(self, what: str) -> Path:
+        """Where results go; what was measured of other code or another checkpoint is discarded."""
+        from lerobot_openspm.cli.pipeline import digest, discard_unless
+
+        folder = Path(self.output or f"outputs/bench/{what}_{self.env.type}")
+        files = [self.checkpoint / name for name in ("model.safetensors", "memory.json", "cameras.json")]
+        discard_unless(folder, digest(files, [what]))
+        folder.mkdir(parents=True, exist_ok=True)
+        return folder
+
+
+def perception(config: BenchConfig) -> dict[str, Any]:
+    """Errors of the poses that are followed, and what perception and the filter cost."""
+    from lerobot_openspm.bench import perception as measure
+
+    folder = config.folder("perception")
+    root, repo_id = DEFAULTS[config.env.type]
+    setting = measure.Setting(
+        config.env.type, str(config.checkpoint), config.dataset.root or f"{root}/dataset",
+        config.dataset.repo_id or repo_id,
+    )  # fmt: skip
+    if not (Path(setting.dataset) / "meta/info.json").is_file():
+        raise FileNotFoundError(f"no demonstrations at {setting.dataset}; pass --dataset.root")
+    tasks = measure.tasks(config.env.type, config.env.task)
+    jobs = [(tasks[i % len(tasks)], config.seed + i // len(tasks)) for i in range(config.episodes)]
+    left = [job for job in jobs if not measure.file_of(folder, *job).is_file()]
+    for _ in _each(config.workers, measure.run, [(setting, folder, *job) for job in left]):
+        pass  # each writes its own file
+    samples = measure.read(folder, jobs)
+    return {**measure.summarise(samples), **measure.costs(setting), "episodes": len(jobs)}
+
+
+def tracking(config: BenchConfig) -> dict[str, Any]:
+    """Success where objects are displaced or dropped, with and without tracking."""
+    from lerobot_openspm.bench import tracking as measure
+
+    found = _disturbed(config, "tracking", measure.TRACKING)
+    n = min(one["n"] for one in found.values())
+    return {**{f"success_{name}": one["success"] for name, one in found.items()}, "n": n, "conditions": found}
+
+
+def cameras(config: BenchConfig) -> dict[str, Any]:
+    """Success where the cameras stand elsewhere and their calibration says so."""
+    from lerobot_openspm.bench import tracking as measure
+
+    found = _disturbed(config, "cameras", measure.CAMERAS)
+    n = min(one["n"] for one in found.values())
+    return {**{f"success_{name}": one["success"] for name, one in found.items()}, "n": n, "conditions": found}
+
+
+def _disturbed(config: BenchConfig, what: str, conditions: Sequence[Any]) -> dict[str, Any]:
+    from lerobot_openspm.bench import tracking as measure
+
+    if config.env.type != "openspm_tabletop":
+        raise OpenSPMError(f"bench {what} disturbs the tabletop alone, got env.type={config.env.type}")
+    log = config.folder(what) / "episodes.jsonl"
+    checkpoint = str(config.checkpoint)
+    jobs = measure.jobs(conditions, config.episodes, config.seed)
+    done = measure.read(log)
+    left = [(checkpoint, *job) for job in jobs if (job[0].name, *job[1:]) not in done]
+    for result in _each(config.workers, measure.run, left):
+        measure.write_line(log, result)
+    done = measure.read(log)
+    return measure.summarise([done[condition.name, task, seed] for condition, task, seed in jobs])
+
+
+def _each(workers: int, function: Callable[..., Any], jobs: Sequence[tuple[Any, ...]]) -> Iterable[Any]:
+    """Call a function for every job in processes of their own; yields results as they come."""
+    from tqdm import tqdm
+
+    context = multiprocessing.get_context("spawn")
+    with ProcessPoolExecutor(workers, context) as pool:
+        running = [pool.submit(function, *job) for job in jobs]
+        try:
+            for future in tqdm(as_completed(running), "Episodes", len(running), disable=not jobs):
+                yield future.result()
+        finally:
+            pool.shutdown(cancel_futures=True)
+
+
+MEASURES: dict[str, Callable[[BenchConfig], dict[str, Any]]] = {
+    "perception": perception,
+    "tracking": tracking,
+    "cameras": cameras,
+}
+
+
+def main(args: Sequence[str] | None = None) -> None:
+    """Parse the arguments (default: the command line's), measure, print one JSON object last."""
+    import sys
+
+    import draccus
+
+    what, *options = list(sys.argv[1:] if args is None else args) or [""]
+    if what not in MEASURES:
+        raise OpenSPMError(f"bench what? got {what!r}, expected one of {', '.join(MEASURES)}")
+    set_default_gl_backend()
+    config = draccus.parse(config_class=BenchConfig, args=options)
+    print(json.dumps(MEASURES[what](config)))
