@@ -1,0 +1,95 @@
+import numpy as np
+import pytest
+from tests.perception.drawn_world import cameras, draw_poses, views_of
+
+from lerobot_openspm.geometry import se3
+from lerobot_openspm.geometry.camera import project
+from lerobot_openspm.perception.learning import learn_objects
+from lerobot_openspm.perception.localise import localise
+from lerobot_openspm.perception.occlusion import hand_mask
+from lerobot_openspm.perception.types import View
+
+DOWN = np.diag([1.0, -1.0, -1.0])
+
+
+def view(mount="world"):
+    camera, T_world_cam = cameras()["front"]
+    camera = type(camera)(**{**vars(camera), "mount": mount})
+    return View(np.zeros((160, 160, 3), np.uint8), camera, T_world_cam)
+
+
+def test_the_hand_hides_its_fingers_and_the_arm_behind_them_and_little_else():
+    T_world_ee = se3.transform(DOWN, [0.0, 0.0, 0.1])
+    mask = hand_mask(view(), T_world_ee, 0.05)
+    for height, hidden in ((0.0, True), (0.1, True), (-0.09, False)):
+        uv, _ = project(view().camera, view().T_world_cam, [0.0, 0.0, 0.1 + height])
+        assert mask[round(float(uv[1])), round(float(uv[0]))] == hidden
+    assert 0.01 < mask.mean() < 0.2
+
+
+def test_a_larger_hand_hides_more_and_a_hand_camera_sees_past_its_own():
+    T_world_ee = se3.transform(DOWN, [0.0, 0.0, 0.1])
+    small, large = (hand_mask(view(), T_world_ee, radius) for radius in (0.03, 0.08))
+    assert (large & small).sum() == small.sum() < large.sum()
+    assert not hand_mask(view("ee"), T_world_ee, 0.08).any()
+
+
+@pytest.fixture(scope="module")
+def models():
+    from tests.perception.drawn_world import demonstration
+
+    rng = np.random.default_rng(3)
+    return learn_objects([demonstration(rng) for _ in range(6)], np.random.default_rng(0))
+
+
+def with_bar(views, name, T, share):
+    """A grey bar over part of an object in every view, and the masks that tell of it."""
+    covered, hidden = {}, {}
+    for camera, one in views.items():
+        uv, _ = project(one.camera, one.T_world_cam, T[:3, 3] + [0, 0, 0.03])
+        left = round(float(uv[0]) + (0.5 - share) * 24)
+        image, mask = one.image.copy(), np.zeros((160, 160), bool)
+        mask[:, left : left + 40] = True
+        image[mask] = (90, 90, 95)
+        covered[camera], hidden[camera] = View(image, one.camera, one.T_world_cam), mask
+    return covered, hidden
+
+
+def test_what_is_known_to_be_hidden_does_not_pull_the_pose(models):
+    rng = np.random.default_rng(11)
+    told, untold, shares = [], [], []
+    for _ in range(8):
+        poses = draw_poses(rng)
+        clear = localise(views_of(poses), models["block"])
+        covered, hidden = with_bar(views_of(poses), "block", poses["block"], 0.35)
+        for found, masks in ((told, hidden), (untold, None)):
+            one = localise(covered, models["block"], hidden=masks, T_expected=clear.T_world_obj)
+            found.append(np.linalg.norm(one.T_world_obj[:2, 3] - clear.T_world_obj[:2, 3]))
+            if masks:
+                shares.append(one.visible)
+    assert np.median(told) < 0.5 * np.median(untold)
+    assert np.median(told) < 0.004
+    assert all(0.2 < share < 0.95 for share in shares)
+
+
+def test_an_object_is_found_again_where_it_is_expected_and_where_it_is_not(models):
+    rng = np.random.default_rng(12)
+    for _ in range(5):
+        poses = draw_poses(rng)
+        clear = localise(views_of(poses), models["cup"])
+        for expected in (clear.T_world_obj, se3.from_yaw([0.3, -0.3, clear.T_world_obj[2, 3]], 0.0)):
+            again = localise(views_of(poses), models["cup"], T_expected=expected)
+            assert again.status == "found"
+            assert np.linalg.norm(again.T_world_obj[:3, 3] - clear.T_world_obj[:3, 3]) < 0.002
+
+
+def test_an_object_that_is_gone_is_missed_where_it_should_be_seen(models):
+    rng = np.random.default_rng(13)
+    poses = draw_poses(rng)
+    clear = localise(views_of(poses), models["cup"])
+    without = views_of({name: T for name, T in poses.items() if name != "cup"})
+    gone = localise(without, models["cup"], T_expected=clear.T_world_obj)
+    assert gone.status == "not_found"
+    assert gone.visible > 0.9
+    everything = {camera: np.ones((160, 160), bool) for camera in without}
+    assert localise(without, models["cup"], hidden=everything, T_expected=clear.T_world_obj).visible == 0.0
