@@ -1,7 +1,8 @@
-"""Every segmentation backend with a scene to look at: what the contract's test needs of each."""
+"""Every segmentation backend with a scene to look at, each made once a process."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import cache
 
 import numpy as np
 from tests.perception.drawn_world import SHAPES, TABLE, demonstration, draw_poses, render, views_of
@@ -57,6 +58,7 @@ def scene() -> Views:
     return labelled(draw_poses(np.random.default_rng(7)))
 
 
+@cache
 def shapes() -> Backend:
     """Objects known by their colours and shapes."""
     rng = np.random.default_rng(1)
@@ -65,6 +67,7 @@ def shapes() -> Backend:
     return Backend(segmenter, scene(), segmenter, without_objects())
 
 
+@cache
 def patches() -> Backend:
     """Objects known by patches of the images."""
     rng = np.random.default_rng(1)
@@ -73,6 +76,7 @@ def patches() -> Backend:
     return Backend(segmenter, labelled(still_poses(rng)), segmenter, without_objects())
 
 
+@cache
 def sam3() -> Backend:
     """SAM 3 with random weights; it sees something everywhere, unless it asks for certainty."""
     tiny = tiny_models.sam3()
@@ -80,6 +84,7 @@ def sam3() -> Backend:
     return Backend(seeing, scene(), Sam3Segmenter(tiny.model, tiny.processor, 1.0), without_objects())
 
 
+@cache
 def grounded_sam2() -> Backend:
     """Grounding DINO and SAM 2.1 with random weights, likewise."""
     detector, masks = tiny_models.grounding_dino(), tiny_models.sam2()
@@ -88,6 +93,7 @@ def grounded_sam2() -> Backend:
     return Backend(seeing, scene(), GroundedSam2Segmenter(*parts, min_confidence=1.0), without_objects())
 
 
+@cache
 def given() -> Backend:
     """Masks in the views."""
     segmenter = GivenSegmenter(LABELS)
