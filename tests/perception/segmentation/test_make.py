@@ -1,5 +1,8 @@
 """Choosing a backend by its name."""
 
+import subprocess
+import sys
+
 import pytest
 from tests.perception.segmentation import tiny_models
 
@@ -21,6 +24,14 @@ def folders(tmp_path_factory):
         tiny.model.save_pretrained(saved[name])
         tiny.processor.save_pretrained(saved[name])
     return saved
+
+
+def test_nothing_heavy_is_imported_before_it_is_needed():
+    code = (
+        "import sys; from lerobot_openspm.perception.segmentation.make import make_segmenter; "
+        "make_segmenter('given', {}, {}); sys.exit(bool({'torch', 'transformers'} & set(sys.modules)))"
+    )
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
 
 
 def test_each_name_makes_its_backend(folders):
