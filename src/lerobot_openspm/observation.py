@@ -54,21 +54,20 @@ class Observation:
         ]
         return zlib.crc32(b"".join(parts))
 
-    def views(
-        self, cameras: Mapping[str, Camera], strict: bool = True
-    ) -> tuple[dict[str, View], dict[str, str]]:
+    def views(self, cameras: Mapping[str, Camera]) -> dict[str, View]:
         """Images of the calibrated cameras with the cameras' present poses, depths and labels.
-
-        Args:
-            cameras: The calibration.
-            strict: Whether a camera without a usable image is an error.
-
-        Returns:
-            Views by camera, and why there is none for the others.
 
         Raises:
             ObservationError: A calibrated camera is missing, or its image is no finite RGB picture, or its
-                masks or depth do not fit it; only if strict.
+                masks or depth do not fit it.
+            CalibrationError: An image has another shape than the calibration.
+        """
+        return {key: self._view(key, camera) for key, camera in cameras.items()}
+
+    def usable_views(self, cameras: Mapping[str, Camera]) -> tuple[dict[str, View], dict[str, str]]:
+        """Views of the cameras that have one, and what is wrong with the others.
+
+        Raises:
             CalibrationError: An image has another shape than the calibration.
         """
         views, absent = {}, {}
@@ -76,8 +75,6 @@ class Observation:
             try:
                 views[key] = self._view(key, camera)
             except ObservationError as error:
-                if strict:
-                    raise
                 absent[key] = str(error)
         return views, absent
 

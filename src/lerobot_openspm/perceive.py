@@ -52,8 +52,10 @@ class Eyes:
         """
         if self.experience.perception == "oracle":
             return Sighting(self._simulator_poses(observation, names), {})
-        views, absent = observation.views(self.experience.cameras, strict=not self._has_looked)
-        self._has_looked = True
+        if not self._has_looked:  # a camera that never worked is a mistake in the set-up
+            observation.views(self.experience.cameras)
+            self._has_looked = True
+        views, absent = observation.usable_views(self.experience.cameras)
         T_world_ee = observation.hand.T_world_ee
         faults = self._watch.check(views, absent, T_world_ee, time_s)
         good = {camera: view for camera, view in views.items() if camera not in faults}
