@@ -191,6 +191,11 @@ class OpenSPMConfig(PreTrainedConfig):
         """The weights of retrieval."""
         return ScoreWeights(self.weight_semantic, self.weight_geometric, self.weight_quality)
 
+    @property
+    def image_sizes(self) -> dict[str, tuple[int, int]]:
+        """Height and width of every camera's images."""
+        return {key: (int(f.shape[-2]), int(f.shape[-1])) for key, f in self.image_features.items()}
+
     def validate_features(self) -> None:
         """Check that there are images, a state and an action, of the sizes that the layouts name."""
         if not self.image_features:

@@ -21,11 +21,11 @@ from torch import Tensor
 from lerobot_openspm.configuration_openspm import OpenSPMConfig
 from lerobot_openspm.control.row import Knowledge, Row
 from lerobot_openspm.errors import DatasetError, MemoryFormatError
-from lerobot_openspm.experience import FILES, Experience, load_experience, save_experience
+from lerobot_openspm.experience import CAMERAS_JSON, FILES, Experience, load_experience, save_experience
 from lerobot_openspm.flow.condition import CONDITION_DIM, Query, encode, to_world_frame
 from lerobot_openspm.flow.network import VelocityField
 from lerobot_openspm.flow.training_set import TrainingSet
-from lerobot_openspm.geometry.camera import load_cameras
+from lerobot_openspm.geometry.camera import check_sizes, load_cameras
 from lerobot_openspm.observation import Observation, split_batch
 from lerobot_openspm.perceive import Eyes
 from lerobot_openspm.perception.tracker import TrackerSettings
@@ -264,6 +264,8 @@ class OpenSPMPolicy(PreTrainedPolicy):
             )
         if self.config.cameras is not None:
             self.experience = replace(self.experience, cameras=load_cameras(Path(self.config.cameras)))
+        where = self.config.cameras or str(directory / CAMERAS_JSON)
+        check_sizes(self.experience.cameras, self.config.image_sizes, where)
         if dataset_meta is not None:
             if self.config.memory_update != "keep":
                 known = self.experience if self.config.memory_update == "append" else None

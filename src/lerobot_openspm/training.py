@@ -14,7 +14,7 @@ from lerobot_openspm.errors import CalibrationError, DatasetError
 from lerobot_openspm.experience import Experience
 from lerobot_openspm.flow.samples import perturbed, segment_frames
 from lerobot_openspm.flow.training_set import TrainingSet
-from lerobot_openspm.geometry.camera import Camera, load_cameras
+from lerobot_openspm.geometry.camera import Camera, check_sizes, load_cameras
 from lerobot_openspm.memory.robot import RobotModel
 from lerobot_openspm.mining.dataset import Demonstrations
 from lerobot_openspm.mining.mine import (
@@ -69,6 +69,7 @@ def mine_experience(
             "mining needs the cameras' calibration, got none; pass --policy.cameras=FILE, e.g. "
             "configs/cameras/openspm_tabletop.json"
         )
+    check_sizes(cameras, config.image_sizes, config.cameras or "the checkpoint's calibration")
     _compare_rates(dataset_meta, config)
     demonstrations = open_demonstrations(dataset_meta, config)
     episodes = demonstrations.episodes(config.memory_episodes)

@@ -72,6 +72,30 @@ class Camera:
         return self.T_mount_cam if self.mount == "world" else np.asarray(T_world_ee, float) @ self.T_mount_cam
 
 
+def check_sizes(cameras: Mapping[str, Camera], sizes: Mapping[str, tuple[int, int]], where: str) -> None:
+    """Compare a calibration with the images it is for.
+
+    Args:
+        cameras: The calibration.
+        sizes: Height and width of every camera's images, by camera key.
+        where: Names the calibration in errors.
+
+    Raises:
+        CalibrationError: A camera has no images, or images of another aspect ratio.
+    """
+    for key, camera in cameras.items():
+        if key not in sizes:
+            raise CalibrationError(
+                f"{where}: cameras[{key!r}] has no images here, expected one of {', '.join(sorted(sizes))}; "
+                "rename it in the file, or leave it out"
+            )
+        height, width = sizes[key]
+        try:
+            camera.scaled(width, height)
+        except CalibrationError as error:
+            raise CalibrationError(f"{where}: cameras[{key!r}] 'width' and 'height': {error}") from error
+
+
 def project(camera: Camera, T_world_cam: ArrayLike, points_world: ArrayLike) -> tuple[Array, Array]:
     """Project world points into the image.
 
