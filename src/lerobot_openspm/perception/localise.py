@@ -24,6 +24,12 @@ COARSE_CUTS_PX = (30.0, 30.0, 20.0, 12.0)
 FINE_CUTS_PX = (6.0, 4.0, 3.0, 3.0)
 BLOBS_PER_VIEW = 3
 MAX_CANDIDATES = 3
+# A place that so much less of the object's colours suggests than another is no candidate.
+WEAK_SHARE = 0.2
+# A candidate that fits so much worse than another is not worth a finer look.
+POOR_SHARE = 0.7
+# A share of points is told by every so many-th.
+SHARE_STEP = 5
 # An object that is followed: how far from where it is expected it is looked for before everywhere else, and
 # how well it must be seen there for that to be left out.
 NEARBY_CUTS_PX = (12.0, 6.0, 4.0, 3.0)
@@ -155,7 +161,7 @@ def _nearby(model: ObjectModel, T_expected: Array) -> Freedom:
 
 def seen_share(evidence: Sequence[Evidence], cloud: Cloud, T_world_obj: Array) -> float:
     """Share of a model's points that the view that shows it best has in the picture, not hidden."""
-    points = se3.apply(T_world_obj, cloud.points)
+    points = se3.apply(T_world_obj, cloud.points[::SHARE_STEP])
     shares = [0.0]
     for one in evidence:
         uv, depth = project(one.view.camera, one.view.T_world_cam, points)
@@ -173,15 +179,19 @@ def search(evidence: Sequence[Evidence], model: ObjectModel, freedom: Freedom) -
     cloud = Cloud(model.points.astype(float), model.spacing)
     if model.yaw_period == 0:
         freedom = Freedom(freedom.position, freedom.height, 0.0)
-    fits: list[Fit] = []
+    starts = []
     for point in candidates(evidence, model):
-        starts = [
+        turned = [
             fit(evidence, cloud, se3.from_yaw(point, yaw), freedom, COARSE_CUTS_PX, COARSE_PX)
             for yaw in model.search_yaws()
         ]
-        start = max(starts, key=lambda one: one.score)
-        if start.score > 0:
-            fits.append(fit(evidence, cloud, start.T_world_obj, freedom, FINE_CUTS_PX))
+        starts.append(max(turned, key=lambda one: one.score))
+    enough = POOR_SHARE * max((one.score for one in starts), default=0.0)
+    fits = [
+        fit(evidence, cloud, start.T_world_obj, freedom, FINE_CUTS_PX)
+        for start in starts
+        if start.score > 0 and start.score >= enough
+    ]
     fits.sort(key=lambda one: -one.score)
     return _distinct(fits, model.radius)
 
@@ -212,6 +222,7 @@ def candidates(evidence: Sequence[Evidence], model: ObjectModel) -> list[Array]:
             places.append(point)
             strength.append(weight)
     order = np.argsort(-np.array(strength), kind="stable")[:MAX_CANDIDATES]
+    order = [i for i in order if strength[i] >= WEAK_SHARE * max(strength)]
     return [np.array([places[i][0], places[i][1], model.height]) for i in order]
 
 

@@ -68,10 +68,19 @@ def observed_distance(probability: Float32, limit_px: float) -> Float32:
     The soft mask is enlarged before its edge is found: antialiased pixels tell where within them it runs.
     """
     height, width = probability.shape
-    large = np.asarray(cv2.resize(probability, (2 * width, 2 * height), interpolation=cv2.INTER_LINEAR))
-    return np.clip(signed_distance((large > 0.5).astype(np.uint8)) / 2, -limit_px, limit_px).astype(
-        np.float32
-    )
+    distance = np.full((2 * height, 2 * width), -limit_px, np.float32)
+    rows, columns = (np.flatnonzero((probability > 0.5).any(axis)) for axis in (1, 0))
+    if len(rows) == 0:
+        return distance
+    # Further from the mask than the limit there is nothing to compute.
+    margin = int(np.ceil(limit_px)) + 2
+    top, left = max(rows[0] - margin, 0), max(columns[0] - margin, 0)
+    bottom, right = min(rows[-1] + margin + 1, height), min(columns[-1] + margin + 1, width)
+    size = (2 * (right - left), 2 * (bottom - top))
+    large = cv2.resize(probability[top:bottom, left:right], size, interpolation=cv2.INTER_LINEAR)
+    near = signed_distance((np.asarray(large) > 0.5).astype(np.uint8)) / 2
+    distance[2 * top : 2 * bottom, 2 * left : 2 * right] = np.clip(near, -limit_px, limit_px)
+    return distance
 
 
 def draw(
