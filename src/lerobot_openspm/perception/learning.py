@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -15,7 +15,7 @@ from lerobot_openspm.geometry import se3
 from lerobot_openspm.geometry.camera import intersect_plane
 from lerobot_openspm.geometry.se3 import Array
 from lerobot_openspm.perception import colour, seeding, shape
-from lerobot_openspm.perception.blobs import Blob, triangulate
+from lerobot_openspm.perception.blobs import Blob, reach, triangulate
 from lerobot_openspm.perception.fitting import (
     COARSE_PX,
     FINE_PX,
@@ -27,12 +27,14 @@ from lerobot_openspm.perception.fitting import (
     measure,
     score,
 )
+from lerobot_openspm.perception.sightings import touched, whole_mask
 from lerobot_openspm.perception.localise import COARSE_CUTS_PX, FINE_CUTS_PX, prepare
 from lerobot_openspm.perception.model import KnownObject, ObjectModel
 from lerobot_openspm.perception.patch_learning import learn_patches
 from lerobot_openspm.perception.seeding import Picture
 from lerobot_openspm.perception.shape import Posed, Votes
-from lerobot_openspm.perception.types import Scene, View
+from lerobot_openspm.perception.types import Scene, Segmenter, View
+from lerobot_openspm.perception.yaw import yaw_range
 
 log = logging.getLogger(__name__)
 
@@ -58,7 +60,9 @@ CLEAR_VIEW = 0.8
 TRIM_LOSS = 0.0007
 NEAR_YAWS = np.deg2rad([-30.0, -10.0, 10.0, 30.0])
 TURN_GAIN = 0.008
-YAW_MARGIN = np.deg2rad(20)
+
+# One view's evidence, and the patch of it that is the object; None where it was not seen.
+Patched = tuple[Evidence, Blob | None]
 
 
 def learn_objects(
@@ -99,9 +103,34 @@ def learn_object(name: str, scenes: Sequence[Scene], floor: float, rng: Generato
         hinted = sorted(rng.choice(hinted, MAX_SCENES, replace=False).tolist())
     pictures = [picture for i in hinted for picture in _pictures(i, name, scenes[i], floor)]
     log_odds = seeding.learn_colours(pictures)
-    posed, half_size = _first_poses(pictures, log_odds)
+    return _learn_shape(name, log_odds, _coloured(pictures, log_odds), len(hinted))
+
+
+def learn_masked(
+    name: str, scenes: Sequence[Scene], floor: float, segmenter: Segmenter
+) -> ObjectModel | None:
+    """Learn an object's shape from a segmenter's masks; None, with a warning, if in vain."""
+    hinted = [i for i, scene in enumerate(scenes) if any(hint.name == name for hint in scene.hints)]
+    hinted = hinted[:: max(1, -(-len(hinted) // MAX_SCENES))]
+    groups: dict[int, list[Patched]] = {}
+    for i in hinted:
+        hints = [hint for hint in scenes[i].hints if hint.name == name]
+        found = segmenter.segment(scenes[i].views, [name])[name]
+        seen = touched(scenes[i].views, found, hints, floor)
+        groups[i] = []
+        for camera, view in scenes[i].views.items():
+            blob = whole_mask(seen[camera].mask) if camera in seen else None
+            mask = np.zeros(view.image.shape[:2], bool) if blob is None else blob.mask
+            groups[i].append((Evidence(view, mask.astype(np.float32), None, camera), blob))
+    return _learn_shape(name, None, groups, len(hinted))
+
+
+def _learn_shape(
+    name: str, log_odds: NDArray[np.float32] | None, groups: Mapping[int, list[Patched]], count: int
+) -> ObjectModel | None:
+    posed, half_size = _first_poses(groups)
     if not posed:
-        log.warning("perception: %r was not found near the hints of its %d demonstrations", name, len(hinted))
+        log.warning("perception: %r was not found near the hints of its %d demonstrations", name, count)
         return None
     found = _bootstrap(posed, half_size)
     if found is None:
@@ -123,14 +152,19 @@ def _pictures(index: int, name: str, scene: Scene, floor: float) -> list[Picture
     ]  # fmt: skip
 
 
-def _first_poses(pictures: Sequence[Picture], log_odds: NDArray[np.float32]) -> tuple[list[Posed], float]:
-    """Places from the patches' centres, at one height and yaw 0, and half the size of a cube around them."""
+def _coloured(pictures: Sequence[Picture], log_odds: NDArray[np.float32]) -> dict[int, list[Patched]]:
+    """By scene, each view's foreground by colour and the patch that the hints point at."""
     visible = seeding.hiding_pixels(pictures, log_odds)
-    groups: dict[int, list[tuple[Evidence, Blob | None]]] = {}
+    groups: dict[int, list[Patched]] = {}
     for picture in pictures:
         probability = colour.foreground(picture.bins, log_odds)
         evidence = Evidence(picture.view, probability, visible.get(picture.camera), picture.camera)
         groups.setdefault(picture.scene, []).append((evidence, seeding.hinted_blob(picture, log_odds)))
+    return groups
+
+
+def _first_poses(groups: Mapping[int, list[Patched]]) -> tuple[list[Posed], float]:
+    """Places from the patches' centres, at one height and yaw 0, and half the size of a cube around them."""
     places: dict[int, Array] = {}
     singles: dict[int, tuple[View, Blob]] = {}
     sizes: list[float] = []
@@ -142,7 +176,7 @@ def _first_poses(pictures: Sequence[Picture], log_odds: NDArray[np.float32]) -> 
             point, gap = triangulate([view for view, _ in seen], [blob.centre for _, blob in seen])
             if gap < MAX_RAY_GAP:
                 places[index] = point
-                sizes += [_reach(view, blob, point) for view, blob in seen]
+                sizes += [reach(view, blob, point) for view, blob in seen]
         elif seen:
             singles[index] = seen[0]
     if not places:
@@ -155,13 +189,6 @@ def _first_poses(pictures: Sequence[Picture], log_odds: NDArray[np.float32]) -> 
         for i, point in sorted(places.items())
     ]
     return posed, 1.25 * float(np.median(sizes))
-
-
-def _reach(view: View, blob: Blob, point_world: Array) -> float:
-    """Distance in metres, at a point's depth, from a patch's centre to its furthest pixel."""
-    v, u = np.nonzero(blob.mask)
-    distance = float(np.linalg.norm(point_world - view.T_world_cam[:3, 3]))
-    return float(np.hypot(u - blob.centre[0], v - blob.centre[1]).max()) * distance / view.camera.focal_px
 
 
 def _bootstrap(posed: list[Posed], half_size: float) -> tuple[Cloud, list[Posed]] | None:
@@ -220,7 +247,7 @@ def _aligned_axis(
     Where the object hardly turns between scenes, places that are all off by the same few millimetres yield
     nearly as good a hull, and refitting corrects them too slowly; so the displacement is searched for.
     """
-    _, halfwidth = _yaw_range(np.array([se3.yaw_of(scene.T_world_obj) for scene in posed]), 2 * np.pi)
+    _, halfwidth = yaw_range(np.array([se3.yaw_of(scene.T_world_obj) for scene in posed]), 2 * np.pi)
     if halfwidth > NARROW_YAW:
         return posed
     worth_asking = shape.around(cloud, half_size)
@@ -250,7 +277,7 @@ def _symmetrise(
     posed: list[Posed], half_size: float, cloud: Cloud, limits: tuple[float, float]
 ) -> tuple[Cloud, list[Posed], float]:
     """The most symmetric shape that explains the masks as well as the free one, poses and yaw period."""
-    _, halfwidth = _yaw_range(np.array([se3.yaw_of(scene.T_world_obj) for scene in posed]), 2 * np.pi)
+    _, halfwidth = yaw_range(np.array([se3.yaw_of(scene.T_world_obj) for scene in posed]), 2 * np.pi)
     free = float(
         np.mean([one.score for one in (_refit(scene, cloud, 2 * np.pi) for scene in _reliable(posed, cloud))])
     )
@@ -366,7 +393,7 @@ def _model(
     name: str, log_odds: NDArray[np.float32], cloud: Cloud, posed: list[Posed], period: float, scores: Array
 ) -> ObjectModel:
     """Put the frame at the footprint's centre, x along its long side; summarise the demonstrations."""
-    centre, turn = shape.footprint(cloud.points)
+    centre, turn, _ = shape.footprint(cloud.points)
     bottom = float(cloud.points[:, 2].min()) - cloud.spacing / 2
     turn = 0.0 if period == 0 else turn
     T_old_new = se3.from_yaw([*centre, bottom], turn)
@@ -374,23 +401,9 @@ def _model(
     yaws = (
         np.array([se3.yaw_of(scene.T_world_obj) for scene in posed])[scores > 0.8 * np.median(scores)] + turn
     )
-    yaw_centre, halfwidth = _yaw_range(yaws, period)
+    yaw_centre, halfwidth = yaw_range(yaws, period)
     height = float(np.median([scene.T_world_obj[2, 3] for scene in posed])) + bottom
     return ObjectModel(
         name, log_odds, points.astype(np.float32), cloud.spacing, height, period, yaw_centre, halfwidth,
         float(np.median(scores)),
     )  # fmt: skip
-
-
-def _yaw_range(yaws: Array, period: float) -> tuple[float, float]:
-    """Middle and half width of the yaws to search: the period, or the part the demonstrations kept to."""
-    if period == 0:
-        return 0.0, 0.0
-    ordered = np.sort(np.mod(yaws, period))
-    gaps = np.diff(np.append(ordered, ordered[0] + period))
-    widest = int(gaps.argmax())
-    halfwidth = (period - gaps[widest]) / 2
-    centre = float(se3.wrap_angle(ordered[(widest + 1) % len(ordered)] + halfwidth, 2 * np.pi))
-    if halfwidth > 0.2 * period:
-        return centre, period / 2
-    return centre, float(min(halfwidth + YAW_MARGIN, period / 2))

@@ -14,18 +14,16 @@ from lerobot_openspm.geometry.camera import intersect_plane
 from lerobot_openspm.geometry.se3 import Array
 from lerobot_openspm.perception import colour
 from lerobot_openspm.perception.blobs import find_blobs
-from lerobot_openspm.perception.fitting import COARSE_PX, Cloud, Evidence, Fit, Freedom, fit
+from lerobot_openspm.perception.fitting import COARSE_PX, Cloud, Evidence, Fit, Freedom, fit, verdict
 from lerobot_openspm.perception.model import KnownObject, ObjectModel, PatchModel
 from lerobot_openspm.perception.patches import localise_patches
 from lerobot_openspm.perception.types import UNKNOWN_YAW_STD, PoseEstimate, View
+from lerobot_openspm.perception.yaw import canonical
 
 COARSE_CUTS_PX = (30.0, 30.0, 20.0, 12.0)
 FINE_CUTS_PX = (6.0, 4.0, 3.0, 3.0)
 BLOBS_PER_VIEW = 3
 MAX_CANDIDATES = 3
-# Relative to the overlap that is typical of the object's demonstrations.
-FOUND_CONFIDENCE = 0.5
-RIVAL_SHARE = 0.93
 
 
 @dataclass(frozen=True)
@@ -83,15 +81,13 @@ def localise(
     if not fits:
         return PoseEstimate("not_found", np.eye(4), _ignorance(), 0.0, masks)
     best = fits[0]
-    confidence = float(np.clip(best.score / max(model.typical_overlap, 1e-3), 0, 1))
-    status = "found" if confidence >= FOUND_CONFIDENCE else "not_found"
-    if status == "found" and len(fits) > 1 and fits[1].score > RIVAL_SHARE * best.score:
-        status = "ambiguous"
+    status, confidence = verdict([one.score for one in fits], model.typical_overlap)
     covariance = best.covariance.copy()
     if model.yaw_period == 0:
         covariance[3, :] = covariance[:, 3] = 0
         covariance[3, 3] = UNKNOWN_YAW_STD**2
-    return PoseEstimate(status, canonical(best.T_world_obj, model), covariance, confidence, masks)
+    T_world_obj = canonical(best.T_world_obj, model.yaw_period, model.yaw_centre)
+    return PoseEstimate(status, T_world_obj, covariance, confidence, masks)
 
 
 def search(evidence: Sequence[Evidence], model: ObjectModel, freedom: Freedom) -> list[Fit]:
@@ -139,14 +135,6 @@ def candidates(evidence: Sequence[Evidence], model: ObjectModel) -> list[Array]:
             strength.append(weight)
     order = np.argsort(-np.array(strength), kind="stable")[:MAX_CANDIDATES]
     return [np.array([places[i][0], places[i][1], model.height]) for i in order]
-
-
-def canonical(T_world_obj: Array, model: ObjectModel) -> Array:
-    """The same pose with its yaw brought to within half a period of the demonstrations' middle yaw."""
-    if model.yaw_period == 0:
-        return se3.from_yaw(T_world_obj[:3, 3], 0.0)
-    turn = se3.wrap_angle(se3.yaw_of(T_world_obj) - model.yaw_centre, model.yaw_period)
-    return se3.from_yaw(T_world_obj[:3, 3], model.yaw_centre + turn)
 
 
 def _distinct(fits: list[Fit], radius: float) -> list[Fit]:
