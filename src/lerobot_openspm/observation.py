@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import zlib
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -18,6 +18,7 @@ from lerobot_openspm.geometry import se3
 from lerobot_openspm.geometry.camera import Camera
 from lerobot_openspm.geometry.layout import VectorLayout
 from lerobot_openspm.geometry.se3 import Array
+from lerobot_openspm.observation_layers import depth_of, find_layers, labels_of
 from lerobot_openspm.perception.types import View
 
 # Named by the environment that gives them: position and quat_wxyz per object (oracle ablation only).
@@ -35,6 +36,7 @@ class Observation:
         images: Images ``(3, H, W)`` by camera, still as tensors: few of them are ever looked at. A
             mapping that makes them when they are asked for will do.
         object_poses: Simulator poses ``(n * 7,)``, or None.
+        layers: Masks and depths ``(1, H, W)`` of some images, see :mod:`lerobot_openspm.observation_layers`.
     """
 
     instruction: str
@@ -42,6 +44,7 @@ class Observation:
     hand: Hand
     images: Mapping[str, torch.Tensor]
     object_poses: Array | None
+    layers: Mapping[str, torch.Tensor] = field(default_factory=dict)
 
     def fingerprint(self) -> int:
         """A number that tells this observation from others, by its state and images."""
@@ -52,10 +55,11 @@ class Observation:
         return zlib.crc32(b"".join(parts))
 
     def views(self, cameras: Mapping[str, Camera]) -> dict[str, View]:
-        """Images of the calibrated cameras with the cameras' present poses.
+        """Images of the calibrated cameras with the cameras' present poses, depths and labels.
 
         Raises:
-            ObservationError: A calibrated camera is missing, or its image is no finite RGB picture.
+            ObservationError: A calibrated camera is missing, or its image is no finite RGB picture, or its
+                masks or depth do not fit it.
             CalibrationError: An image has another shape than the calibration.
         """
         views = {}
@@ -67,7 +71,9 @@ class Observation:
                 )
             image = _as_uint8(self.images[key], key)
             scaled = camera.scaled(image.shape[1], image.shape[0])
-            views[key] = View(image, scaled, scaled.T_world_cam(self.hand.T_world_ee))
+            size = image.shape[:2]
+            depth, labels = depth_of(self.layers, key, size), labels_of(self.layers, key, size)
+            views[key] = View(image, scaled, scaled.T_world_cam(self.hand.T_world_ee), depth, labels)
         return views
 
     def simulator_layout(self, names: Sequence[str]) -> dict[str, Array]:
@@ -123,6 +129,7 @@ def split_batch(batch: Mapping[str, Any], state_layout: VectorLayout) -> list[Ob
     images = {
         k: v for k, v in batch.items() if k.startswith("observation.image") and isinstance(v, torch.Tensor)
     }
+    layers = find_layers(batch, len(states))
     poses = batch[OBJECT_POSES].detach().cpu().numpy().astype(float) if OBJECT_POSES in batch else None
     return [
         Observation(
@@ -131,6 +138,7 @@ def split_batch(batch: Mapping[str, Any], state_layout: VectorLayout) -> list[Ob
             hand=Hand(T_world_ee[i], float(openings[i])),
             images={key: value[i] for key, value in images.items()},
             object_poses=None if poses is None else poses[i],
+            layers={key: value[i] for key, value in layers.items()},
         )
         for i in range(len(states))
     ]

@@ -32,6 +32,10 @@ class TabletopEnvConfig(EnvConfig):
     observation_width: int = 256
     # True poses as observation.object_poses: for oracle ablations, never for a policy's reported figure.
     object_poses: bool = False
+    # The simulator's own segmentation as observation.masks.<camera>: for ablations of the segmentation.
+    masks: bool = False
+    # Metres along the optical axis as observation.depth.<camera>, as an aligned depth camera would give.
+    depth: bool = False
     # File to append one JSON line per finished episode to: task, seed, steps, success, status.
     episode_log: str | None = None
     features: dict[str, PolicyFeature] = field(
@@ -52,6 +56,12 @@ class TabletopEnvConfig(EnvConfig):
         if self.object_poses:
             self.features["object_poses"] = PolicyFeature(type=FeatureType.ENV, shape=(OBJECT_POSES_SIZE,))
             self.features_map["object_poses"] = f"{OBS_STR}.object_poses"
+        for kind in [kind for kind, wanted in (("masks", self.masks), ("depth", self.depth)) if wanted]:
+            for name in CAMERA_NAMES:
+                # Not VISUAL: LeRobot expects three channels of those, and compares them with the policy's.
+                layer = PolicyFeature(type=FeatureType.ENV, shape=(1, *shape[:2]))
+                self.features[f"{kind}.{name}"] = layer
+                self.features_map[f"{kind}.{name}"] = f"{OBS_STR}.{kind}.{name}"
 
     @property
     def gym_kwargs(self) -> dict[str, Any]:
@@ -61,6 +71,8 @@ class TabletopEnvConfig(EnvConfig):
             "observation_height": self.observation_height,
             "observation_width": self.observation_width,
             "object_poses": self.object_poses,
+            "masks": self.masks,
+            "depth": self.depth,
             "episode_log": self.episode_log,
         }
 

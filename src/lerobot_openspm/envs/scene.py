@@ -46,6 +46,8 @@ HOME_POSITION = (-0.12, 0.0, 0.40)
 TIMESTEP_S = 0.0025
 
 OBJECT_NAMES = ("bowl", "plate", "box", "bottle", "rack", "cabinet", "stove")
+# Numbers in the simulator's own segmentation; 0 is everything else.
+OBJECT_LABELS = {name: number for number, name in enumerate(OBJECT_NAMES, 1)}
 MOVABLE_NAMES = ("bowl", "plate", "box", "bottle")
 DRAWER_NAMES = ("drawer_bottom", "drawer_middle", "drawer_top")
 CAMERA_NAMES = ("front", "side", "wrist")

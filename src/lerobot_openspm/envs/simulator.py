@@ -67,6 +67,7 @@ class TabletopSimulator:
         self._qpos = {n: int(self.model.joint(n).qposadr[0]) for n in _joint_names()}
         self._dof = {n: int(self.model.joint(n).dofadr[0]) for n in _joint_names()}
         self._hand_bodies = {self._body[n] for n in HAND_BODIES}
+        self._geom_labels = self._label_geoms()
         self._target_position = np.array(scene.HOME_POSITION)
         self._target_rotation = HOME_ROTATION.copy()
 
@@ -188,13 +189,54 @@ class TabletopSimulator:
         Raises:
             RenderingUnavailableError: The OpenGL stack of this machine is incomplete.
         """
+        return np.ascontiguousarray(self._looking_through(camera, height, width).render())
+
+    def render_labels(self, camera: str, height: int, width: int) -> np.ndarray:
+        """Number of the object that each pixel shows, (height, width) int32, as in `scene.OBJECT_LABELS`.
+
+        Drawers and their handles are the cabinet's, the knob is the stove's; 0 is the hand and the room.
+
+        Raises:
+            RenderingUnavailableError: The OpenGL stack of this machine is incomplete.
+        """
+        renderer = self._looking_through(camera, height, width)
+        renderer.enable_segmentation_rendering()
+        try:
+            geoms, kinds = np.moveaxis(renderer.render(), -1, 0)
+        finally:
+            renderer.disable_segmentation_rendering()
+        is_geom = kinds == mujoco.mjtObj.mjOBJ_GEOM
+        return np.where(is_geom, self._geom_labels[np.where(is_geom, geoms, 0)], 0).astype(np.int32)
+
+    def render_depth(self, camera: str, height: int, width: int) -> np.ndarray:
+        """Distance along the optical axis of what each pixel shows, (height, width) float32 metres.
+
+        Raises:
+            RenderingUnavailableError: The OpenGL stack of this machine is incomplete.
+        """
+        renderer = self._looking_through(camera, height, width)
+        renderer.enable_depth_rendering()
+        try:
+            return np.array(renderer.render())
+        finally:
+            renderer.disable_depth_rendering()
+
+    def _looking_through(self, camera: str, height: int, width: int) -> Any:
         renderer = self._renderers.get((height, width))
         if renderer is None:
             renderer = self._renderers[(height, width)] = _make_renderer(self.model, height, width)
             # mujoco shuts EGL down at exit; registered after that hook, this one runs before it.
             atexit.register(_close_at_exit, weakref.ref(self))
         renderer.update_scene(self.data, camera=camera)
-        return np.ascontiguousarray(renderer.render())
+        return renderer
+
+    def _label_geoms(self) -> np.ndarray:
+        """Number of each geom's object, (ngeom,); drawers and knob hang on their objects."""
+        labels = np.zeros(self.model.ngeom, np.int32)
+        roots = self.model.body_rootid[self.model.geom_bodyid]
+        for name, number in scene.OBJECT_LABELS.items():
+            labels[roots == self._body[name]] = number
+        return labels
 
     def close(self) -> None:
         """Free the renderers' OpenGL contexts."""

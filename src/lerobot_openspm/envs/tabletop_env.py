@@ -53,8 +53,11 @@ def axis_angle(rotation: np.ndarray) -> np.ndarray:
 class TabletopEnv(gym.Env):
     """One task on the tabletop.
 
-    Observation: "pixels" (front, side, wrist: upright uint8 RGB), "agent_pos" (8,) float32 as `STATE_NAMES`
-    and, if asked for, "object_poses" (49,) float32, the simulator's true poses, for oracle ablations only.
+    Observation: "pixels" (front, side, wrist: upright uint8 RGB), "agent_pos" (8,) float32 as `STATE_NAMES`.
+    If asked for, also "object_poses" (49,) float32, the simulator's true poses, for oracle ablations only;
+    "masks.<camera>" (1, H, W) int32, the simulator's own segmentation with the numbers of
+    `scene.OBJECT_LABELS`, for ablations of the segmentation only; "depth.<camera>" (1, H, W) float32, metres
+    along the optical axis.
     Action: (7,) in [-1, 1], as in `TabletopSimulator.apply`; 20 actions a second.
     """
 
@@ -67,6 +70,8 @@ class TabletopEnv(gym.Env):
         observation_height: int = 256,
         observation_width: int = 256,
         object_poses: bool = False,
+        masks: bool = False,
+        depth: bool = False,
         episode_log: str | None = None,
         render_mode: str = "rgb_array",
     ) -> None:
@@ -85,6 +90,7 @@ class TabletopEnv(gym.Env):
         self.render_mode = render_mode
         self._size = (observation_height, observation_width)
         self._with_object_poses = object_poses
+        self._with_masks, self._with_depth = masks, depth
         self._episode_log = episode_log
         self._seed: int | None = None
         self._simulator: TabletopSimulator | None = None
@@ -97,6 +103,12 @@ class TabletopEnv(gym.Env):
         }
         if object_poses:
             entries["object_poses"] = spaces.Box(-np.inf, np.inf, (len(OBJECT_POSE_NAMES),), np.float32)
+        layer = (1, *self._size)
+        for name in scene.CAMERA_NAMES:
+            if masks:
+                entries[f"masks.{name}"] = spaces.Box(0, len(scene.OBJECT_NAMES), layer, np.int32)
+            if depth:
+                entries[f"depth.{name}"] = spaces.Box(0, np.inf, layer, np.float32)
         self.observation_space = spaces.Dict(entries)
         self.action_space = spaces.Box(-1.0, 1.0, (len(ACTION_NAMES),), np.float32)
 
@@ -161,6 +173,11 @@ class TabletopEnv(gym.Env):
         }
         if self._with_object_poses:
             observation["object_poses"] = self.object_pose_vector()
+        for name in scene.CAMERA_NAMES:
+            if self._with_masks:
+                observation[f"masks.{name}"] = self.simulator.render_labels(name, *self._size)[None]
+            if self._with_depth:
+                observation[f"depth.{name}"] = self.simulator.render_depth(name, *self._size)[None]
         return observation
 
     def state(self) -> np.ndarray:

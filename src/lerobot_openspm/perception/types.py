@@ -59,15 +59,21 @@ class Segmentation:
 
 
 class Segmenter(Protocol):
-    """Finds objects by phrase in the views of one moment."""
+    """Finds objects by phrase in the views of one moment.
+
+    What is found of a phrase does not depend on the other phrases that are asked for with it.
+    """
 
     def segment(
         self, views: Mapping[str, View], phrases: Sequence[str]
     ) -> dict[str, dict[str, tuple[Segmentation, ...]]]:
-        """By phrase and camera: the instances seen, the most confident first, none where there is none.
+        """By phrase and camera: the instances seen, the most confident first.
+
+        Every phrase and every camera has an entry; it is empty where nothing is seen.
 
         Raises:
             PerceptionError: A phrase that this segmenter cannot know, or a view that lacks what it needs.
+            ObservationError: A view whose image does not fit its camera.
         """
         ...
 
