@@ -12,9 +12,9 @@ from lerobot_openspm.geometry.camera import intersect_plane
 from lerobot_openspm.geometry.se3 import Array
 from lerobot_openspm.perception import fitting
 from lerobot_openspm.perception.box import Box
-from lerobot_openspm.perception.sightings import Instances, Sighting, sightings, whole_mask
 from lerobot_openspm.perception.model import BoxModel
 from lerobot_openspm.perception.outline import OutlineFit, fit_outlines, outline, overlap
+from lerobot_openspm.perception.sightings import Instances, Sighting, sightings, whole_mask
 from lerobot_openspm.perception.types import UNKNOWN_YAW_STD, PoseEstimate, View
 from lerobot_openspm.perception.yaw import canonical
 
@@ -68,7 +68,7 @@ def place(views: Mapping[str, View], sighting: Sighting, model: BoxModel) -> Pla
 
 
 def coverage(views: Mapping[str, View], sighting: Sighting, body: Box) -> float:
-    """How well a body covers the masks, from 0 to 1; views that should show it but have no mask count as 0."""
+    """How well a body covers the masks, from 0 to 1; a view that should show it but does not counts as 0."""
     overlaps = [
         overlap(view, sighting[camera].mask if camera in sighting else None, body)
         for camera, view in views.items()

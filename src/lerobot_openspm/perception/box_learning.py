@@ -12,10 +12,10 @@ from lerobot_openspm.errors import DatasetError
 from lerobot_openspm.geometry import se3
 from lerobot_openspm.perception.box import Box, oriented_box
 from lerobot_openspm.perception.box_finding import place
-from lerobot_openspm.perception.sightings import Instances, Sighting, touched, whole_mask
 from lerobot_openspm.perception.lifting import Lifted, lift, support_height
 from lerobot_openspm.perception.model import BoxModel, box_period
 from lerobot_openspm.perception.outline import OutlineFit, fit_outlines, outline
+from lerobot_openspm.perception.sightings import Instances, Sighting, touched, whole_mask
 from lerobot_openspm.perception.types import Scene, Segmenter, View
 from lerobot_openspm.perception.yaw import yaw_range
 
@@ -24,8 +24,8 @@ log = logging.getLogger(__name__)
 MAX_SCENES = 30
 # Rays through the centres of one object's masks miss each other by less than this, metres.
 MAX_RAY_GAP = 0.05
-# Fingers close above the plane that objects stand on; where nothing else tells it, it is taken to lie this far
-# below the lowest point that they ever went to, metres.
+# Fingers close above the plane that objects stand on; where nothing else tells it, it is taken to lie this
+# far below the lowest point that they ever went to, metres.
 BELOW_HINTS_M = 0.02
 
 

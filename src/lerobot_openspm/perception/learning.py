@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
+from typing import Literal, get_args
 
 import numpy as np
 from numpy.random import Generator
@@ -16,6 +17,7 @@ from lerobot_openspm.geometry.camera import intersect_plane
 from lerobot_openspm.geometry.se3 import Array
 from lerobot_openspm.perception import colour, seeding, shape
 from lerobot_openspm.perception.blobs import Blob, reach, triangulate
+from lerobot_openspm.perception.box_learning import learn_boxes
 from lerobot_openspm.perception.fitting import (
     COARSE_PX,
     FINE_PX,
@@ -27,12 +29,12 @@ from lerobot_openspm.perception.fitting import (
     measure,
     score,
 )
-from lerobot_openspm.perception.sightings import touched, whole_mask
 from lerobot_openspm.perception.localise import COARSE_CUTS_PX, FINE_CUTS_PX, prepare
 from lerobot_openspm.perception.model import KnownObject, ObjectModel
 from lerobot_openspm.perception.patch_learning import learn_patches
 from lerobot_openspm.perception.seeding import Picture
 from lerobot_openspm.perception.shape import Posed, Votes
+from lerobot_openspm.perception.sightings import touched, whole_mask
 from lerobot_openspm.perception.types import Scene, Segmenter, View
 from lerobot_openspm.perception.yaw import yaw_range
 
@@ -65,8 +67,16 @@ TURN_GAIN = 0.008
 Patched = tuple[Evidence, Blob | None]
 
 
+Shape = Literal["demonstrations", "box"]
+SHAPES: tuple[Shape, ...] = get_args(Shape)
+
+
 def learn_objects(
-    scenes: Sequence[Scene], rng: Generator, known: Collection[KnownObject] = ()
+    scenes: Sequence[Scene],
+    rng: Generator,
+    known: Collection[KnownObject] = (),
+    segmenter: Segmenter | None = None,
+    shape_source: Shape = "demonstrations",
 ) -> dict[str, KnownObject]:
     """Learn every object that some scene hints at.
 
@@ -74,6 +84,9 @@ def learn_objects(
         scenes: First frames and hints of the demonstrations of all tasks.
         rng: Chooses among the demonstrations of an object where there are more than needed.
         known: Objects that are known already; none of the new ones is one of them.
+        segmenter: Finds the objects' masks; by default the demonstrations teach their colours and patches.
+        shape_source: With a segmenter, "box" learns the boxes around the objects and "demonstrations" their
+            shapes; without one, there is only the latter.
 
     Returns:
         Models by name. An object that cannot be learned (never visible, no consistent colour) is left out,
@@ -87,7 +100,12 @@ def learn_objects(
         raise DatasetError(
             "no demonstration shows a grasp, contact or release; perception has nothing to learn from"
         )
+    if segmenter is not None and shape_source == "box":
+        return {**learn_boxes(names, scenes, segmenter)}
     floor = min(float(hint.point_world[2]) for scene in scenes for hint in scene.hints) - 0.02
+    if segmenter is not None:
+        masked = {name: learn_masked(name, scenes, floor, segmenter) for name in names}
+        return {name: model for name, model in masked.items() if model is not None}
     models: dict[str, KnownObject] = {**learn_patches(names, scenes, known)}
     for name in names:
         model = models.get(name) or learn_object(name, scenes, floor, rng)
@@ -390,7 +408,12 @@ def _moved(posed: Sequence[Posed], fits: Sequence[Fit]) -> list[Posed]:
 
 
 def _model(
-    name: str, log_odds: NDArray[np.float32], cloud: Cloud, posed: list[Posed], period: float, scores: Array
+    name: str,
+    log_odds: NDArray[np.float32] | None,
+    cloud: Cloud,
+    posed: list[Posed],
+    period: float,
+    scores: Array,
 ) -> ObjectModel:
     """Put the frame at the footprint's centre, x along its long side; summarise the demonstrations."""
     centre, turn, _ = shape.footprint(cloud.points)

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 
 from lerobot_openspm.errors import ObservationError
 from lerobot_openspm.geometry import se3
@@ -49,8 +49,8 @@ class Lifted:
             hull ("hull"), or where its rays meet the support plane ("plane"): the footprint and its shadow.
         source: What they come from.
         spacing: Distance between neighbouring points, metres.
-        ray_gap_m: Largest distance of the rays through the centres of its whole masks from the point nearest to
-            all; NaN where fewer than two masks end before the image does.
+        ray_gap_m: Largest distance of the rays through the centres of its whole masks from the point nearest
+            to all; NaN where fewer than two masks end before the image does.
         overlaps: By camera, intersection over union of the mask with the points drawn in that view; NaN where
             they are out of sight.
     """
@@ -147,7 +147,7 @@ def support_height(view: View, mask: Mask) -> float | None:
 
 
 def plane_points(view: View, mask: Mask, height: float) -> Array:
-    """Points ``(n, 3)`` where the rays of a mask's pixels meet the plane ``z = height`` ahead of the camera."""
+    """Where the rays of a mask's pixels meet the plane ``z = height`` ahead of the camera ``(n, 3)``."""
     v, u = np.nonzero(mask)
     points = intersect_plane(view.camera, view.T_world_cam, np.stack([u, v], axis=1), height)
     return points[(points - view.T_world_cam[:3, 3]) @ view.T_world_cam[:3, 2] > 0]
@@ -158,7 +158,7 @@ def _settled(points: Array, height: float) -> Array:
     points = points[points[:, 2] > height - BELOW_PLANE_M]
     if len(points) <= NEIGHBOURS:
         return points
-    distances, _ = cKDTree(points).query(points, NEIGHBOURS + 1)
+    distances, _ = KDTree(points).query(points, NEIGHBOURS + 1)
     usual = distances[:, 1:].mean(axis=1)
     return points[usual <= LONELY * np.median(usual)]
 
@@ -199,5 +199,6 @@ def _check_size(name: str, view: View, mask: Mask) -> None:
     for what, array in (("mask", mask), ("depth image", view.depth)):
         if array is not None and array.shape != size:
             raise ObservationError(
-                f"camera {name!r}: {what} of shape {array.shape} with an image of {size}; give both at one size"
+                f"camera {name!r}: {what} of shape {array.shape} with an image of {size}; give both at the "
+                "image's size"
             )

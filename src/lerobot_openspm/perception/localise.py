@@ -1,4 +1,8 @@
-"""Finding a learned object in new images: candidates from colour, poses by aligning silhouettes."""
+"""Finding learned objects in new images, whatever they are known by.
+
+An object known by its shape: candidates from patches of foreground (its colours, or a segmenter's masks),
+poses by aligning silhouettes. Those known by patches or boxes are found in modules of their own.
+"""
 
 from __future__ import annotations
 
@@ -8,16 +12,18 @@ from functools import cached_property
 
 import numpy as np
 
-from lerobot_openspm.errors import ObservationError
+from lerobot_openspm.errors import ObservationError, PerceptionError
 from lerobot_openspm.geometry import se3
 from lerobot_openspm.geometry.camera import intersect_plane
 from lerobot_openspm.geometry.se3 import Array
 from lerobot_openspm.perception import colour
 from lerobot_openspm.perception.blobs import find_blobs
+from lerobot_openspm.perception.box_finding import localise_box
 from lerobot_openspm.perception.fitting import COARSE_PX, Cloud, Evidence, Fit, Freedom, fit, verdict
-from lerobot_openspm.perception.model import KnownObject, ObjectModel, PatchModel
+from lerobot_openspm.perception.model import BoxModel, KnownObject, ObjectModel, PatchModel
 from lerobot_openspm.perception.patches import localise_patches
-from lerobot_openspm.perception.types import UNKNOWN_YAW_STD, PoseEstimate, View
+from lerobot_openspm.perception.sightings import Instances
+from lerobot_openspm.perception.types import UNKNOWN_YAW_STD, PoseEstimate, Segmenter, View
 from lerobot_openspm.perception.yaw import canonical
 
 COARSE_CUTS_PX = (30.0, 30.0, 20.0, 12.0)
@@ -55,8 +61,30 @@ def prepare(view: View) -> Prepared:
     return Prepared(view)
 
 
+def localise_all(
+    views: Mapping[str, View], models: Mapping[str, KnownObject], segmenter: Segmenter | None = None
+) -> dict[str, PoseEstimate]:
+    """Find several objects in the views of one moment; a segmenter is asked once for all of them.
+
+    Args:
+        views: Views by camera name.
+        models: The objects by phrase.
+        segmenter: Finds the masks of objects that were learned from a segmenter's; None if none were.
+
+    Raises:
+        ObservationError: There is no view, or one is malformed.
+        PerceptionError: An object needs a segmenter and there is none, or the segmenter cannot be used.
+    """
+    prepared = {camera: prepare(view) for camera, view in views.items()}
+    instances = segmenter.segment(views, list(models)) if segmenter is not None and models else {}
+    return {name: localise(prepared, model, instances=instances.get(name)) for name, model in models.items()}
+
+
 def localise(
-    views: Mapping[str, View | Prepared], model: KnownObject, freedom: Freedom | None = None
+    views: Mapping[str, View | Prepared],
+    model: KnownObject,
+    freedom: Freedom | None = None,
+    instances: Instances | None = None,
 ) -> PoseEstimate:
     """Find an object in the views of one moment.
 
@@ -66,16 +94,25 @@ def localise(
         freedom: Prior around the start poses; by default the object stands on its support plane, at any place
             and any yaw within the range that its demonstrations showed. An object known by patches is sought
             near its demonstrated places, whatever this says.
+        instances: What a segmenter found of the object's phrase, by camera; for objects that were learned from
+            a segmenter's masks.
 
     Raises:
         ObservationError: There is no view, or one is malformed.
+        PerceptionError: The object was learned from masks, and none are given.
     """
     if not views:
         raise ObservationError("no camera views to look for an object in; pass at least one")
     prepared = [view if isinstance(view, Prepared) else prepare(view) for view in views.values()]
+    plain = {name: one.view for name, one in zip(views, prepared, strict=True)}
     if isinstance(model, PatchModel):
-        return localise_patches({name: one.view for name, one in zip(views, prepared, strict=True)}, model)
-    evidence = [Evidence(one.view, colour.foreground(one.bins, model.log_odds)) for one in prepared]
+        return localise_patches(plain, model)
+    if isinstance(model, BoxModel):
+        return localise_box(plain, model, _required(instances, model.name))
+    if model.log_odds is None:
+        evidence = masked_evidence(plain, _required(instances, model.name))
+    else:
+        evidence = [Evidence(one.view, colour.foreground(one.bins, model.log_odds)) for one in prepared]
     masks = {name: one.probability > 0.5 for name, one in zip(views, evidence, strict=True)}
     fits = search(evidence, model, freedom or Freedom())
     if not fits:
@@ -88,6 +125,26 @@ def localise(
         covariance[3, 3] = UNKNOWN_YAW_STD**2
     T_world_obj = canonical(best.T_world_obj, model.yaw_period, model.yaw_centre)
     return PoseEstimate(status, T_world_obj, covariance, confidence, masks)
+
+
+def masked_evidence(views: Mapping[str, View], instances: Instances) -> list[Evidence]:
+    """Every view with all instances of a phrase as foreground, in the order of the views."""
+    evidence = []
+    for name, view in views.items():
+        mask = np.zeros(view.image.shape[:2], np.float32)
+        for one in instances.get(name, ()):
+            mask[one.mask] = 1.0
+        evidence.append(Evidence(view, mask, camera=name))
+    return evidence
+
+
+def _required(instances: Instances | None, name: str) -> Instances:
+    if instances is None:
+        raise PerceptionError(
+            f"{name!r} was learned from a segmenter's masks, and is to be found without them; give the "
+            "segmenter that it was learned with"
+        )
+    return instances
 
 
 def search(evidence: Sequence[Evidence], model: ObjectModel, freedom: Freedom) -> list[Fit]:

@@ -19,7 +19,7 @@ class ObjectModel:
 
     Attributes:
         name: The noun phrase.
-        log_odds: Foreground log-odds ``(N_BINS,)`` per colour, float32; None where a segmenter gives the masks.
+        log_odds: Foreground log-odds ``(N_BINS,)`` per colour, float32; None where a segmenter finds it.
         points: Surface points ``(n, 3)`` in the object's frame, metres, float32. The frame is upright, its
             origin at the footprint's centre on the support plane.
         spacing: Distance between neighbouring points, metres.
@@ -148,7 +148,7 @@ class BoxModel:
 
     @property
     def box_period(self) -> float:
-        """Angle that turns the box, if not the object, into itself, radians; a box shows no more of its yaw."""
+        """Angle in radians that turns the box, if not the object, into itself: all it shows of the yaw."""
         return 0.0 if self.is_round else box_period(self.size)
 
 

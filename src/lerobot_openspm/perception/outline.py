@@ -81,7 +81,7 @@ def outline(view: View, mask: Mask, confidence: float = 1.0) -> Outline:
     along = corners @ DIRECTIONS.T
     furthest = corners[along.argmax(axis=0)]
     last = np.array([mask.shape[1], mask.shape[0]]) - 1
-    whole = ((furthest > 0) & (furthest < last)).all(axis=1)
+    whole = np.all((furthest > 0) & (furthest < last), axis=1)
     return Outline(view, mask, along.max(axis=0) + BEYOND_CENTRE_PX, whole, confidence)
 
 

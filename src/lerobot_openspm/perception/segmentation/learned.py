@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 
 import numpy as np
+from numpy.typing import NDArray
 
 from lerobot_openspm.errors import PerceptionError
 from lerobot_openspm.geometry.camera import project
@@ -65,11 +66,17 @@ class LearnedSegmenter:
 def _find(views: Mapping[str, Prepared], model: KnownObject) -> dict[str, tuple[Segmentation, ...]]:
     if isinstance(model, PatchModel):
         return _discs({camera: one.view for camera, one in views.items()}, model)
-    return {camera: _blobs(one, model) for camera, one in views.items()}
+    if not isinstance(model, ObjectModel) or model.log_odds is None:
+        raise PerceptionError(
+            f"{model.name!r} was learned from another segmenter's masks, and nothing is known of its colours; "
+            "use that segmenter, or train again with --policy.segmentation=demonstrations"
+        )
+    log_odds = model.log_odds
+    return {camera: _blobs(one, log_odds) for camera, one in views.items()}
 
 
-def _blobs(view: Prepared, model: ObjectModel) -> tuple[Segmentation, ...]:
-    probability = colour.foreground(view.bins, model.log_odds)
+def _blobs(view: Prepared, log_odds: NDArray[np.float32]) -> tuple[Segmentation, ...]:
+    probability = colour.foreground(view.bins, log_odds)
     blobs = find_blobs(probability, MIN_BLOB_PX, MAX_BLOBS)
     if not blobs:
         return ()
