@@ -30,10 +30,10 @@ class LearnedSegmenter:
     the right colour are not surer than the object.
 
     An object known by patches of the images: nothing is known of its outline, but where the patch is found is
-    known to a millimetre or two. The mask is a disc of the patch's size there. Its centre is the point that the
-    pose stands for, and the disc is what was recognised; its rim is not the object's. Refusing instead would
-    leave those objects that hardly moved in the demonstrations without any mask. It is given in the cameras
-    that the patches were looked for in.
+    known to a millimetre or two. The mask is a disc of the patch's size there. Its centre is the point that
+    the pose stands for, and the disc is what was recognised; its rim is not the object's. Refusing instead
+    would leave those objects that hardly moved in the demonstrations without any mask. It is given in the
+    cameras that the patches were looked for in.
 
     Args:
         objects: What was learned, by phrase.
@@ -56,9 +56,9 @@ class LearnedSegmenter:
             if phrase not in self._objects:
                 raise PerceptionError(
                     f"the demonstrations taught no {phrase!r}; they taught "
-                    f"{', '.join(self._objects) or 'nothing'}. Add demonstrations that touch it and train again "
-                    "(lerobot-train --policy.type=openspm), or choose the segmenter sam3 or grounded_sam2, which "
-                    "take any phrase"
+                    f"{', '.join(self._objects) or 'nothing'}. Add demonstrations that touch it and train "
+                    "again (lerobot-train --policy.type=openspm), or choose the segmenter sam3 or "
+                    "grounded_sam2, which take any phrase"
                 )
         return {phrase: _find(prepared, self._objects[phrase]) for phrase in wanted}
 

@@ -50,10 +50,10 @@ def make_segmenter(
         raise PerceptionError(f"there is no segmenter {kind!r}; choose one of {', '.join(SEGMENTERS)}")
     names = tuple(weights) or DEFAULT_WEIGHTS[kind]
     if len(names) != len(DEFAULT_WEIGHTS[kind]):
-        expected = ", ".join(DEFAULT_WEIGHTS[kind]) or "none"
+        usual = ", ".join(DEFAULT_WEIGHTS[kind]) or "none"
         raise PerceptionError(
-            f"the segmenter {kind!r} takes {len(DEFAULT_WEIGHTS[kind])} names of weights, such as {expected}, "
-            f"got {len(names)}: {', '.join(names)}; give as many"
+            f"the segmenter {kind!r} takes {len(DEFAULT_WEIGHTS[kind])} names of weights, got {len(names)}: "
+            f"{', '.join(names)}; give as many as by default: {usual}"
         )
     if kind == "sam3":
         return Sam3Segmenter.from_pretrained(names[0], device)

@@ -85,8 +85,8 @@ def check_complete(report: Mapping[str, Any], name: str) -> None:
             more = f" and {len(keys) - 3} more" if len(keys) > 3 else ""
             raise PerceptionError(
                 f"{name!r} {what} {len(keys)} weights that transformers {transformers.__version__} expects: "
-                f"{', '.join(keys[:3])}{more}; the model would be random there. Install the release that this "
-                f"was tested with: {INSTALL} 'transformers=={TESTED_RELEASE}', or download the weights again: "
+                f"{', '.join(keys[:3])}{more}; the model would be random there. Install the release that was "
+                f"tested: {INSTALL} 'transformers=={TESTED_RELEASE}', or download the weights again: "
                 f"hf download {name} --force-download"
             )
 

@@ -62,10 +62,12 @@ class Sam3Segmenter:
         import torch
 
         _, wanted = check_query(views, phrases)
+        if not wanted:
+            return {}
         found: dict[str, dict[str, tuple[Segmentation, ...]]] = {phrase: {} for phrase in wanted}
         with torch.inference_mode():
             prompts = {phrase: self._encode_text(phrase) for phrase in wanted}
-            for camera, view in views.items() if wanted else ():
+            for camera, view in views.items():
                 encoded = self._encode_image(view)
                 for phrase, prompt in prompts.items():
                     found[phrase][camera] = self._instances(encoded, prompt, view)
