@@ -187,8 +187,8 @@ class OpenSPMConfig(PreTrainedConfig):
             )
         if (self.segmentation == "given") != (self.mask_labels is not None):
             raise ValueError(
-                f"segmentation is {self.segmentation!r}, mask_labels is {self.mask_labels}, expected labels with "
-                "segmentation=given and with nothing else; pass e.g. --policy.segmentation=given "
+                f"segmentation is {self.segmentation!r}, mask_labels is {self.mask_labels}, expected labels "
+                "with segmentation=given and with nothing else; pass e.g. --policy.segmentation=given "
                 """--policy.mask_labels='{"bowl": 1}'"""
             )
         for phrase, number in (self.mask_labels or {}).items():

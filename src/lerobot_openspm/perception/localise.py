@@ -94,8 +94,8 @@ def localise(
         freedom: Prior around the start poses; by default the object stands on its support plane, at any place
             and any yaw within the range that its demonstrations showed. An object known by patches is sought
             near its demonstrated places, whatever this says.
-        instances: What a segmenter found of the object's phrase, by camera; for objects that were learned from
-            a segmenter's masks.
+        instances: What a segmenter found of the object's phrase, by camera; for objects that were learned
+            from a segmenter's masks.
 
     Raises:
         ObservationError: There is no view, or one is malformed.
