@@ -1,9 +1,9 @@
 """Upright boxes around points: the pose and size of an object whose shape nobody learned.
 
 The directions come from the smallest rectangle around the footprint, not from the points' principal axes:
-what is seen from one side is two faces of a box, whose principal axis is its diagonal. Where the top is not seen
-either, the footprint is a right angle, around which the rectangle along the diagonal is just as small as that
-along the faces; then the points decide, which lie near the sides of the right one.
+what is seen from one side is two faces of a box, whose principal axis is its diagonal. Where the top is not
+seen either, the footprint is a right angle, around which the rectangle along the diagonal is just as small as
+that along the faces; then the points decide, which lie near the sides of the right one.
 """
 
 from __future__ import annotations
@@ -54,7 +54,9 @@ def oriented_box(points_world: Array, height: float) -> Box:
     """The box on the plane ``z = height`` with the smallest footprint around points ``(n, 3)``."""
     centre, yaw, sides = shape.footprint(points_world)
     rival = _rival(points_world[:, :2], yaw, sides)
-    if rival is not None and _hollowness(points_world, *rival) < _hollowness(points_world, centre, yaw, sides):
+    if rival is not None and _hollowness(points_world, *rival) < _hollowness(
+        points_world, centre, yaw, sides
+    ):
         centre, yaw, sides = rival
     top = max(float(points_world[:, 2].max()) - height, 0.0)
     return Box(se3.from_yaw([*centre, height], np.asarray(yaw)), np.array([*sides, top]))

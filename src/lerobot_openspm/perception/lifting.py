@@ -71,10 +71,12 @@ def lift(views: Mapping[str, View], masks: Mapping[str, Mask], height: float) ->
         height: World z of the plane that it stands on, metres.
 
     Raises:
-        ObservationError: A mask belongs to no view, or a mask or a depth image has another size than the image.
+        ObservationError: A mask belongs to no view, or a mask or a depth image has not the image's size.
     """
     if unknown := sorted(set(masks) - set(views)):
-        raise ObservationError(f"masks of {unknown} but views of {sorted(views)}; give the view of every mask")
+        raise ObservationError(
+            f"masks of {unknown} but views of {sorted(views)}; give the view of every mask"
+        )
     blobs = {}
     for name, mask in masks.items():
         _check_size(name, views[name], mask)
