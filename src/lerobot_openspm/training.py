@@ -45,7 +45,7 @@ def open_demonstrations(dataset_meta: Any, config: OpenSPMConfig) -> Demonstrati
 
 
 def segmenter_of(config: OpenSPMConfig) -> Segmenter | None:
-    """The segmenter that a configuration asks for; None where the demonstrations teach what objects look like.
+    """The segmenter that a configuration asks for; None where the demonstrations teach objects' looks.
 
     Raises:
         PerceptionError: It cannot be used.

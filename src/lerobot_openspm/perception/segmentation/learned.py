@@ -68,8 +68,8 @@ def _find(views: Mapping[str, Prepared], model: KnownObject) -> dict[str, tuple[
         return _discs({camera: one.view for camera, one in views.items()}, model)
     if not isinstance(model, ObjectModel) or model.log_odds is None:
         raise PerceptionError(
-            f"{model.name!r} was learned from another segmenter's masks, and nothing is known of its colours; "
-            "use that segmenter, or train again with --policy.segmentation=demonstrations"
+            f"{model.name!r} was learned from another segmenter's masks, and its colours are not known; use "
+            "that segmenter, or train again with --policy.segmentation=demonstrations"
         )
     log_odds = model.log_odds
     return {camera: _blobs(one, log_odds) for camera, one in views.items()}
