@@ -24,7 +24,7 @@ def faces_seen(box: Box, eye: np.ndarray, rng: np.random.Generator, count: int =
             continue
         points = unit.copy()
         points[:, axis] = sign / 2
-        parts.append(([*points, 0, 0, 0.5]) * box.size)
+        parts.append((points + np.array([0, 0, 0.5])) * box.size)
         areas.append(np.prod(np.delete(box.size, axis)))
     shares = (np.array(areas) / sum(areas) * count).astype(int)
     return se3.apply(box.T_world_obj, np.vstack([p[:n] for p, n in zip(parts, shares, strict=True)]))

@@ -182,7 +182,9 @@ def test_something_quite_different_is_not_found(models, unseen):
 
 def test_what_is_never_seen_near_the_hints_is_left_out(scenes, caplog):
     away = [
-        replace(s, hints=tuple(replace(h, point_world=[*h.point_world, 0, 0.5, 0]) for h in s.hints))
+        replace(
+            s, hints=tuple(replace(h, point_world=h.point_world + np.array([0, 0.5, 0])) for h in s.hints)
+        )
         for s in scenes
     ]
     assert learn_boxes(["block"], away, segmenter()) == {}

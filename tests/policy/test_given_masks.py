@@ -1,6 +1,7 @@
 """From demonstrations to success on the tabletop with masks from a segmenter instead of learned colours."""
 
 import json
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
@@ -42,8 +43,8 @@ def start_labels(tiny_dataset: Path) -> list[dict[str, np.ndarray]]:
     return found
 
 
-@pytest.fixture
-def masked_demonstrations(monkeypatch: pytest.MonkeyPatch, start_labels: list[dict[str, np.ndarray]]) -> None:
+@pytest.fixture(scope="module")
+def masked_demonstrations(start_labels: list[dict[str, np.ndarray]]) -> Iterator[None]:
     """The dataset as if its first frames had been recorded with masks."""
     read = Demonstrations.views
 
@@ -56,30 +57,37 @@ def masked_demonstrations(monkeypatch: pytest.MonkeyPatch, start_labels: list[di
             for key, view in read(self, episode, frame, cameras).items()
         }
 
-    monkeypatch.setattr(Demonstrations, "views", views)
-    return
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr(Demonstrations, "views", views)
+        yield
 
 
-def given_masks(checkpoint: Path, shape: str = "box") -> OpenSPMConfig:
+def given_masks(checkpoint: Path) -> OpenSPMConfig:
     config = PreTrainedConfig.from_pretrained(checkpoint)
     assert isinstance(config, OpenSPMConfig)
-    config.segmentation, config.shape, config.mask_labels = "given", shape, LABELS
+    config.segmentation, config.shape, config.mask_labels = "given", "box", LABELS
     config.cameras, config.memory_update = str(CALIBRATION), "rebuild"
     return config
 
 
-@pytest.fixture
-def policy(
-    checkpoint: Path, tiny_dataset: Path, masked_demonstrations: None, tmp_path: Path
-) -> OpenSPMPolicy:
-    """The trained flow model with a memory mined anew from masks, saved and loaded once."""
+@pytest.fixture(scope="module")
+def mined(
+    checkpoint: Path,
+    tiny_dataset: Path,
+    masked_demonstrations: None,
+    tmp_path_factory: pytest.TempPathFactory,
+) -> Path:
+    """A checkpoint with the trained flow model and a memory mined anew from masks."""
+    folder = tmp_path_factory.mktemp("given")
     config, meta = given_masks(checkpoint), LeRobotDatasetMetadata(NAME, root=tiny_dataset)
-    mined = OpenSPMPolicy.from_pretrained(
-        relabelled(checkpoint, tmp_path / "old"), config=config, dataset_meta=meta
-    )
-    mined.save_pretrained(tmp_path / "mined")
-    again = PreTrainedConfig.from_pretrained(tmp_path / "mined")
-    return OpenSPMPolicy.from_pretrained(tmp_path / "mined", config=again)
+    old = relabelled(checkpoint, folder / "old")
+    OpenSPMPolicy.from_pretrained(old, config=config, dataset_meta=meta).save_pretrained(folder / "mined")
+    return folder / "mined"
+
+
+@pytest.fixture
+def policy(mined: Path) -> OpenSPMPolicy:
+    return OpenSPMPolicy.from_pretrained(mined, config=PreTrainedConfig.from_pretrained(mined))
 
 
 def relabelled(checkpoint: Path, copy: Path) -> Path:
@@ -127,16 +135,16 @@ def test_without_masks_in_the_observation_the_option_is_named(policy: OpenSPMPol
         policy.select_action(batch | {"task": [env.task_description]})
 
 
-def test_a_memory_of_masks_is_not_read_as_one_of_colours(policy: OpenSPMPolicy, tmp_path: Path):
-    config = PreTrainedConfig.from_pretrained(tmp_path / "mined")
+def test_a_memory_of_masks_is_not_read_as_one_of_colours(mined: Path):
+    config = PreTrainedConfig.from_pretrained(mined)
     assert isinstance(config, OpenSPMConfig)
-    assert load_experience(tmp_path / "mined").segmentation == "given"
+    assert load_experience(mined).segmentation == "given"
     config.segmentation, config.mask_labels, config.shape = "demonstrations", None, "demonstrations"
     with pytest.raises(MemoryFormatError, match=r"segmentation=given, got --policy\.segmentation=demonstr"):
-        OpenSPMPolicy.from_pretrained(tmp_path / "mined", config=config)
+        OpenSPMPolicy.from_pretrained(mined, config=config)
     config.segmentation, config.mask_labels = "given", LABELS
     with pytest.raises(MemoryFormatError, match=r"shape=box, got --policy\.shape=demonstrations"):
-        OpenSPMPolicy.from_pretrained(tmp_path / "mined", config=config)
+        OpenSPMPolicy.from_pretrained(mined, config=config)
 
 
 def test_a_phrase_without_a_label_is_named(

@@ -13,29 +13,25 @@ from numpy.typing import NDArray
 
 from lerobot_openspm.errors import DatasetError
 from lerobot_openspm.geometry import se3
-from lerobot_openspm.geometry.camera import intersect_plane
 from lerobot_openspm.geometry.se3 import Array
-from lerobot_openspm.perception import colour, seeding, shape
-from lerobot_openspm.perception.blobs import Blob, reach, triangulate
+from lerobot_openspm.perception import seeding, shape
 from lerobot_openspm.perception.box_learning import learn_boxes
+from lerobot_openspm.perception.first_poses import Patched, coloured, first_poses, masked, pictures_of
 from lerobot_openspm.perception.fitting import (
     COARSE_PX,
     FINE_PX,
     Cloud,
-    Evidence,
     Fit,
     Freedom,
     fit,
     measure,
     score,
 )
-from lerobot_openspm.perception.localise import COARSE_CUTS_PX, FINE_CUTS_PX, prepare
+from lerobot_openspm.perception.localise import COARSE_CUTS_PX, FINE_CUTS_PX
 from lerobot_openspm.perception.model import KnownObject, ObjectModel
 from lerobot_openspm.perception.patch_learning import learn_patches
-from lerobot_openspm.perception.seeding import Picture
 from lerobot_openspm.perception.shape import Posed, Votes
-from lerobot_openspm.perception.sightings import touched, whole_mask
-from lerobot_openspm.perception.types import Scene, Segmenter, View
+from lerobot_openspm.perception.types import Scene, Segmenter
 from lerobot_openspm.perception.yaw import yaw_range
 
 log = logging.getLogger(__name__)
@@ -48,8 +44,6 @@ NARROW_YAW = np.deg2rad(60)
 ROUNDS = 4
 SYMMETRY_ROUNDS = 2
 THRESHOLDS = (0.5, 0.6, 0.7, 0.8, 0.9, 0.97)
-# Two rays that are to meet in an object may miss each other by this much, metres.
-MAX_RAY_GAP = 0.05
 # A more symmetric shape is preferred if it explains the masks as well as this.
 SYMMETRY_LOSS = 0.006
 # A yaw read into a round body does more harm than a body with corners taken for round, which costs far more.
@@ -62,9 +56,6 @@ CLEAR_VIEW = 0.8
 TRIM_LOSS = 0.0007
 NEAR_YAWS = np.deg2rad([-30.0, -10.0, 10.0, 30.0])
 TURN_GAIN = 0.008
-
-# One view's evidence, and the patch of it that is the object; None where it was not seen.
-Patched = tuple[Evidence, Blob | None]
 
 
 Shape = Literal["demonstrations", "box"]
@@ -119,9 +110,9 @@ def learn_object(name: str, scenes: Sequence[Scene], floor: float, rng: Generato
     hinted = [i for i, scene in enumerate(scenes) if any(hint.name == name for hint in scene.hints)]
     if len(hinted) > MAX_SCENES:
         hinted = sorted(rng.choice(hinted, MAX_SCENES, replace=False).tolist())
-    pictures = [picture for i in hinted for picture in _pictures(i, name, scenes[i], floor)]
+    pictures = [picture for i in hinted for picture in pictures_of(i, name, scenes[i], floor)]
     log_odds = seeding.learn_colours(pictures)
-    return _learn_shape(name, log_odds, _coloured(pictures, log_odds), len(hinted))
+    return _learn_shape(name, log_odds, coloured(pictures, log_odds), len(hinted))
 
 
 def learn_masked(
@@ -130,23 +121,14 @@ def learn_masked(
     """Learn an object's shape from a segmenter's masks; None, with a warning, if in vain."""
     hinted = [i for i, scene in enumerate(scenes) if any(hint.name == name for hint in scene.hints)]
     hinted = hinted[:: max(1, -(-len(hinted) // MAX_SCENES))]
-    groups: dict[int, list[Patched]] = {}
-    for i in hinted:
-        hints = [hint for hint in scenes[i].hints if hint.name == name]
-        found = segmenter.segment(scenes[i].views, [name])[name]
-        seen = touched(scenes[i].views, found, hints, floor)
-        groups[i] = []
-        for camera, view in scenes[i].views.items():
-            blob = whole_mask(seen[camera].mask) if camera in seen else None
-            mask = np.zeros(view.image.shape[:2], bool) if blob is None else blob.mask
-            groups[i].append((Evidence(view, mask.astype(np.float32), None, camera), blob))
+    groups = {i: masked(name, scenes[i], floor, segmenter) for i in hinted}
     return _learn_shape(name, None, groups, len(hinted))
 
 
 def _learn_shape(
     name: str, log_odds: NDArray[np.float32] | None, groups: Mapping[int, list[Patched]], count: int
 ) -> ObjectModel | None:
-    posed, half_size = _first_poses(groups)
+    posed, half_size = first_poses(groups)
     if not posed:
         log.warning("perception: %r was not found near the hints of its %d demonstrations", name, count)
         return None
@@ -156,57 +138,6 @@ def _learn_shape(
         return None
     cloud, posed = found
     return _model(name, log_odds, *_finish(posed, half_size, cloud))
-
-
-def _pictures(index: int, name: str, scene: Scene, floor: float) -> list[Picture]:
-    hints = tuple(hint for hint in scene.hints if hint.name == name)
-    later = scene.later_views or {}
-    return [
-        Picture(
-            index, key, view, prepare(view).bins,
-            seeding.changed_pixels(view, later[key]) if key in later else None, hints, floor,
-        )
-        for key, view in scene.views.items()
-    ]  # fmt: skip
-
-
-def _coloured(pictures: Sequence[Picture], log_odds: NDArray[np.float32]) -> dict[int, list[Patched]]:
-    """By scene, each view's foreground by colour and the patch that the hints point at."""
-    visible = seeding.hiding_pixels(pictures, log_odds)
-    groups: dict[int, list[Patched]] = {}
-    for picture in pictures:
-        probability = colour.foreground(picture.bins, log_odds)
-        evidence = Evidence(picture.view, probability, visible.get(picture.camera), picture.camera)
-        groups.setdefault(picture.scene, []).append((evidence, seeding.hinted_blob(picture, log_odds)))
-    return groups
-
-
-def _first_poses(groups: Mapping[int, list[Patched]]) -> tuple[list[Posed], float]:
-    """Places from the patches' centres, at one height and yaw 0, and half the size of a cube around them."""
-    places: dict[int, Array] = {}
-    singles: dict[int, tuple[View, Blob]] = {}
-    sizes: list[float] = []
-    for index, group in groups.items():
-        seen = [(one.view, blob) for one, blob in group if blob is not None]
-        # Patches cut off by the image's border have a wrong centre: only if nothing else is left.
-        seen = [(view, blob) for view, blob in seen if blob.whole] or seen
-        if len(seen) >= 2:
-            point, gap = triangulate([view for view, _ in seen], [blob.centre for _, blob in seen])
-            if gap < MAX_RAY_GAP:
-                places[index] = point
-                sizes += [reach(view, blob, point) for view, blob in seen]
-        elif seen:
-            singles[index] = seen[0]
-    if not places:
-        return [], 0.0
-    height = float(np.median([point[2] for point in places.values()]))
-    for index, (view, blob) in singles.items():
-        places[index] = intersect_plane(view.camera, view.T_world_cam, blob.centre, height)
-    posed = [
-        Posed(tuple(one for one, _ in groups[i]), se3.from_yaw([point[0], point[1], height], 0.0))
-        for i, point in sorted(places.items())
-    ]
-    return posed, 1.25 * float(np.median(sizes))
 
 
 def _bootstrap(posed: list[Posed], half_size: float) -> tuple[Cloud, list[Posed]] | None:

@@ -86,23 +86,26 @@ def lift(views: Mapping[str, View], masks: Mapping[str, Mask], height: float) ->
         return None
     seen = {name: views[name] for name in blobs}
     centre, gap = common_point(seen, blobs, height)
-    deep = [name for name, view in seen.items() if view.depth is not None]
-    points, spacing, source = np.empty((0, 3)), 0.0, "depth"
-    if deep:
-        parts = [depth_points(seen[name], blobs[name].mask) for name in deep]
-        points = _settled(np.concatenate(parts), height)
-        spacing = _pixel_m(seen[deep[0]], centre)
-    if len(points) < MIN_POINTS and len(seen) >= 2:
-        source = "hull"
-        points, spacing = _hull(seen, blobs, centre, height)
-    elif len(points) < MIN_POINTS:
-        source = "plane"
-        ((name, view),) = seen.items()
-        points, spacing = plane_points(view, blobs[name].mask, height), _pixel_m(view, centre)
+    points, spacing, source = _points(seen, blobs, centre, height)
     if len(points) < MIN_POINTS:
         return None
-    overlaps = _overlaps(seen, blobs, points, spacing)
-    return Lifted(points, source, spacing, gap, overlaps)  # pyright: ignore[reportArgumentType]
+    return Lifted(points, source, spacing, gap, _overlaps(seen, blobs, points, spacing))
+
+
+def _points(
+    views: Mapping[str, View], blobs: Mapping[str, Blob], centre: Array, height: float
+) -> tuple[Array, float, Source]:
+    """Points ``(n, 3)`` by the best source there is, their spacing, and that source."""
+    deep = [name for name, view in views.items() if view.depth is not None]
+    if deep:
+        parts = [depth_points(views[name], blobs[name].mask) for name in deep]
+        points = _settled(np.concatenate(parts), height)
+        if len(points) >= MIN_POINTS:
+            return points, _pixel_m(views[deep[0]], centre), "depth"
+    if len(views) >= 2:
+        return *_hull(views, blobs, centre, height), "hull"
+    ((name, view),) = views.items()
+    return plane_points(view, blobs[name].mask, height), _pixel_m(view, centre), "plane"
 
 
 def common_point(views: Mapping[str, View], blobs: Mapping[str, Blob], height: float) -> tuple[Array, float]:

@@ -109,10 +109,7 @@ def localise(
         return localise_patches(plain, model)
     if isinstance(model, BoxModel):
         return localise_box(plain, model, _required(instances, model.name))
-    if model.log_odds is None:
-        evidence = masked_evidence(plain, _required(instances, model.name))
-    else:
-        evidence = [Evidence(one.view, colour.foreground(one.bins, model.log_odds)) for one in prepared]
+    evidence = _evidence(plain, prepared, model, instances)
     masks = {name: one.probability > 0.5 for name, one in zip(views, evidence, strict=True)}
     fits = search(evidence, model, freedom or Freedom())
     if not fits:
@@ -125,6 +122,15 @@ def localise(
         covariance[3, 3] = UNKNOWN_YAW_STD**2
     T_world_obj = canonical(best.T_world_obj, model.yaw_period, model.yaw_centre)
     return PoseEstimate(status, T_world_obj, covariance, confidence, masks)
+
+
+def _evidence(
+    views: Mapping[str, View], prepared: Sequence[Prepared], model: ObjectModel, instances: Instances | None
+) -> list[Evidence]:
+    """Every view with the foreground probability of the object's pixels."""
+    if model.log_odds is None:
+        return masked_evidence(views, _required(instances, model.name))
+    return [Evidence(one.view, colour.foreground(one.bins, model.log_odds)) for one in prepared]
 
 
 def masked_evidence(views: Mapping[str, View], instances: Instances) -> list[Evidence]:
