@@ -65,10 +65,15 @@ class HubError(Exception):
 
 
 class LoopbackHub:
-    """The store and its server. `requests` holds "METHOD path" of everything that was asked for."""
+    """The store and its server.
+
+    `requests` holds "METHOD path" of everything that was asked for; `gated` what is answered to whoever asks
+    for a repository's files: 401 without a token, 403 with one that has no access.
+    """
 
     def __init__(self) -> None:
         self.repos: dict[tuple[str, str], Repo] = {}
+        self.gated: dict[str, HTTPStatus] = {}
         self.requests: list[str] = []
         self.lock = threading.Lock()
         handler = type("Handler", (_Handler,), {"hub": self})
@@ -263,6 +268,8 @@ class _Handler(BaseHTTPRequestHandler):
         match self.command, parts:
             case (("GET" | "HEAD"), [owner, name, "resolve", revision, *path]):
                 commit_id, files = self.hub.tree(kind, f"{owner}/{name}", revision)
+                if f"{owner}/{name}" in self.hub.gated:
+                    raise HubError(self.hub.gated[f"{owner}/{name}"], "GatedRepo")
                 content = files.get("/".join(path))
                 if content is None:
                     raise HubError(HTTPStatus.NOT_FOUND, "EntryNotFound")

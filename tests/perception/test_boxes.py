@@ -22,6 +22,7 @@ from lerobot_openspm.perception.box_learning import learn_boxes
 from lerobot_openspm.perception.learning import learn_objects
 from lerobot_openspm.perception.localise import localise, localise_all
 from lerobot_openspm.perception.model import BoxModel, ObjectModel
+from lerobot_openspm.perception.segmentation.learned import LearnedSegmenter
 from lerobot_openspm.perception.sightings import touched
 from lerobot_openspm.perception.types import Hint, Segmentation
 
@@ -221,6 +222,11 @@ def test_a_segmenter_is_asked_once_for_all_objects(models, unseen):
     localise_all(masked_views(unseen[0]), models, Counting())
     localise_all(masked_views(unseen[0]), {}, Counting())
     assert asked == [list(NAMES)]
+
+
+def test_colours_are_not_asked_of_what_was_learned_from_masks(models, unseen):
+    with pytest.raises(PerceptionError, match="'block' was learned from another segmenter's masks.*nothing"):
+        LearnedSegmenter(models).segment(masked_views(unseen[0]), ["block"])
 
 
 def test_what_was_learned_from_masks_is_not_sought_without(models, unseen):

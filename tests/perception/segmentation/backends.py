@@ -1,15 +1,13 @@
-"""Every segmentation backend with a scene to look at: what the contract's test needs of each."""
+"""Every segmentation backend with a scene to look at, each made once a process."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import cache
 
 import numpy as np
 from tests.perception.drawn_world import SHAPES, TABLE, demonstration, draw_poses, render, views_of
 from tests.perception.segmentation import tiny_models
-from tests.perception.test_patches import demonstration as still_demonstration
-from tests.perception.test_patches import poses as still_poses
 
-from lerobot_openspm.geometry import se3
 from lerobot_openspm.perception.learning import learn_objects
 from lerobot_openspm.perception.segmentation.given import GivenSegmenter
 from lerobot_openspm.perception.segmentation.grounded_sam2 import GroundedSam2Segmenter
@@ -57,22 +55,16 @@ def scene() -> Views:
     return labelled(draw_poses(np.random.default_rng(7)))
 
 
-def shapes() -> Backend:
-    """Objects known by their colours and shapes."""
+@cache
+def demonstrations() -> Backend:
+    """Objects learned from demonstrations."""
     rng = np.random.default_rng(1)
     objects = learn_objects([demonstration(rng) for _ in range(6)], np.random.default_rng(0))
     segmenter = LearnedSegmenter(objects)
     return Backend(segmenter, scene(), segmenter, without_objects())
 
 
-def patches() -> Backend:
-    """Objects known by patches of the images."""
-    rng = np.random.default_rng(1)
-    objects = learn_objects([still_demonstration(rng) for _ in range(8)], np.random.default_rng(0))
-    segmenter = LearnedSegmenter(objects)
-    return Backend(segmenter, labelled(still_poses(rng)), segmenter, without_objects())
-
-
+@cache
 def sam3() -> Backend:
     """SAM 3 with random weights; it sees something everywhere, unless it asks for certainty."""
     tiny = tiny_models.sam3()
@@ -80,6 +72,7 @@ def sam3() -> Backend:
     return Backend(seeing, scene(), Sam3Segmenter(tiny.model, tiny.processor, 1.0), without_objects())
 
 
+@cache
 def grounded_sam2() -> Backend:
     """Grounding DINO and SAM 2.1 with random weights, likewise."""
     detector, masks = tiny_models.grounding_dino(), tiny_models.sam2()
@@ -88,6 +81,7 @@ def grounded_sam2() -> Backend:
     return Backend(seeing, scene(), GroundedSam2Segmenter(*parts, min_confidence=1.0), without_objects())
 
 
+@cache
 def given() -> Backend:
     """Masks in the views."""
     segmenter = GivenSegmenter(LABELS)
@@ -95,15 +89,8 @@ def given() -> Backend:
 
 
 BACKENDS: dict[str, Callable[[], Backend]] = {
-    "shapes": shapes,
-    "patches": patches,
+    "demonstrations": demonstrations,
     "sam3": sam3,
     "grounded_sam2": grounded_sam2,
     "given": given,
 }
-
-
-def moved_up(views: Views, metres: float) -> Views:
-    """The same images as seen by cameras that stand higher."""
-    T = se3.transform(np.eye(3), np.array([0, 0, metres]))
-    return {camera: replace(view, T_world_cam=T @ view.T_world_cam) for camera, view in views.items()}

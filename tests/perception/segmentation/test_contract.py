@@ -1,6 +1,5 @@
 """What every segmentation backend owes its caller, whichever it is."""
 
-from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -20,22 +19,9 @@ def one_thread():
     torch.set_num_threads(before)
 
 
-@pytest.fixture(scope="module")
-def make() -> Callable[[str], Backend]:
-    """Make each backend once, when it is first asked for."""
-    made: dict[str, Backend] = {}
-
-    def make(name: str) -> Backend:
-        if name not in made:
-            made[name] = BACKENDS[name]()
-        return made[name]
-
-    return make
-
-
 @pytest.fixture(params=BACKENDS)
-def backend(request: pytest.FixtureRequest, make: Callable[[str], Backend]) -> Backend:
-    return make(request.param)
+def backend(request: pytest.FixtureRequest) -> Backend:
+    return BACKENDS[request.param]()
 
 
 def assert_same(a, b):

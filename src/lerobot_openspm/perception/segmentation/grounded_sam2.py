@@ -14,7 +14,7 @@ import numpy as np
 from lerobot_openspm.errors import PerceptionError
 from lerobot_openspm.geometry.se3 import Array
 from lerobot_openspm.perception.segmentation.instances import check_query, distinct_instances
-from lerobot_openspm.perception.segmentation.pretrained import load_model, load_processor
+from lerobot_openspm.perception.segmentation.pretrained import fetch, load_model, load_processor
 from lerobot_openspm.perception.types import Segmentation, View
 
 DETECTOR_WEIGHTS = "IDEA-Research/grounding-dino-tiny"
@@ -67,11 +67,13 @@ class GroundedSam2Segmenter:
             PerceptionError: transformers, the device or the weights are missing, or a checkpoint lacks some
                 of its weights.
         """
+        finder = fetch(detector, "GroundingDinoForObjectDetection", device)
+        cutter = fetch(masks, "Sam2Model", device)
         return cls(
-            load_model("GroundingDinoForObjectDetection", detector, device),
-            load_processor("GroundingDinoProcessor", detector),
-            load_model("Sam2Model", masks, device),
-            load_processor("Sam2Processor", masks),
+            load_model("GroundingDinoForObjectDetection", finder, device),
+            load_processor("GroundingDinoProcessor", finder),
+            load_model("Sam2Model", cutter, device),
+            load_processor("Sam2Processor", cutter),
         )
 
     def segment(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Generator, Iterator, Mapping
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +12,81 @@ from lerobot_openspm.errors import PerceptionError
 
 INSTALL = "pip install 'lerobot_policy_openspm[perception]'"
 TESTED_RELEASE = "5.5.4"
+# Publishers put the same weights beside them in other formats, among them pickles, which are never read.
+FILES = ("*.json", "*.txt", "*.safetensors")
+
+
+@dataclass(frozen=True)
+class Checkpoint:
+    """A pretrained model on this machine.
+
+    Attributes:
+        name: On the Hugging Face Hub, or a folder.
+        folder: Where its files are.
+    """
+
+    name: str
+    folder: Path
+
+    @property
+    def download_command(self) -> str:
+        """What to type to have its files in the cache."""
+        return f"hf download {self.name} " + " ".join(f"--include '{pattern}'" for pattern in FILES)
+
+
+def fetch(name: str, class_name: str, device: str) -> Checkpoint:
+    """Bring a model's files to this machine; everything else reads them from there.
+
+    All at once, because transformers asks the Hub for one file after the other, and where there is no network
+    waits for half a minute at each, be they in the cache or not.
+
+    Args:
+        name: On the Hugging Face Hub, or a folder.
+        class_name: The class of `transformers` that is to read it, looked for before anything is downloaded.
+        device: Where the model is to run, looked for likewise.
+
+    Raises:
+        PerceptionError: The package or the device is missing, the model does not exist or is given on
+            request only, or it is not in the cache and there is no network.
+    """
+    transformers_class(class_name)
+    check_device(device)
+    if name and Path(name).is_dir():
+        return Checkpoint(name, Path(name))
+    from huggingface_hub import snapshot_download
+
+    with _explained(Checkpoint(name, Path()), class_name):
+        return Checkpoint(name, Path(snapshot_download(name, allow_patterns=list(FILES))))
+
+
+def load_model(class_name: str, checkpoint: Checkpoint, device: str) -> Any:
+    """A pretrained model of `transformers` in evaluation mode, with every one of its weights.
+
+    Raises:
+        PerceptionError: The checkpoint is of something else, is damaged, or lacks weights.
+    """
+    model_class = transformers_class(class_name)
+    with _explained(checkpoint, class_name):
+        if not (checkpoint.folder / "config.json").is_file():
+            # transformers takes a model of the usual size then, and weights of another shape for random ones.
+            raise FileNotFoundError(f"there is no config.json in {checkpoint.folder}")
+        # Weights of another shape are reported like missing ones then, instead of a traceback.
+        model, report = model_class.from_pretrained(
+            checkpoint.folder, output_loading_info=True, ignore_mismatched_sizes=True, use_safetensors=True
+        )
+    _check_complete(report, checkpoint)
+    return model.to(device).eval()
+
+
+def load_processor(class_name: str, checkpoint: Checkpoint) -> Any:
+    """The processor of images and texts that belongs to a pretrained model.
+
+    Raises:
+        PerceptionError: The processor's files are missing or damaged.
+    """
+    processor_class = transformers_class(class_name)
+    with _explained(checkpoint, class_name):
+        return processor_class.from_pretrained(checkpoint.folder)
 
 
 def transformers_class(name: str) -> Any:
@@ -31,66 +107,6 @@ def transformers_class(name: str) -> Any:
         ) from error
 
 
-def load_model(class_name: str, name: str, device: str) -> Any:
-    """A pretrained model in evaluation mode, every one of its weights from the checkpoint.
-
-    Args:
-        class_name: Of `transformers`.
-        name: On the Hugging Face Hub, or a folder.
-        device: As PyTorch names it, such as ``"cpu"`` or ``"cuda"``.
-
-    Raises:
-        PerceptionError: The package, the device or the weights are missing, or the checkpoint lacks weights.
-    """
-    model_class = transformers_class(class_name)
-    check_device(device)
-    with _explained(name, class_name):
-        # Weights of another shape are reported like missing ones then, instead of a traceback.
-        model, report = model_class.from_pretrained(
-            name, output_loading_info=True, ignore_mismatched_sizes=True, use_safetensors=True
-        )
-    check_complete(report, name)
-    return model.to(device).eval()
-
-
-def load_processor(class_name: str, name: str) -> Any:
-    """The processor of images and texts that belongs to a pretrained model.
-
-    Raises:
-        PerceptionError: The package or the processor's files are missing.
-    """
-    processor_class = transformers_class(class_name)
-    with _explained(name, class_name):
-        return processor_class.from_pretrained(name)
-
-
-def check_complete(report: Mapping[str, Any], name: str) -> None:
-    """Refuse a model that was loaded in part: transformers fills gaps with random weights, and only warns.
-
-    Some releases, for example, look for SAM 3's text encoder under names that its checkpoint does not use.
-
-    Args:
-        report: What ``from_pretrained(..., output_loading_info=True)`` tells of the loading.
-        name: The checkpoint's, for the error.
-
-    Raises:
-        PerceptionError: Weights are missing from the checkpoint, or have another shape there.
-    """
-    missing = sorted(report["missing_keys"])
-    mismatched = sorted(key for key, *_ in report["mismatched_keys"])
-    for what, keys in (("lacks", missing), ("has in another shape", mismatched)):
-        if keys:
-            import transformers
-
-            more = f" and {len(keys) - 3} more" if len(keys) > 3 else ""
-            raise PerceptionError(
-                f"{name!r} {what} {len(keys)} weights that transformers {transformers.__version__} expects: "
-                f"{', '.join(keys[:3])}{more}; the model would be random there. Install the release that was "
-                f"tested: {INSTALL} 'transformers=={TESTED_RELEASE}', or download the weights again: "
-                f"hf download {name} --force-download"
-            )
-
-
 def check_device(device: str) -> None:
     """Raise PerceptionError on a device that PyTorch does not have here."""
     import torch
@@ -102,19 +118,43 @@ def check_device(device: str) -> None:
         raise PerceptionError(f"device {device!r} cannot be used: {error}. Use 'cpu'") from error
 
 
+def _check_complete(report: Mapping[str, Any], checkpoint: Checkpoint) -> None:
+    """Refuse a model that was loaded in part: transformers fills gaps with random weights, and only warns.
+
+    Some releases, for example, look for SAM 3's text encoder under names that its checkpoint does not use.
+    """
+    import transformers
+
+    missing = sorted(report["missing_keys"])
+    mismatched = sorted(key for key, *_ in report["mismatched_keys"])
+    for what, keys in (("lacks", missing), ("has in another shape", mismatched)):
+        if keys:
+            more = f" and {len(keys) - 3} more" if len(keys) > 3 else ""
+            raise PerceptionError(
+                f"{checkpoint.name!r} {what} {len(keys)} weights that transformers "
+                f"{transformers.__version__} expects: {', '.join(keys[:3])}{more}; the model would be random "
+                f"there. Install the release that was tested: {INSTALL} 'transformers=={TESTED_RELEASE}'"
+            )
+
+
 @contextmanager
-def _explained(name: str, class_name: str) -> Generator[None]:
+def _explained(checkpoint: Checkpoint, class_name: str) -> Generator[None]:
     """Turn what goes wrong while loading into one PerceptionError that keeps the cause."""
+    from httpx import TransportError
     from safetensors import SafetensorError
 
     try:
         yield
-    # Everything that transformers is known to let through; a mistake of ours, such as a TypeError, stays one.
-    except (OSError, ValueError, RuntimeError, ImportError, KeyError, SafetensorError) as error:
-        raise PerceptionError(_explanation(error, name, class_name)) from error
+    # What the libraries are known to let through; a mistake of ours, such as a TypeError, stays one.
+    except (
+        OSError, ValueError, RuntimeError, ImportError, KeyError, SafetensorError, TransportError
+    ) as error:  # fmt: skip
+        raise PerceptionError(_explanation(error, checkpoint, class_name)) from error
 
 
-def _explanation(error: Exception, name: str, class_name: str) -> str:
+def _explanation(error: Exception, checkpoint: Checkpoint, class_name: str) -> str:
+    from httpx import TransportError
+    from huggingface_hub import constants
     from huggingface_hub.errors import (
         GatedRepoError,
         LocalEntryNotFoundError,
@@ -123,8 +163,8 @@ def _explanation(error: Exception, name: str, class_name: str) -> str:
     )
 
     causes = tuple(_causes(error))
-    page = f"https://huggingface.co/{name}"
-    # A gated repository is to huggingface_hub a special case of one that is not found.
+    name, page = checkpoint.name, f"https://huggingface.co/{checkpoint.name}"
+    # First, for to huggingface_hub a repository that is given on request is a special case of one not found.
     if any(isinstance(cause, GatedRepoError) for cause in causes):
         return (
             f"the weights {name!r} are given on request only. Ask for access at {page}, then log in with a "
@@ -135,22 +175,23 @@ def _explanation(error: Exception, name: str, class_name: str) -> str:
             f"there is no model {name!r} on the Hugging Face Hub that you may see. Check the name at {page}; "
             "if it is private, log in: hf auth login"
         )
-    if any(isinstance(cause, OfflineModeIsEnabled) for cause in causes):
+    unreachable = (LocalEntryNotFoundError, OfflineModeIsEnabled, TransportError)
+    if any(isinstance(cause, unreachable) for cause in causes):
+        why, prefix = "the Hugging Face Hub cannot be reached", ""
+        if constants.HF_HUB_OFFLINE:
+            why, prefix = "HF_HUB_OFFLINE forbids to download it", "HF_HUB_OFFLINE=0 "
         return (
-            f"{name!r} is not wholly in the cache, and HF_HUB_OFFLINE forbids to download it. Once, with a "
-            f"network: HF_HUB_OFFLINE=0 hf download {name}"
+            f"{name!r} is not or not wholly in the cache, and {why}. Once, with a network: "
+            f"{prefix}{checkpoint.download_command}"
         )
-    # LocalEntryNotFoundError comes with the offline mode too, hence last.
-    if any(isinstance(cause, LocalEntryNotFoundError | ConnectionError) for cause in causes):
-        return (
-            f"{name!r} is not wholly in the cache, and the Hugging Face Hub cannot be reached. Once, with a "
-            f"network: hf download {name}"
-        )
-    where = "the folder" if Path(name).is_dir() else "the model"
     return (
-        f"{where} {name!r} is no checkpoint of {class_name}: {str(error).splitlines()[0]}. Give the name of "
-        "one on the Hub, or its folder with config.json and *.safetensors"
+        f"{name!r} is no checkpoint of {class_name}: {_first_line(error)}. Give the name of one on the "
+        "Hugging Face Hub, or a folder with its config.json and *.safetensors"
     )
+
+
+def _first_line(error: Exception) -> str:
+    return (str(error).splitlines() or [type(error).__name__])[0]
 
 
 def _causes(error: BaseException | None) -> Iterator[BaseException]:

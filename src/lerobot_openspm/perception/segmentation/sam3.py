@@ -10,7 +10,7 @@ import numpy as np
 
 from lerobot_openspm.errors import PerceptionError
 from lerobot_openspm.perception.segmentation.instances import check_query, distinct_instances
-from lerobot_openspm.perception.segmentation.pretrained import load_model, load_processor
+from lerobot_openspm.perception.segmentation.pretrained import fetch, load_model, load_processor
 from lerobot_openspm.perception.types import Segmentation, View
 
 WEIGHTS = "facebook/sam3"
@@ -48,7 +48,9 @@ class Sam3Segmenter:
             PerceptionError: transformers, the device, the weights or the permission to use them are missing,
                 or the checkpoint lacks some of the weights.
         """
-        return cls(load_model("Sam3Model", name, device), load_processor("Sam3Processor", name))
+        checkpoint = fetch(name, "Sam3Model", device)
+        model = load_model("Sam3Model", checkpoint, device)
+        return cls(model, load_processor("Sam3Processor", checkpoint))
 
     def segment(
         self, views: Mapping[str, View], phrases: Sequence[str]
