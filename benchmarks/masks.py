@@ -7,7 +7,6 @@ drawn from tuning seeds: these figures chose the method.
 from __future__ import annotations
 
 import json
-import time
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 
@@ -86,24 +85,15 @@ def offsets(models: Mapping[str, KnownObject], scenes: Sequence[tuple[Scene, Tru
 
 def measure(shape: Shape, scenes: Sequence[tuple[Scene, Truth]], cameras: Mapping[str, Camera]) -> dict:
     """Errors per object of one kind of model."""
-    start_s = time.perf_counter()
     models = learn_objects(
         [scene for scene, _ in scenes], np.random.default_rng(0), segmenter=SEGMENTER, shape_source=shape
     )
-    learned_s = time.perf_counter() - start_s
-    T_sim_obj, errors, spent_s = offsets(models, scenes), {name: [] for name in models}, []
+    T_sim_obj, errors = offsets(models, scenes), {name: [] for name in models}
     for views, truth in rendered(range(FIRST_SEED, FIRST_SEED + SCENES), cameras):
-        start_s = time.perf_counter()
-        estimates = localise_all(views, models, SEGMENTER)
-        spent_s.append(time.perf_counter() - start_s)
-        for name, found in estimates.items():
+        for name, found in localise_all(views, models, SEGMENTER).items():
             own = error(truth[name], found.T_world_obj, T_sim_obj[name], TRUE_PERIODS[name])
             errors[name].append(own if found.status == "found" else (np.nan, np.nan))
-    return {
-        "learned_s": round(learned_s, 1),
-        "scene_ms_median": round(1000 * float(np.median(spent_s))),
-        "objects": {name: summary(np.array(rows), TRUE_PERIODS[name]) for name, rows in errors.items()},
-    }
+    return {name: summary(np.array(rows), TRUE_PERIODS[name]) for name, rows in errors.items()}
 
 
 def main() -> dict:

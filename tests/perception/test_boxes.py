@@ -211,7 +211,7 @@ def test_learning_chooses_by_segmenter_and_shape(scenes, unseen):
         assert np.mean(errors) < 0.003
 
 
-def test_a_segmenter_is_asked_once_for_all_objects(models, unseen):
+def test_a_segmenter_is_asked_once_for_all_objects(models, unseen, scenes):
     asked = []
 
     class Counting:
@@ -222,10 +222,12 @@ def test_a_segmenter_is_asked_once_for_all_objects(models, unseen):
     localise_all(masked_views(unseen[0]), models, Counting())
     localise_all(masked_views(unseen[0]), {}, Counting())
     assert asked == [list(NAMES)]
+    learn_boxes(NAMES, scenes[:2], Counting())
+    assert asked == [list(NAMES)] * 3
 
 
 def test_colours_are_not_asked_of_what_was_learned_from_masks(models, unseen):
-    with pytest.raises(PerceptionError, match="'block' was learned from another segmenter's masks.*nothing"):
+    with pytest.raises(PerceptionError, match=r"'block' was learned from another segmenter's masks.*nothing"):
         LearnedSegmenter(models).segment(masked_views(unseen[0]), ["block"])
 
 

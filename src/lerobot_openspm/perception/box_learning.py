@@ -15,13 +15,12 @@ from lerobot_openspm.perception.box_finding import place
 from lerobot_openspm.perception.lifting import Lifted, lift, support_height
 from lerobot_openspm.perception.model import BoxModel, box_period
 from lerobot_openspm.perception.outline import OutlineFit, fit_outlines, outline
-from lerobot_openspm.perception.sightings import Instances, Sighting, touched, whole_mask
+from lerobot_openspm.perception.sightings import Instances, Sighting, segmented, touched, whole_mask
 from lerobot_openspm.perception.types import Scene, Segmenter, View
 from lerobot_openspm.perception.yaw import yaw_range
 
 log = logging.getLogger(__name__)
 
-MAX_SCENES = 30
 # Rays through the centres of one object's masks miss each other by less than this, metres.
 MAX_RAY_GAP = 0.05
 # Fingers close above the plane that objects stand on; where nothing else tells it, it is taken to lie this
@@ -79,15 +78,10 @@ def learn_boxes(phrases: Sequence[str], scenes: Sequence[Scene], segmenter: Segm
             "no object to learn the box of; give the phrases that the demonstrations' hints name"
         )
     floor = floor_of(scenes)
-    seen: dict[str, list[Seen]] = {phrase: [] for phrase in phrases}
-    for scene, names in _chosen(phrases, scenes):
-        found = segmenter.segment(scene.views, names)
-        for name in names:
-            one = _see(scene, name, found.get(name, {}), floor)
-            if one is not None:
-                seen[name].append(one)
     models = {}
-    for phrase, ones in seen.items():
+    for phrase, pairs in segmented(phrases, scenes, segmenter).items():
+        seen = [_see(scene, phrase, found, floor) for scene, found in pairs]
+        ones = [one for one in seen if one is not None]
         if ones:
             models[phrase] = _learn(phrase, ones, floor)
         else:
@@ -99,16 +93,6 @@ def floor_of(scenes: Sequence[Scene]) -> float:
     """World height, metres, below which nothing that the hand touched can stand."""
     heights = [float(hint.point_world[2]) for scene in scenes for hint in scene.hints]
     return min(heights, default=0.0) - BELOW_HINTS_M
-
-
-def _chosen(phrases: Sequence[str], scenes: Sequence[Scene]) -> list[tuple[Scene, list[str]]]:
-    """The scenes to look at and the phrases to look for in each; at most so many scenes a phrase."""
-    wanted: dict[int, list[str]] = {}
-    for phrase in phrases:
-        hinted = [i for i, scene in enumerate(scenes) if any(hint.name == phrase for hint in scene.hints)]
-        for i in hinted[:: -(-len(hinted) // MAX_SCENES) or 1]:
-            wanted.setdefault(i, []).append(phrase)
-    return [(scenes[i], names) for i, names in sorted(wanted.items())]
 
 
 def _see(scene: Scene, name: str, instances: Instances, floor: float) -> Seen | None:

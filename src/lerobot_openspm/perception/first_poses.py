@@ -16,8 +16,8 @@ from lerobot_openspm.perception.fitting import Evidence
 from lerobot_openspm.perception.localise import prepare
 from lerobot_openspm.perception.seeding import Picture
 from lerobot_openspm.perception.shape import Posed
-from lerobot_openspm.perception.sightings import touched, whole_mask
-from lerobot_openspm.perception.types import Scene, Segmenter, View
+from lerobot_openspm.perception.sightings import Instances, touched, whole_mask
+from lerobot_openspm.perception.types import Scene, View
 
 # Two rays that are to meet in an object may miss each other by this much, metres.
 MAX_RAY_GAP = 0.05
@@ -50,10 +50,10 @@ def coloured(pictures: Sequence[Picture], log_odds: NDArray[np.float32]) -> dict
     return groups
 
 
-def masked(name: str, scene: Scene, floor: float, segmenter: Segmenter) -> list[Patched]:
+def masked(name: str, scene: Scene, floor: float, instances: Instances) -> list[Patched]:
     """Each view's foreground by a segmenter: the instance that the hand touched, or nothing."""
     hints = [hint for hint in scene.hints if hint.name == name]
-    seen = touched(scene.views, segmenter.segment(scene.views, [name])[name], hints, floor)
+    seen = touched(scene.views, instances, hints, floor)
     group: list[Patched] = []
     for camera, view in scene.views.items():
         blob = whole_mask(seen[camera].mask) if camera in seen else None

@@ -31,6 +31,7 @@ from lerobot_openspm.perception.localise import COARSE_CUTS_PX, FINE_CUTS_PX
 from lerobot_openspm.perception.model import KnownObject, ObjectModel
 from lerobot_openspm.perception.patch_learning import learn_patches
 from lerobot_openspm.perception.shape import Posed, Votes
+from lerobot_openspm.perception.sightings import segmented
 from lerobot_openspm.perception.types import Scene, Segmenter
 from lerobot_openspm.perception.yaw import yaw_range
 
@@ -95,8 +96,7 @@ def learn_objects(
         return {**learn_boxes(names, scenes, segmenter)}
     floor = min(float(hint.point_world[2]) for scene in scenes for hint in scene.hints) - 0.02
     if segmenter is not None:
-        masked = {name: learn_masked(name, scenes, floor, segmenter) for name in names}
-        return {name: model for name, model in masked.items() if model is not None}
+        return _learn_masked(names, scenes, floor, segmenter)
     models: dict[str, KnownObject] = {**learn_patches(names, scenes, known)}
     for name in names:
         model = models.get(name) or learn_object(name, scenes, floor, rng)
@@ -115,14 +115,16 @@ def learn_object(name: str, scenes: Sequence[Scene], floor: float, rng: Generato
     return _learn_shape(name, log_odds, coloured(pictures, log_odds), len(hinted))
 
 
-def learn_masked(
-    name: str, scenes: Sequence[Scene], floor: float, segmenter: Segmenter
-) -> ObjectModel | None:
-    """Learn an object's shape from a segmenter's masks; None, with a warning, if in vain."""
-    hinted = [i for i, scene in enumerate(scenes) if any(hint.name == name for hint in scene.hints)]
-    hinted = hinted[:: max(1, -(-len(hinted) // MAX_SCENES))]
-    groups = {i: masked(name, scenes[i], floor, segmenter) for i in hinted}
-    return _learn_shape(name, None, groups, len(hinted))
+def _learn_masked(
+    names: Sequence[str], scenes: Sequence[Scene], floor: float, segmenter: Segmenter
+) -> dict[str, KnownObject]:
+    """Shapes of objects from a segmenter's masks."""
+    models: dict[str, KnownObject] = {}
+    for name, pairs in segmented(names, scenes, segmenter).items():
+        groups = {i: masked(name, scene, floor, found) for i, (scene, found) in enumerate(pairs)}
+        if model := _learn_shape(name, None, groups, len(pairs)):
+            models[name] = model
+    return models
 
 
 def _learn_shape(

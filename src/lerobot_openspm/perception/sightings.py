@@ -11,7 +11,7 @@ from lerobot_openspm.geometry.camera import intersect_plane, project
 from lerobot_openspm.geometry.se3 import Array
 from lerobot_openspm.perception.blobs import Blob
 from lerobot_openspm.perception.seeding import column
-from lerobot_openspm.perception.types import Hint, Mask, Segmentation, View
+from lerobot_openspm.perception.types import Hint, Mask, Scene, Segmentation, Segmenter, View
 
 # By camera: what a segmenter found of one phrase.
 Instances = Mapping[str, Sequence[Segmentation]]
@@ -24,6 +24,8 @@ MIN_PIXELS = 12
 # Pieces of a mask smaller than this share of its largest are specks.
 SPECK_SHARE = 0.1
 MAX_SIGHTINGS = 3
+# So many demonstrations are enough to learn one object from.
+MAX_SCENES = 30
 
 
 def whole_mask(mask: Mask) -> Blob | None:
@@ -66,6 +68,26 @@ def touched(views: Mapping[str, View], instances: Instances, hints: Sequence[Hin
         if distances and min(distances) < TOUCH_M:
             found[camera] = ones[int(np.argmin(distances))]
     return found
+
+
+def segmented(
+    phrases: Sequence[str], scenes: Sequence[Scene], segmenter: Segmenter
+) -> dict[str, list[tuple[Scene, Instances]]]:
+    """By phrase, at most :data:`MAX_SCENES` scenes that hint at it, with what a segmenter found of it there.
+
+    A scene is shown to the segmenter once, with all its phrases: large models encode an image once for all.
+    """
+    wanted: dict[int, list[str]] = {}
+    for phrase in phrases:
+        hinted = [i for i, scene in enumerate(scenes) if any(hint.name == phrase for hint in scene.hints)]
+        for i in hinted[:: max(1, -(-len(hinted) // MAX_SCENES))]:
+            wanted.setdefault(i, []).append(phrase)
+    pairs: dict[str, list[tuple[Scene, Instances]]] = {phrase: [] for phrase in phrases}
+    for i, names in sorted(wanted.items()):
+        found = segmenter.segment(scenes[i].views, names)
+        for name in names:
+            pairs[name].append((scenes[i], found[name]))
+    return pairs
 
 
 def _distance(view: View, mask: Mask, points_world: Array) -> float:
