@@ -144,6 +144,16 @@ def test_two_equally_good_instances_are_ambiguous(models):
     assert min(places) < 0.004
 
 
+def test_a_part_that_is_segmented_too_is_no_second_object(models):
+    poses = draw_poses(np.random.default_rng(7))
+    views = masked_views(poses, only=("front",))
+    (whole,) = instances_of(views, "block")["front"]
+    part = whole.mask.copy()
+    part[:, np.flatnonzero(part.any(0))[-1]] = False
+    estimate = localise_box(views, models["block"], {"front": (whole, Segmentation(part, 0.8))})
+    assert estimate.status == "found"
+
+
 def test_of_two_instances_the_one_of_the_right_size_is_taken(models):
     poses = draw_poses(np.random.default_rng(7))
     views = masked_views(poses)

@@ -20,6 +20,8 @@ from lerobot_openspm.perception.yaw import canonical
 
 # A box turned by more than this from where a fit begins may slip into a turn by a quarter.
 START_YAWS = np.arange(4) * np.pi / 4
+# Two bodies nearer than this share of their radius are one.
+SAME_PLACE = 0.7
 
 
 @dataclass(frozen=True)
@@ -45,6 +47,7 @@ def localise_box(views: Mapping[str, View], model: BoxModel, instances: Instance
     found = sightings(views, instances, model.height + model.size[2] / 2, radius)
     placed = [(place(views, sighting, model), sighting) for sighting in found]
     placed.sort(key=lambda pair: -pair[0].score)
+    placed = _distinct(placed, radius)
     if not placed:
         return PoseEstimate("not_found", np.eye(4), np.diag([1.0, 1.0, 1.0, UNKNOWN_YAW_STD**2]), 0.0, {})
     best, sighting = placed[0]
@@ -56,10 +59,7 @@ def localise_box(views: Mapping[str, View], model: BoxModel, instances: Instance
 
 def place(views: Mapping[str, View], sighting: Sighting, model: BoxModel) -> Placed:
     """Fit the model's body, on its support plane, to one object's masks."""
-    outlines = []
-    for camera, one in sighting.items():
-        if blob := whole_mask(one.mask):
-            outlines.append(outline(views[camera], blob.mask, one.confidence))
+    outlines = [outline(views[camera], one.mask, one.confidence) for camera, one in sighting.items()]
     start = _start(views, sighting, model)
     yaws = np.zeros(1) if model.is_round else START_YAWS
     fits = [fit_outlines(outlines, Box(se3.from_yaw(start, yaw), model.size, model.is_round)) for yaw in yaws]
@@ -74,6 +74,17 @@ def coverage(views: Mapping[str, View], sighting: Sighting, body: Box) -> float:
         for camera, view in views.items()
     ]
     return fitting.score(np.array(overlaps))
+
+
+def _distinct(placed: list[tuple[Placed, Sighting]], radius: float) -> list[tuple[Placed, Sighting]]:
+    """Those that are not at the place of a better one: a part of a mask is no second object."""
+    kept: list[tuple[Placed, Sighting]] = []
+    for one in placed:
+        place_of = one[0].fit.body.T_world_obj[:2, 3]
+        others = [other.fit.body.T_world_obj[:2, 3] for other, _ in kept]
+        if all(np.linalg.norm(place_of - other) > SAME_PLACE * radius for other in others):
+            kept.append(one)
+    return kept
 
 
 def _start(views: Mapping[str, View], sighting: Sighting, model: BoxModel) -> Array:

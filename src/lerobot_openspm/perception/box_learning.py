@@ -16,7 +16,7 @@ from lerobot_openspm.perception.lifting import Lifted, lift, support_height
 from lerobot_openspm.perception.model import BoxModel, box_period
 from lerobot_openspm.perception.outline import OutlineFit, fit_outlines, outline
 from lerobot_openspm.perception.sightings import Instances, Sighting, segmented, touched, whole_mask
-from lerobot_openspm.perception.types import Scene, Segmenter, View
+from lerobot_openspm.perception.types import Scene, Segmentation, Segmenter, View
 from lerobot_openspm.perception.yaw import yaw_range
 
 log = logging.getLogger(__name__)
@@ -98,9 +98,9 @@ def floor_of(scenes: Sequence[Scene]) -> float:
 def _see(scene: Scene, name: str, instances: Instances, floor: float) -> Seen | None:
     hints = [hint for hint in scene.hints if hint.name == name]
     sighting = {
-        camera: one
+        camera: Segmentation(blob.mask, one.confidence)
         for camera, one in touched(scene.views, instances, hints, floor).items()
-        if whole_mask(one.mask) is not None
+        if (blob := whole_mask(one.mask)) is not None
     }
     lifted = lift(scene.views, {camera: one.mask for camera, one in sighting.items()}, floor)
     if lifted is None or lifted.ray_gap_m > MAX_RAY_GAP:

@@ -123,7 +123,8 @@ def sightings(
                 continue
             point = intersect_plane(view.camera, view.T_world_cam, blob.centre, middle_height)
             if (point - view.T_world_cam[:3, 3]) @ view.T_world_cam[:3, 2] > 0:
-                rays.append((not blob.whole, -one.confidence, camera, point, one))
+                clean = Segmentation(blob.mask, one.confidence)
+                rays.append((not blob.whole, -one.confidence, camera, point, clean))
     rays.sort(key=lambda ray: ray[:3])
     groups: list[tuple[Array, Sighting]] = []
     for is_cut, _, camera, point, one in rays:
