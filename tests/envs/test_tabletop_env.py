@@ -21,7 +21,7 @@ def _assert_equal(a: dict, b: dict) -> None:
 @pytest.mark.filterwarnings("ignore")
 def test_gymnasium_accepts_it(make_env):
     check_env(make_env())
-    check_env(make_env(object_poses=True))
+    check_env(make_env(object_poses=True, masks=True, depth=True))
 
 
 def test_same_seed_and_actions_give_the_same_bits(make_env):

@@ -13,6 +13,7 @@ from lerobot_openspm.errors import ObservationError
 from lerobot_openspm.geometry.camera import cameras_from_dict
 from lerobot_openspm.geometry.layout import parse_layout
 from lerobot_openspm.observation import split_batch
+from lerobot_openspm.perception.segmentation.given import GivenSegmenter
 from lerobot_openspm.processor_openspm import make_openspm_pre_post_processors
 
 SIZE = 128
@@ -54,6 +55,17 @@ def test_masks_and_depth_reach_the_views_of_their_environment(raw, batch):
             np.testing.assert_array_equal(view.labels, raw[f"masks.{name}"][row, 0])
             np.testing.assert_array_equal(view.depth, raw[f"depth.{name}"][row, 0])
     assert views_of(batch)["observation.images.front"].labels.max() == len(scene.OBJECT_NAMES)
+
+
+def test_given_masks_are_what_the_environment_gave(raw, batch):
+    views = views_of(batch, row=1)
+    found = GivenSegmenter(scene.OBJECT_LABELS).segment(views, scene.OBJECT_NAMES)
+    for key in views:
+        labels = raw[f"masks.{key.rpartition('.')[2]}"][1, 0]
+        for name, number in scene.OBJECT_LABELS.items():
+            shown = [one.mask for one in found[name][key]]
+            assert len(shown) == (number in labels)
+            assert all(np.array_equal(mask, labels == number) for mask in shown)
 
 
 def test_they_are_optional_camera_by_camera(batch):

@@ -1,10 +1,12 @@
 """Grounding DINO with SAM 2.1: boxes by phrase, masks by box."""
 
+import json
 from itertools import combinations
 
 import numpy as np
 import pytest
 import torch
+import transformers
 from safetensors.torch import load_file, save_file
 from tests.perception.segmentation import tiny_models
 from tests.perception.segmentation.backends import PHRASES, scene
@@ -99,6 +101,20 @@ def test_saved_checkpoints_see_the_same(detector, masks, views, saved):
     again = loaded.segment(views, ["cup"])["cup"]["side"]
     before = make(detector, masks, 0.0).segment(views, ["cup"])["cup"]["side"]
     assert [one.confidence for one in again] == pytest.approx([one.confidence for one in before])
+
+
+def test_the_mask_models_weights_may_be_part_of_a_video_model(masks, saved):
+    """As they are published: with the video model's config, beside the weights of its memory."""
+    weights = load_file(saved / "masks/model.safetensors")
+    more = weights | {"memory_attention.layers.0.x": torch.zeros(2)}
+    save_file(more, saved / "masks/model.safetensors", metadata={"format": "pt"})
+    parts = ("vision_config", "prompt_encoder_config", "mask_decoder_config")
+    config = {name: getattr(masks.model.config, name).to_dict() for name in parts}
+    transformers.Sam2VideoConfig(**config).save_pretrained(saved / "masks")
+    assert json.loads((saved / "masks/config.json").read_text())["model_type"] == "sam2_video"
+    segmenter = GroundedSam2Segmenter.from_pretrained(str(saved / "detector"), str(saved / "masks"))
+    loaded = segmenter._mask_model.state_dict()
+    assert all(torch.equal(loaded[key], value) for key, value in weights.items())
 
 
 @pytest.mark.parametrize("part", ["detector", "masks"])
