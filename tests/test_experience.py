@@ -78,7 +78,32 @@ def test_yaw_periods_are_those_of_the_objects():
         "bowl": 2 * np.pi,
         "cream cheese box": np.pi,
         "stove": 2 * np.pi,
+        "rack": np.pi,
+        "mug": 2 * np.pi,
     }
+
+
+def test_what_found_the_objects_is_remembered(tmp_path):
+    made = experience(segmentation="given", shape="box")
+    save_experience(made, tmp_path)
+    assert same(load_experience(tmp_path), made)
+
+
+@pytest.mark.parametrize("version", [1, 2, 3])
+def test_memories_from_before_segmenters_are_read(tmp_path, version):
+    older = experience(objects={"bowl": model("bowl", 1), "stove": model("stove", 2)})
+    save_experience(older, tmp_path)
+
+    def age(memory):
+        memory["version"] = version
+        del memory["segmentation"], memory["shape"]
+        for fields in memory["objects"]:
+            del fields["foreground"]
+
+    edit_json(tmp_path, age)
+    loaded = load_experience(tmp_path)
+    assert same(loaded, older)
+    assert (loaded.segmentation, loaded.shape) == ("demonstrations", "demonstrations")
 
 
 @pytest.mark.parametrize("name", FILES)
@@ -173,6 +198,11 @@ SPOILT = {
     "workspace of another shape": (setting("robot", "workspace", value=[[0, 0, 0]]), "'robot'"),
     "no perception": (without("perception"), "perception"),
     "no simulator objects": (without("simulator_objects"), "simulator_objects"),
+    "unknown segmentation": (setting("segmentation", value="magic"), "segmentation is 'magic'.*sam3"),
+    "unknown shape": (setting("shape", value=["box"]), r"shape is \['box'\], expected one of demonstr"),
+    "a box of no size": (setting("objects", 3, "size", value=[0, 0, 0]), "'size'"),
+    "a box without a side": (without("objects", 3, "size", 0), "'size'.*'rack'"),
+    "a shape without its foreground": (without("objects", 4, "foreground"), "log_odds"),
     "entries of another kind": (setting("entries", value={}), "'entries'"),
     "objects of another kind": (setting("objects", value={}), "'objects'"),
     "an object of another kind": (setting("objects", 0, value=3), "'objects'"),
@@ -348,7 +378,7 @@ def test_appending_adds_entries_and_objects_and_keeps_known_ones():
     )
     both = old.appended(newer)
     assert [e.source for e in both.entries] == ["local/demos#0", "local/demos#1", "local/more#0"]
-    assert set(both.objects) == {"bowl", "cream cheese box", "stove", "plate"}
+    assert set(both.objects) == {"bowl", "cream cheese box", "stove", "rack", "mug", "plate"}
     # The old entries are anchored in the old model's frame.
     assert_array_equal(both.objects["bowl"].points, old.objects["bowl"].points)
     assert same(both.robot, old.robot)

@@ -15,8 +15,10 @@ from lerobot_openspm.control.transfer import TransferLimits
 from lerobot_openspm.flow.condition import Conditioning
 from lerobot_openspm.geometry.layout import ROTATION_KINDS, VectorLayout, parse_layout
 from lerobot_openspm.memory.retrieval import ScoreWeights
+from lerobot_openspm.perception.learning import Shape
 
 PerceptionSource = Literal["demonstrations", "oracle"]
+Segmentation = Literal["demonstrations", "sam3", "grounded_sam2", "given"]
 MemoryUpdate = Literal["keep", "append", "rebuild"]
 
 
@@ -45,6 +47,12 @@ class OpenSPMConfig(PreTrainedConfig):
             "oracle" takes their poses from the simulator, for ablations only.
         tracking: Whether objects are followed through the episode, and key poses with them. Otherwise they
             are found once, at its start, as in the paper.
+        segmentation: What finds the objects' pixels. "demonstrations": the colours and patches that the
+            demonstrations showed. "sam3" and "grounded_sam2": pretrained models that take any phrase.
+            "given": the numbers in ``observation.masks.<camera>``.
+        shape: What is learned of an object that a segmenter finds. "demonstrations": its shape, from the
+            masks of all of them. "box": the upright box or cylinder around it; one demonstration is enough.
+        mask_labels: Number of each phrase in the masks, for segmentation "given", e.g. ``{"bowl": 1}``.
         memory_episodes: Episodes that may enter the memory and the training samples; all if not given. Name
             them when some are held out: the policy is shown the whole dataset otherwise.
         memory_update: What happens to a checkpoint's memory when training goes on from it: "keep" it,
@@ -92,6 +100,9 @@ class OpenSPMConfig(PreTrainedConfig):
     # Memory and perception.
     perception: PerceptionSource = "demonstrations"
     tracking: bool = True
+    segmentation: Segmentation = "demonstrations"
+    shape: Shape = "demonstrations"
+    mask_labels: dict[str, int] | None = None
     memory_episodes: list[int] | None = None
     memory_update: MemoryUpdate = "keep"
     weight_semantic: float = 1.0
@@ -131,6 +142,9 @@ class OpenSPMConfig(PreTrainedConfig):
     def __post_init__(self) -> None:
         super().__post_init__()
         _require_choice("perception", self.perception, get_args(PerceptionSource))
+        _require_choice("segmentation", self.segmentation, get_args(Segmentation))
+        _require_choice("shape", self.shape, get_args(Shape))
+        self._check_segmentation()
         _require_choice("memory_update", self.memory_update, get_args(MemoryUpdate))
         _require_choice("conditioning", self.conditioning, get_args(Conditioning))
         _require_choice("execution", self.execution, get_args(Execution))
@@ -164,6 +178,28 @@ class OpenSPMConfig(PreTrainedConfig):
         for name in not_negative:
             if not getattr(self, name) >= 0:
                 raise ValueError(f"{name} is {getattr(self, name)}, expected 0 or more")
+
+    def _check_segmentation(self) -> None:
+        """Options that say something of masks need something that gives masks."""
+        if self.segmentation == "demonstrations" and self.shape != "demonstrations":
+            raise ValueError(
+                f"shape is {self.shape!r}, but without a segmenter colours and shape are learned together; "
+                "pass --policy.segmentation=sam3, grounded_sam2 or given"
+            )
+        if self.segmentation != "demonstrations" and self.perception == "oracle":
+            raise ValueError(
+                f"segmentation is {self.segmentation!r}, but perception=oracle looks at no masks; leave one "
+                "of the two out"
+            )
+        if (self.segmentation == "given") != (self.mask_labels is not None):
+            raise ValueError(
+                f"segmentation is {self.segmentation!r}, mask_labels is {self.mask_labels}, expected labels "
+                "with segmentation=given and with nothing else; pass e.g. --policy.segmentation=given "
+                """--policy.mask_labels='{"bowl": 1}'"""
+            )
+        for phrase, number in (self.mask_labels or {}).items():
+            if type(number) is not int or number < 1:
+                raise ValueError(f"mask_labels[{phrase!r}] is {number!r}, expected a number from 1 on")
 
     def set_dataset_feature_metadata(self, features: Mapping[str, Any]) -> None:
         """Take the layouts from the dataset's feature names where they were not given. Called by LeRobot."""

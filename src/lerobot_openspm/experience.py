@@ -24,12 +24,15 @@ from lerobot_openspm.geometry.camera import Camera, cameras_to_dict, load_camera
 from lerobot_openspm.memory.entry import MemoryEntry
 from lerobot_openspm.memory.robot import RobotModel
 from lerobot_openspm.memory.store import entries_from_parts, entries_to_parts, robot_from_dict, robot_to_dict
+from lerobot_openspm.perception.learning import SHAPES
 from lerobot_openspm.perception.model import KnownObject
+from lerobot_openspm.perception.segmentation.make import SEGMENTERS
 from lerobot_openspm.perception.store import from_parts as object_from_parts
 from lerobot_openspm.perception.store import to_parts as object_to_parts
 
-# Version 2: objects known by patches. Version 3: key poses with the axis of their constraint.
-FORMAT, VERSION = "openspm-memory", 3
+# Version 2: objects known by patches. Version 3: key poses with the axis of their constraint. Version 4:
+# objects known by boxes, or by shapes whose pixels a segmenter finds.
+FORMAT, VERSION = "openspm-memory", 4
 MEMORY_JSON, MEMORY_ARRAYS, CAMERAS_JSON = "memory.json", "memory.safetensors", "cameras.json"
 FILES = (MEMORY_JSON, MEMORY_ARRAYS, CAMERAS_JSON)
 MAX_JSON_BYTES, MAX_ARRAY_BYTES = 512_000_000, 4_000_000_000
@@ -45,6 +48,8 @@ class Experience:
         robot: The robot that gave the demonstrations.
         cameras: Calibration by camera key.
         perception: Whose object frames the entries are in: "demonstrations" or "oracle".
+        segmentation: What found the objects' pixels: "demonstrations", or a segmenter by name.
+        shape: What was learned of the objects: "demonstrations" or "box".
         simulator_objects: Objects in the order of the simulator's pose vector (oracle ablation only).
     """
 
@@ -54,6 +59,8 @@ class Experience:
     cameras: dict[str, Camera]
     perception: str
     simulator_objects: tuple[str, ...] = ()
+    segmentation: str = "demonstrations"
+    shape: str = "demonstrations"
 
     @property
     def yaw_periods(self) -> dict[str, float]:
@@ -106,6 +113,8 @@ def save_experience(experience: Experience, directory: Path) -> None:
         "version": VERSION,
         "arrays": {"file": MEMORY_ARRAYS, "sha256": hashlib.sha256(blob).hexdigest()},
         "perception": experience.perception,
+        "segmentation": experience.segmentation,
+        "shape": experience.shape,
         "simulator_objects": list(experience.simulator_objects),
         "robot": robot_to_dict(experience.robot),
         "objects": objects,
@@ -147,6 +156,11 @@ def load_experience(directory: Path) -> Experience:
         raise MemoryFormatError(f"{where}: 'entries' and 'objects' must be lists")
     if perception not in ("demonstrations", "oracle"):
         raise MemoryFormatError(f"{where}: perception is {perception!r}, expected demonstrations or oracle")
+    # Until version 3 nothing else was known.
+    segmentation, shape = (memory.get(name, "demonstrations") for name in ("segmentation", "shape"))
+    for name, got, expected in (("segmentation", segmentation, SEGMENTERS), ("shape", shape, SHAPES)):
+        if got not in expected:
+            raise MemoryFormatError(f"{where}: {name} is {got!r}, expected one of {', '.join(expected)}")
     arrays = _read_arrays(directory / MEMORY_ARRAYS, checksum)
     models = {}
     for fields in objects:
@@ -160,7 +174,7 @@ def load_experience(directory: Path) -> Experience:
     if perception != "oracle":
         _check_anchors(entries, models, where)
     cameras = load_cameras(directory / CAMERAS_JSON)
-    return Experience(entries, models, robot, cameras, perception, simulator_objects)
+    return Experience(entries, models, robot, cameras, perception, simulator_objects, segmentation, shape)
 
 
 def _check_anchors(entries: Sequence[MemoryEntry], models: Mapping[str, KnownObject], where: str) -> None:

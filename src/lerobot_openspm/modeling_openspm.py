@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Sequence
 from dataclasses import replace
-from functools import partial
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
 
@@ -29,7 +29,8 @@ from lerobot_openspm.geometry.camera import check_sizes, load_cameras
 from lerobot_openspm.observation import Observation, split_batch
 from lerobot_openspm.perceive import Eyes
 from lerobot_openspm.perception.tracker import TrackerSettings
-from lerobot_openspm.training import mine_experience, training_set
+from lerobot_openspm.perception.types import Segmenter
+from lerobot_openspm.training import mine_experience, segmenter_of, training_set
 
 logger = logging.getLogger(__name__)
 
@@ -67,7 +68,7 @@ class OpenSPMPolicy(PreTrainedPolicy):
         self._training_set: TrainingSet | None = None
         if dataset_meta is not None:
             config.control_hz = config.control_hz or float(dataset_meta.fps)
-            self.experience = mine_experience(dataset_meta, config)
+            self.experience = mine_experience(dataset_meta, config, segmenter=self.segmenter)
             self._training_set = training_set(dataset_meta, config, self.experience.robot)
             self.flow.action_scale.copy_(self._training_set.action_scale)
         self.reset()
@@ -153,7 +154,12 @@ class OpenSPMPolicy(PreTrainedPolicy):
         return 1 / (self.config.control_hz or DEFAULT_CONTROL_HZ)
 
     def _new_eyes(self) -> Eyes:
-        return Eyes(self.require_experience(), self.config.hand_radius_m)
+        return Eyes(self.require_experience(), self.config.hand_radius_m, self.segmenter)
+
+    @cached_property
+    def segmenter(self) -> Segmenter | None:
+        """What finds the objects' masks, made when it is first needed; None where their colours do."""
+        return segmenter_of(self.config)
 
     def _chunk(self, row: Row, query: Query) -> np.ndarray:
         """Generate one chunk ``(chunk_size, 7)`` in the world. Rows go one by one, so batches act alike."""
@@ -256,12 +262,13 @@ class OpenSPMPolicy(PreTrainedPolicy):
             raise MemoryFormatError(
                 f"the memory in {directory} holds no entries, so nothing can be done with it; train again"
             )
-        if self.experience.perception != self.config.perception:
-            raise MemoryFormatError(
-                f"the memory in {directory} holds key poses in the frames of perception="
-                f"{self.experience.perception}, got --policy.perception={self.config.perception}; the two "
-                "cannot be mixed, train with the one you evaluate"
-            )
+        for name in ("perception", "segmentation", "shape"):
+            made, asked = getattr(self.experience, name), getattr(self.config, name)
+            if made != asked:
+                raise MemoryFormatError(
+                    f"the memory in {directory} holds key poses in the frames of {name}={made}, got "
+                    f"--policy.{name}={asked}; the two cannot be mixed, train with the one you evaluate"
+                )
         if self.config.cameras is not None:
             self.experience = replace(self.experience, cameras=load_cameras(Path(self.config.cameras)))
         where = self.config.cameras or str(directory / CAMERAS_JSON)
@@ -269,7 +276,9 @@ class OpenSPMPolicy(PreTrainedPolicy):
         if dataset_meta is not None:
             if self.config.memory_update != "keep":
                 known = self.experience if self.config.memory_update == "append" else None
-                self.experience = mine_experience(dataset_meta, self.config, known, self.experience.cameras)
+                self.experience = mine_experience(
+                    dataset_meta, self.config, known, self.experience.cameras, self.segmenter
+                )
             logger.info(
                 "memory_update=%s: %d entries", self.config.memory_update, len(self.experience.entries)
             )

@@ -18,7 +18,7 @@ from lerobot_openspm.geometry import se3
 from lerobot_openspm.geometry.camera import Camera
 from lerobot_openspm.geometry.layout import VectorLayout
 from lerobot_openspm.geometry.se3 import Array
-from lerobot_openspm.observation_layers import depth_of, find_layers, labels_of
+from lerobot_openspm.perception.layers import depth_of, find_layers, labels_of
 from lerobot_openspm.perception.types import View
 
 # Named by the environment that gives them: position and quat_wxyz per object (oracle ablation only).
@@ -36,7 +36,7 @@ class Observation:
         images: Images ``(3, H, W)`` by camera, still as tensors: few of them are ever looked at. A
             mapping that makes them when they are asked for will do.
         object_poses: Simulator poses ``(n * 7,)``, or None.
-        layers: Masks and depths ``(1, H, W)`` of some images, see :mod:`lerobot_openspm.observation_layers`.
+        layers: Masks and depths ``(1, H, W)`` of some images, see :mod:`lerobot_openspm.perception.layers`.
     """
 
     instruction: str

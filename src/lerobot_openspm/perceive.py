@@ -7,15 +7,15 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from lerobot_openspm.control.row import Sighting
+from lerobot_openspm.control.row import Seen
 from lerobot_openspm.experience import Experience
 from lerobot_openspm.geometry.se3 import Array
 from lerobot_openspm.mining.mine import name_simulator_poses
 from lerobot_openspm.observation import Observation
 from lerobot_openspm.perception.camera_watch import CameraWatch
-from lerobot_openspm.perception.localise import localise, prepare
+from lerobot_openspm.perception.localise import localise_all
 from lerobot_openspm.perception.occlusion import hand_mask
-from lerobot_openspm.perception.types import PoseEstimate, View
+from lerobot_openspm.perception.types import PoseEstimate, Segmenter, View
 
 # How exact the simulator's poses are taken to be (oracle ablation only): metres and radians.
 ORACLE_STD = 1e-4
@@ -28,16 +28,18 @@ class Eyes:
     Attributes:
         experience: What objects and cameras are known.
         hand_radius_m: Radius of the hand, which hides what is behind it.
+        segmenter: Finds the masks of objects that were learned from a segmenter's; None if none were.
     """
 
     experience: Experience
     hand_radius_m: float
+    segmenter: Segmenter | None = None
     _watch: CameraWatch = field(default_factory=CameraWatch)
     _has_looked: bool = False
 
     def look(
         self, observation: Observation, names: Sequence[str], expected: Mapping[str, Array], time_s: float
-    ) -> Sighting:
+    ) -> Seen:
         """Look for objects.
 
         Args:
@@ -51,7 +53,7 @@ class Eyes:
             ObservationError: A camera is missing or broken at the very first look.
         """
         if self.experience.perception == "oracle":
-            return Sighting(self._simulator_poses(observation, names), {})
+            return Seen(self._simulator_poses(observation, names), {})
         if not self._has_looked:  # a camera that never worked is a mistake in the set-up
             observation.views(self.experience.cameras)
             self._has_looked = True
@@ -59,7 +61,7 @@ class Eyes:
         T_world_ee = observation.hand.T_world_ee
         faults = self._watch.check(views, absent, T_world_ee, time_s)
         good = {camera: view for camera, view in views.items() if camera not in faults}
-        return Sighting(self._find(good, names, expected, T_world_ee) if good else {}, faults)
+        return Seen(self._find(good, names, expected, T_world_ee) if good else {}, faults)
 
     def _find(
         self,
@@ -68,15 +70,9 @@ class Eyes:
         expected: Mapping[str, Array],
         T_world_ee: Array,
     ) -> dict[str, PoseEstimate]:
-        prepared = {camera: prepare(view) for camera, view in views.items()}
         hidden = {camera: hand_mask(view, T_world_ee, self.hand_radius_m) for camera, view in views.items()}
-        return {
-            name: localise(
-                prepared, self.experience.objects[name], hidden=hidden, T_expected=expected.get(name)
-            )
-            for name in names
-            if name in self.experience.objects
-        }
+        known = {n: self.experience.objects[n] for n in names if n in self.experience.objects}
+        return localise_all(views, known, self.segmenter, hidden, expected)
 
     def _simulator_poses(self, observation: Observation, names: Sequence[str]) -> dict[str, PoseEstimate]:
         poses = observation.simulator_layout(self.experience.simulator_objects)

@@ -25,6 +25,8 @@ from lerobot_openspm.mining.mine import (
     oracle_layouts,
 )
 from lerobot_openspm.mining.signals import observe_robot
+from lerobot_openspm.perception.segmentation.make import make_segmenter
+from lerobot_openspm.perception.types import Segmenter
 
 logger = logging.getLogger(__name__)
 
@@ -42,11 +44,23 @@ def open_demonstrations(dataset_meta: Any, config: OpenSPMConfig) -> Demonstrati
     return Demonstrations(dataset, *config.layouts())
 
 
+def segmenter_of(config: OpenSPMConfig) -> Segmenter | None:
+    """The segmenter that a configuration asks for; None where the demonstrations teach objects' looks.
+
+    Raises:
+        PerceptionError: It cannot be used.
+    """
+    if config.segmentation == "demonstrations":
+        return None
+    return make_segmenter(config.segmentation, {}, config.mask_labels or {}, device=str(config.device))
+
+
 def mine_experience(
     dataset_meta: Any,
     config: OpenSPMConfig,
     known: Experience | None = None,
     cameras: dict[str, Camera] | None = None,
+    segmenter: Segmenter | None = None,
 ) -> Experience:
     """Mine a dataset's key poses, learn its objects, and make memory entries of it.
 
@@ -57,6 +71,7 @@ def mine_experience(
         config: The policy's configuration.
         known: An experience to append to. Its objects are recognised by what is known of them.
         cameras: Calibration to use where the configuration names no file.
+        segmenter: Finds the objects' masks, where the configuration's segmentation is not "demonstrations".
 
     Raises:
         CalibrationError: No calibration is given, or it does not fit.
@@ -76,7 +91,9 @@ def mine_experience(
     robot = observe_robot(episodes, known.robot if known else None)
     mined = mine_key_poses(demonstrations, robot, config.memory_episodes)
     scenes = learn_scenes(demonstrations, mined.mined, cameras)
-    objects = layouts_in_scenes(scenes, mined.mined, known.objects if known else {}, np.random.default_rng(0))
+    objects = layouts_in_scenes(
+        scenes, mined.mined, known.objects if known else {}, np.random.default_rng(0), segmenter, config.shape
+    )
     names: tuple[str, ...] = ()
     layouts = objects.layouts
     if config.perception == "oracle":
@@ -93,7 +110,16 @@ def mine_experience(
         "mined %d entries from %d episodes (%d skipped); objects: %s",
         len(entries), len(mined.mined), len(mined.skipped), ", ".join(sorted(objects.models)),
     )  # fmt: skip
-    experience = Experience(entries, objects.models, robot, dict(cameras), config.perception, names)
+    experience = Experience(
+        entries,
+        objects.models,
+        robot,
+        dict(cameras),
+        config.perception,
+        names,
+        config.segmentation,
+        config.shape,
+    )
     return known.appended(experience) if known else experience
 
 

@@ -11,7 +11,7 @@ from lerobot_openspm.control.row import (
     MOVED_M,
     Knowledge,
     Row,
-    Sighting,
+    Seen,
 )
 from lerobot_openspm.control.transfer import TransferLimits
 from lerobot_openspm.errors import InstructionError
@@ -41,7 +41,7 @@ class Eyes:
 
     def __call__(self, names, expected, time_s):
         self.asked.append(list(names))
-        return Sighting({name: self._estimate(name) for name in names}, self.faults)
+        return Seen({name: self._estimate(name) for name in names}, self.faults)
 
     def _estimate(self, name):
         if name not in self.layout:

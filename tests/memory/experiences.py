@@ -1,8 +1,8 @@
-"""A whole experience built by hand: entries, objects of both kinds, a robot, a camera."""
+"""A whole experience built by hand: entries, objects of all kinds, a robot, a camera."""
 
 import numpy as np
 from tests.memory.builders import entry, key_pose, robot
-from tests.perception.builders import model, patch_model
+from tests.perception.builders import box_model, masked_model, model, patch_model
 
 from lerobot_openspm.experience import Experience
 from lerobot_openspm.geometry import se3
@@ -24,6 +24,8 @@ def experience(**changes):
             "bowl": model("bowl", 1),
             "cream cheese box": model("cream cheese box", 2, np.pi),
             "stove": patch_model("stove"),
+            "rack": box_model("rack"),
+            "mug": masked_model("mug"),
         },
         "robot": robot(),
         "cameras": {"observation.images.front": Camera(64, 48, 50.1, 50.2, 31.5, 23.5, "ee", T)},

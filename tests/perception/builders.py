@@ -1,11 +1,13 @@
 """Known objects made of random numbers, for tests of what is done with them."""
 
+from dataclasses import replace
+
 import numpy as np
 
 from lerobot_openspm.geometry import se3
 from lerobot_openspm.geometry.camera import Camera
 from lerobot_openspm.perception.colour import N_BINS
-from lerobot_openspm.perception.model import ObjectModel, Patch, PatchModel, Probe
+from lerobot_openspm.perception.model import BoxModel, ObjectModel, Patch, PatchModel, Probe
 
 
 def model(name, seed=0, yaw_period=2 * np.pi):
@@ -14,6 +16,15 @@ def model(name, seed=0, yaw_period=2 * np.pi):
         name, rng.normal(size=N_BINS).astype(np.float32), rng.normal(size=(9, 3)).astype(np.float32),
         0.005, 0.01, yaw_period, 0.1, 0.2, 0.9,
     )  # fmt: skip
+
+
+def masked_model(name):
+    """An object whose shape was learned from a segmenter's masks."""
+    return replace(model(name, 4), log_odds=None)
+
+
+def box_model(name, yaw_period=np.pi, sides=(0.12, 0.06)):
+    return BoxModel(name, np.array([*sides, 0.05]), 0.01, yaw_period, 0.3, 0.8)
 
 
 def patch_model(name):

@@ -1,5 +1,6 @@
 from typing import Any
 
+import draccus
 import numpy as np
 import pytest
 import torch
@@ -7,6 +8,7 @@ from lerobot.configs import FeatureType, PolicyFeature
 from lerobot.utils.constants import ACTION, OBS_STATE
 from scipy.spatial.transform import Rotation
 
+from lerobot_openspm.cli.mine import MineConfig
 from lerobot_openspm.configuration_openspm import OpenSPMConfig
 from lerobot_openspm.errors import LayoutError
 from lerobot_openspm.observation import split_batch
@@ -19,11 +21,46 @@ def config(**options: Any) -> OpenSPMConfig:
 
 
 @pytest.mark.parametrize(
-    "name", ["perception", "memory_update", "conditioning", "execution", "state_rotation"]
+    "name",
+    ["perception", "segmentation", "shape", "memory_update", "conditioning", "execution", "state_rotation"],
 )
 def test_an_unknown_choice_is_named_with_the_known_ones(name: str):
     with pytest.raises(ValueError, match=rf"{name} is 'telepathy', expected one of \w+, "):
         config(**{name: "telepathy"})
+
+
+LABELS = {"bowl": 1, "wine bottle": 4}
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({"shape": "box"}, "shape is 'box', but without a segmenter.*segmentation=sam3"),
+        ({"segmentation": "sam3", "perception": "oracle"}, "'sam3', but perception=oracle"),
+        ({"segmentation": "given"}, "mask_labels is None.*--policy.mask_labels='"),
+        ({"segmentation": "sam3", "mask_labels": LABELS}, "'sam3', mask_labels is {'bowl'"),
+        ({"mask_labels": LABELS}, "'demonstrations', mask_labels is {'bowl'"),
+        (
+            {"segmentation": "given", "mask_labels": {"bowl": 0}},
+            r"mask_labels\['bowl'\] is 0, expected .* 1 on",
+        ),
+        ({"segmentation": "given", "mask_labels": {"bowl": True}}, r"mask_labels\['bowl'\] is True"),
+    ],
+)
+def test_options_that_make_no_sense_together_are_refused(options: dict[str, Any], words: str):
+    with pytest.raises(ValueError, match=words):
+        config(**options)
+
+
+@pytest.mark.parametrize("shape", ["demonstrations", "box"])
+def test_a_segmenter_goes_with_either_shape(shape: str):
+    assert config(segmentation="given", mask_labels=LABELS, shape=shape).mask_labels == LABELS
+    assert config(segmentation="grounded_sam2", shape=shape).shape == shape
+
+
+def test_labels_are_read_from_a_command_line():
+    options = ["--policy.segmentation=given", '--policy.mask_labels={"bowl": 1, "wine bottle": 4}']
+    assert draccus.parse(MineConfig, args=options).policy.mask_labels == LABELS
 
 
 @pytest.mark.parametrize("steps", [0, -1, 6])

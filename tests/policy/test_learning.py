@@ -210,6 +210,10 @@ def test_the_perceptions_are_not_mixed(load: Callable[..., OpenSPMPolicy]):
         MemoryFormatError, match=r"perception=demonstrations, got --policy\.perception=oracle"
     ):
         load(perception="oracle")
+    with pytest.raises(
+        MemoryFormatError, match=r"segmentation=demonstrations, got --policy\.segmentation=sam3"
+    ):
+        load(segmentation="sam3")
 
 
 def test_a_loaded_policy_cannot_be_trained_without_a_dataset(policy: OpenSPMPolicy):

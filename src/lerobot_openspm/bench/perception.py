@@ -90,7 +90,7 @@ def run(setting: Setting, folder: Path, task: str, seed: int) -> None:
     experience = policy.require_experience()
     offsets = {name: offset(experience, name, demonstrations) for name in experience.objects}
     with world(setting.env_type, task, seed) as scene:
-        success, samples = measure_episode(policy, scene, task, offsets)
+        success, samples = measure_episode(policy, scene, setting.env_type, task, offsets)
     write_json(file_of(folder, task, seed), {"success": success, "samples": samples})
 
 
@@ -134,7 +134,7 @@ type Sample = tuple[str, int, str, bool, float | None, float | None]
 
 
 def measure_episode(
-    policy: OpenSPMPolicy, world: World, task: str, offsets: Mapping[str, Array]
+    policy: OpenSPMPolicy, world: World, env_type: str, task: str, offsets: Mapping[str, Array]
 ) -> tuple[bool, dict[str, list[Sample]]]:
     """Run one episode and compare poses with the truth at every step.
 
@@ -162,7 +162,7 @@ def measure_episode(
             for variant, poses in known.items():
                 error: tuple[float | None, float | None] = (None, None)
                 if name in poses:
-                    error = pose_error(true[name], poses[name], true_period(name))
+                    error = pose_error(true[name], poses[name], true_period(name, env_type))
                 samples[variant].append((task, step, name, held, error[0], error[1]))
 
     return run_episode(policy, world, note=compare).success, samples
@@ -175,7 +175,7 @@ class _Shadow:
         experience = policy.require_experience()
         first = next(iter(experience.cameras))
         one_camera = replace(experience, cameras={first: experience.cameras[first]})
-        self._eyes = Eyes(one_camera, policy.config.hand_radius_m)
+        self._eyes = Eyes(one_camera, policy.config.hand_radius_m, policy.segmenter)
         self._step_s = policy.step_s
         self.tracker = Tracker(experience.yaw_periods, TrackerSettings())
         self.seen: dict[str, Array] = {}
@@ -186,11 +186,11 @@ class _Shadow:
         self._time_s += self._step_s
         self.tracker.predict(self._step_s)
         hand = observation.hand.T_world_ee
-        if row.has_just_looked and row.sighting is not None:
-            estimates = row.sighting.estimates
+        if row.has_just_looked and row.seen is not None:
+            estimates = row.seen.estimates
             self.seen |= {name: e.T_world_obj for name, e in estimates.items() if e.status == "found"}
-            sighting = self._eyes.look(observation, list(estimates), self.tracker.poses(hand), self._time_s)
-            self.tracker.look(sighting.estimates, hand, self._time_s - self._looked_at_s)
+            seen = self._eyes.look(observation, list(estimates), self.tracker.poses(hand), self._time_s)
+            self.tracker.look(seen.estimates, hand, self._time_s - self._looked_at_s)
             self._looked_at_s = self._time_s
         for name in row.tracker.held - self.tracker.held:
             self.tracker.hold(name, hand)

@@ -20,13 +20,14 @@ from lerobot_openspm.mining.mine import name_simulator_poses
 ROUND, HALF_TURN = ("bowl", "plate", "bottle"), ("box", "cheese")
 
 
-def true_period(name: str) -> float:
-    """Angle that truly turns a named object of the simulators into itself, radians; 0 for a round one."""
+def true_period(name: str, env_type: str) -> float:
+    """Angle that truly turns a simulator's object into itself, radians; 0 for a round one."""
     words = name.split()
     if any(word in ROUND for word in words):
         return 0.0
-    # The tabletop's rack is the same from both sides, LIBERO's is not; neither turns by more than a quarter.
-    return np.pi if any(word in HALF_TURN for word in words) else 2 * np.pi
+    # The tabletop's rack looks the same from both sides, LIBERO's does not.
+    half_turn = (*HALF_TURN, "rack") if env_type == "openspm_tabletop" else HALF_TURN
+    return np.pi if any(word in half_turn for word in words) else 2 * np.pi
 
 
 class Truth:

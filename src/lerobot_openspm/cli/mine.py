@@ -11,7 +11,7 @@ import draccus
 
 from lerobot_openspm.configuration_openspm import OpenSPMConfig
 from lerobot_openspm.experience import save_experience
-from lerobot_openspm.training import mine_experience
+from lerobot_openspm.training import mine_experience, segmenter_of
 
 
 @dataclass
@@ -38,7 +38,7 @@ def main(args: list[str]) -> None:
     config = draccus.parse(MineConfig, args=args)
     start_s = time.monotonic()
     meta = LeRobotDatasetMetadata(config.repo_id, root=config.root)
-    experience = mine_experience(meta, config.policy)
+    experience = mine_experience(meta, config.policy, segmenter=segmenter_of(config.policy))
     save_experience(experience, Path(config.output))
     summary = {
         "entries": len(experience.entries),

@@ -41,7 +41,7 @@ MIN_USABLE_SCORE = 1e-3
 
 
 @dataclass(frozen=True)
-class Sighting:
+class Seen:
     """What one look brought.
 
     Attributes:
@@ -54,7 +54,7 @@ class Sighting:
 
 
 # Names of objects, poses T_world_obj at which some are expected, seconds since the start -> what is seen.
-Look = Callable[[Sequence[str], Mapping[str, Array], float], Sighting]
+Look = Callable[[Sequence[str], Mapping[str, Array], float], Seen]
 
 
 @dataclass(frozen=True)
@@ -93,7 +93,7 @@ class Row:
         tracker: Follows the objects.
         ranked: The entries of the last retrieval with their scores, best first.
         layout: Poses ``T_world_obj`` that the plan was made with: of what the hand has touched, from before.
-        sighting: What the last look brought; None before the first.
+        seen: What the last look brought; None before the first.
         is_paused: Whether the hand holds still until something is seen again.
     """
 
@@ -104,7 +104,7 @@ class Row:
         self.tracker = Tracker(knowledge.yaw_periods, knowledge.tracker)
         self.ranked: list[Scored] = []
         self.layout: dict[str, Array] = {}
-        self.sighting: Sighting | None = None
+        self.seen: Seen | None = None
         self.is_paused = False
         self._step = -1
         self._looked_at_step = -LOOK_AGAIN_STEPS
@@ -190,7 +190,7 @@ class Row:
     @property
     def faults(self) -> Mapping[str, Fault]:
         """Cameras that were no use at the last look."""
-        return {} if self.sighting is None else self.sighting.faults
+        return {} if self.seen is None else self.seen.faults
 
     @property
     def has_just_looked(self) -> bool:
@@ -215,13 +215,13 @@ class Row:
         """Look for objects; the names of those that are somewhere else than before."""
         waited_s = min(self._waited_steps, LOOK_AGAIN_STEPS) * self._knowledge.step_s
         expected = {k: T for k, T in self.tracker.poses(hand.T_world_ee).items() if k in names}
-        self.sighting = look(names, expected, self._step * self._knowledge.step_s)
+        self.seen = look(names, expected, self._step * self._knowledge.step_s)
         self._looked_at_step = self._step
         for camera, fault in self.faults.items():
             if fault.seconds > GIVE_UP_S:
                 logger.warning("%r: stopping, camera %r: %s", self.instruction, camera, fault.reason)
                 self.executor.stop(Status.CAMERA_FAULT)
-        return self.tracker.look(self.sighting.estimates, hand.T_world_ee, waited_s)
+        return self.tracker.look(self.seen.estimates, hand.T_world_ee, waited_s)
 
     def _look_around(self, hand: Hand, look: Look) -> None:
         """Look at what the remaining key poses need and what is in the hand; act on what has changed."""

@@ -15,6 +15,7 @@ from lerobot_openspm.geometry.camera import Camera
 from lerobot_openspm.geometry.layout import VectorLayout
 from lerobot_openspm.geometry.se3 import Array
 from lerobot_openspm.mining.signals import Episode
+from lerobot_openspm.perception.layers import DEPTH, MASKS, depth_of, labels_of
 from lerobot_openspm.perception.types import View
 
 # True object poses of simulated demonstrations; read for the oracle ablation alone.
@@ -73,8 +74,14 @@ class Demonstrations:
         return episodes
 
     def views(self, episode: Episode, frame: int, cameras: Mapping[str, Camera]) -> dict[str, View]:
-        """Decode one frame's images of the calibrated cameras, keyed by camera."""
+        """Decode one frame's images of the calibrated cameras, keyed by camera, with its masks and depths.
+
+        Raises:
+            DatasetError: The dataset lacks a camera.
+            ObservationError: A mask or a depth does not fit its image.
+        """
         item: dict[str, Any] = self._dataset[episode.from_index + frame]  # pyright: ignore[reportAssignmentType]
+        layers = {key: value for key, value in item.items() if key.startswith((MASKS, DEPTH))}
         views = {}
         for key, camera in cameras.items():
             if key not in item:
@@ -85,7 +92,9 @@ class Demonstrations:
             image = item[key].numpy().transpose(1, 2, 0)
             image = image if image.dtype == np.uint8 else np.round(image * 255).astype(np.uint8)
             scaled = camera.scaled(image.shape[1], image.shape[0])
-            views[key] = View(image, scaled, scaled.T_world_cam(episode.T_world_ee[frame]))
+            size = image.shape[:2]
+            depth, labels = depth_of(layers, key, size), labels_of(layers, key, size)
+            views[key] = View(image, scaled, scaled.T_world_cam(episode.T_world_ee[frame]), depth, labels)
         return views
 
     def simulator_poses(self, episode: Episode, frame: int) -> dict[str, Array]:

@@ -31,10 +31,10 @@ from lerobot_openspm.mining.axes import constrained_axes
 from lerobot_openspm.mining.dataset import Demonstrations
 from lerobot_openspm.mining.key_poses import KeyPose, find_key_poses
 from lerobot_openspm.mining.signals import Episode
-from lerobot_openspm.perception.learning import learn_objects
-from lerobot_openspm.perception.localise import localise, prepare
+from lerobot_openspm.perception.learning import Shape, learn_objects
+from lerobot_openspm.perception.localise import localise_all
 from lerobot_openspm.perception.model import KnownObject
-from lerobot_openspm.perception.types import Hint, Scene
+from lerobot_openspm.perception.types import Hint, Scene, Segmenter
 
 logger = logging.getLogger(__name__)
 
@@ -124,8 +124,19 @@ def layouts_in_scenes(
     mined: Sequence[MinedEpisode],
     known: Mapping[str, KnownObject],
     rng: np.random.Generator,
+    segmenter: Segmenter | None = None,
+    shape: Shape = "demonstrations",
 ) -> LearnedObjects:
-    """Learn the objects that are not known yet, and find those that each episode's instruction names."""
+    """Learn the objects that are not known yet, and find those that each episode's instruction names.
+
+    Args:
+        scenes: One per episode.
+        mined: The episodes.
+        known: Objects by name that are known already.
+        rng: Chooses among the demonstrations of an object where there are more than needed.
+        segmenter: Finds the objects' masks; None to learn what they look like.
+        shape: What is learned of an object that a segmenter finds.
+    """
     named = sorted({hint.name for scene in scenes for hint in scene.hints} - set(known))
     models = dict(known)
     if named:
@@ -134,15 +145,15 @@ def layouts_in_scenes(
             replace(scene, hints=tuple(hint for hint in scene.hints if hint.name in named))
             for scene in scenes
         ]
-        learned = learn_objects(unknown, rng, known.values())
+        learned = learn_objects(unknown, rng, known.values(), segmenter, shape)
         models |= learned
         if missing := [name for name in named if name not in learned]:
             logger.warning("could not learn what %s looks like; no key pose will be anchored there", missing)
     layouts = []
     for scene, item in tqdm(zip(scenes, mined, strict=True), "Finding objects", len(scenes), unit="episode"):
-        prepared = {key: prepare(view) for key, view in scene.views.items()}
         wanted = dict.fromkeys(name for sub_task in item.sub_tasks for name in sub_task.objects)
-        estimates = {name: localise(prepared, models[name]) for name in wanted if name in models}
+        sought = {name: models[name] for name in wanted if name in models}
+        estimates = localise_all(scene.views, sought, segmenter)
         layouts.append({name: e.T_world_obj for name, e in estimates.items() if e.status == "found"})
     return LearnedObjects(models, layouts)
 

@@ -63,6 +63,13 @@ def triangulate(views: Sequence[View], centres: Sequence[Array]) -> tuple[Array,
     return point, float(np.linalg.norm(np.einsum("nij,nj->ni", across, point - origins), axis=1).max())
 
 
+def reach(view: View, blob: Blob, point_world: Array) -> float:
+    """Distance in metres, at a point's depth, from a patch's centre to its furthest pixel."""
+    v, u = np.nonzero(blob.mask)
+    distance = float(np.linalg.norm(point_world - view.T_world_cam[:3, 3]))
+    return float(np.hypot(u - blob.centre[0], v - blob.centre[1]).max()) * distance / view.camera.focal_px
+
+
 def disc(view: View, point_world: Array, radius: float) -> Mask:
     """Pixels ``(H, W)`` within ``radius`` metres of a point, at the point's depth; empty if behind."""
     p_cam = view.T_world_cam[:3, :3].T @ (point_world - view.T_world_cam[:3, 3])

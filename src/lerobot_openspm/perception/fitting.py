@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Literal
 
 import numpy as np
 
@@ -19,6 +20,9 @@ COARSE_PX, FINE_PX = 64.0, 160.0
 CORRELATED_PX = 4.0
 MIN_RESIDUAL_PX = 0.4
 MIN_VISIBLE_SHARE = 0.35
+# Relative to the overlap that is typical of the object's demonstrations.
+FOUND_CONFIDENCE = 0.5
+RIVAL_SHARE = 0.93
 
 
 @dataclass(frozen=True)
@@ -145,6 +149,17 @@ def score(overlaps: Array) -> float:
     """One number of overlaps per view: a view in which the object is hidden pulls it down, but only half."""
     seen = overlaps[np.isfinite(overlaps)]
     return 0.0 if len(seen) == 0 else float(0.5 * seen.max() + 0.5 * seen.mean())
+
+
+def verdict(
+    scores: Sequence[float], typical_overlap: float
+) -> tuple[Literal["found", "not_found", "ambiguous"], float]:
+    """Status and confidence of fits at distinct places, from their scores, the best first; one at least."""
+    confidence = float(np.clip(scores[0] / max(typical_overlap, 1e-3), 0, 1))
+    if confidence < FOUND_CONFIDENCE:
+        return "not_found", confidence
+    is_rivalled = len(scores) > 1 and scores[1] > RIVAL_SHARE * scores[0]
+    return "ambiguous" if is_rivalled else "found", confidence
 
 
 def _covariance(information: Array, prior: Array) -> Array:

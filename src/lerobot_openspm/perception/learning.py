@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
+from typing import Literal, get_args
 
 import numpy as np
 from numpy.random import Generator
@@ -12,27 +13,27 @@ from numpy.typing import NDArray
 
 from lerobot_openspm.errors import DatasetError
 from lerobot_openspm.geometry import se3
-from lerobot_openspm.geometry.camera import intersect_plane
 from lerobot_openspm.geometry.se3 import Array
-from lerobot_openspm.perception import colour, seeding, shape
-from lerobot_openspm.perception.blobs import Blob, triangulate
+from lerobot_openspm.perception import seeding, shape
+from lerobot_openspm.perception.box_learning import learn_boxes
+from lerobot_openspm.perception.first_poses import Patched, coloured, first_poses, masked, pictures_of
 from lerobot_openspm.perception.fitting import (
     COARSE_PX,
     FINE_PX,
     Cloud,
-    Evidence,
     Fit,
     Freedom,
     fit,
     measure,
     score,
 )
-from lerobot_openspm.perception.localise import COARSE_CUTS_PX, FINE_CUTS_PX, prepare
+from lerobot_openspm.perception.localise import COARSE_CUTS_PX, FINE_CUTS_PX
 from lerobot_openspm.perception.model import KnownObject, ObjectModel
 from lerobot_openspm.perception.patch_learning import learn_patches
-from lerobot_openspm.perception.seeding import Picture
 from lerobot_openspm.perception.shape import Posed, Votes
-from lerobot_openspm.perception.types import Scene, View
+from lerobot_openspm.perception.sightings import segmented
+from lerobot_openspm.perception.types import Scene, Segmenter
+from lerobot_openspm.perception.yaw import yaw_range
 
 log = logging.getLogger(__name__)
 
@@ -44,8 +45,6 @@ NARROW_YAW = np.deg2rad(60)
 ROUNDS = 4
 SYMMETRY_ROUNDS = 2
 THRESHOLDS = (0.5, 0.6, 0.7, 0.8, 0.9, 0.97)
-# Two rays that are to meet in an object may miss each other by this much, metres.
-MAX_RAY_GAP = 0.05
 # A more symmetric shape is preferred if it explains the masks as well as this.
 SYMMETRY_LOSS = 0.006
 # A yaw read into a round body does more harm than a body with corners taken for round, which costs far more.
@@ -58,11 +57,18 @@ CLEAR_VIEW = 0.8
 TRIM_LOSS = 0.0007
 NEAR_YAWS = np.deg2rad([-30.0, -10.0, 10.0, 30.0])
 TURN_GAIN = 0.008
-YAW_MARGIN = np.deg2rad(20)
+
+
+Shape = Literal["demonstrations", "box"]
+SHAPES: tuple[Shape, ...] = get_args(Shape)
 
 
 def learn_objects(
-    scenes: Sequence[Scene], rng: Generator, known: Collection[KnownObject] = ()
+    scenes: Sequence[Scene],
+    rng: Generator,
+    known: Collection[KnownObject] = (),
+    segmenter: Segmenter | None = None,
+    shape_source: Shape = "demonstrations",
 ) -> dict[str, KnownObject]:
     """Learn every object that some scene hints at.
 
@@ -70,6 +76,9 @@ def learn_objects(
         scenes: First frames and hints of the demonstrations of all tasks.
         rng: Chooses among the demonstrations of an object where there are more than needed.
         known: Objects that are known already; none of the new ones is one of them.
+        segmenter: Finds the objects' masks; by default the demonstrations teach their colours and patches.
+        shape_source: With a segmenter, "box" learns the boxes around the objects and "demonstrations" their
+            shapes; without one, there is only the latter.
 
     Returns:
         Models by name. An object that cannot be learned (never visible, no consistent colour) is left out,
@@ -83,7 +92,11 @@ def learn_objects(
         raise DatasetError(
             "no demonstration shows a grasp, contact or release; perception has nothing to learn from"
         )
+    if segmenter is not None and shape_source == "box":
+        return {**learn_boxes(names, scenes, segmenter)}
     floor = min(float(hint.point_world[2]) for scene in scenes for hint in scene.hints) - 0.02
+    if segmenter is not None:
+        return _learn_masked(names, scenes, floor, segmenter)
     models: dict[str, KnownObject] = {**learn_patches(names, scenes, known)}
     for name in names:
         model = models.get(name) or learn_object(name, scenes, floor, rng)
@@ -97,11 +110,29 @@ def learn_object(name: str, scenes: Sequence[Scene], floor: float, rng: Generato
     hinted = [i for i, scene in enumerate(scenes) if any(hint.name == name for hint in scene.hints)]
     if len(hinted) > MAX_SCENES:
         hinted = sorted(rng.choice(hinted, MAX_SCENES, replace=False).tolist())
-    pictures = [picture for i in hinted for picture in _pictures(i, name, scenes[i], floor)]
+    pictures = [picture for i in hinted for picture in pictures_of(i, name, scenes[i], floor)]
     log_odds = seeding.learn_colours(pictures)
-    posed, half_size = _first_poses(pictures, log_odds)
+    return _learn_shape(name, log_odds, coloured(pictures, log_odds), len(hinted))
+
+
+def _learn_masked(
+    names: Sequence[str], scenes: Sequence[Scene], floor: float, segmenter: Segmenter
+) -> dict[str, KnownObject]:
+    """Shapes of objects from a segmenter's masks."""
+    models: dict[str, KnownObject] = {}
+    for name, pairs in segmented(names, scenes, segmenter).items():
+        groups = {i: masked(name, scene, floor, found) for i, (scene, found) in enumerate(pairs)}
+        if model := _learn_shape(name, None, groups, len(pairs)):
+            models[name] = model
+    return models
+
+
+def _learn_shape(
+    name: str, log_odds: NDArray[np.float32] | None, groups: Mapping[int, list[Patched]], count: int
+) -> ObjectModel | None:
+    posed, half_size = first_poses(groups)
     if not posed:
-        log.warning("perception: %r was not found near the hints of its %d demonstrations", name, len(hinted))
+        log.warning("perception: %r was not found near the hints of its %d demonstrations", name, count)
         return None
     found = _bootstrap(posed, half_size)
     if found is None:
@@ -109,59 +140,6 @@ def learn_object(name: str, scenes: Sequence[Scene], floor: float, rng: Generato
         return None
     cloud, posed = found
     return _model(name, log_odds, *_finish(posed, half_size, cloud))
-
-
-def _pictures(index: int, name: str, scene: Scene, floor: float) -> list[Picture]:
-    hints = tuple(hint for hint in scene.hints if hint.name == name)
-    later = scene.later_views or {}
-    return [
-        Picture(
-            index, key, view, prepare(view).bins,
-            seeding.changed_pixels(view, later[key]) if key in later else None, hints, floor,
-        )
-        for key, view in scene.views.items()
-    ]  # fmt: skip
-
-
-def _first_poses(pictures: Sequence[Picture], log_odds: NDArray[np.float32]) -> tuple[list[Posed], float]:
-    """Places from the patches' centres, at one height and yaw 0, and half the size of a cube around them."""
-    visible = seeding.hiding_pixels(pictures, log_odds)
-    groups: dict[int, list[tuple[Evidence, Blob | None]]] = {}
-    for picture in pictures:
-        probability = colour.foreground(picture.bins, log_odds)
-        evidence = Evidence(picture.view, probability, visible.get(picture.camera), picture.camera)
-        groups.setdefault(picture.scene, []).append((evidence, seeding.hinted_blob(picture, log_odds)))
-    places: dict[int, Array] = {}
-    singles: dict[int, tuple[View, Blob]] = {}
-    sizes: list[float] = []
-    for index, group in groups.items():
-        seen = [(one.view, blob) for one, blob in group if blob is not None]
-        # Patches cut off by the image's border have a wrong centre: only if nothing else is left.
-        seen = [(view, blob) for view, blob in seen if blob.whole] or seen
-        if len(seen) >= 2:
-            point, gap = triangulate([view for view, _ in seen], [blob.centre for _, blob in seen])
-            if gap < MAX_RAY_GAP:
-                places[index] = point
-                sizes += [_reach(view, blob, point) for view, blob in seen]
-        elif seen:
-            singles[index] = seen[0]
-    if not places:
-        return [], 0.0
-    height = float(np.median([point[2] for point in places.values()]))
-    for index, (view, blob) in singles.items():
-        places[index] = intersect_plane(view.camera, view.T_world_cam, blob.centre, height)
-    posed = [
-        Posed(tuple(one for one, _ in groups[i]), se3.from_yaw([point[0], point[1], height], 0.0))
-        for i, point in sorted(places.items())
-    ]
-    return posed, 1.25 * float(np.median(sizes))
-
-
-def _reach(view: View, blob: Blob, point_world: Array) -> float:
-    """Distance in metres, at a point's depth, from a patch's centre to its furthest pixel."""
-    v, u = np.nonzero(blob.mask)
-    distance = float(np.linalg.norm(point_world - view.T_world_cam[:3, 3]))
-    return float(np.hypot(u - blob.centre[0], v - blob.centre[1]).max()) * distance / view.camera.focal_px
 
 
 def _bootstrap(posed: list[Posed], half_size: float) -> tuple[Cloud, list[Posed]] | None:
@@ -220,7 +198,7 @@ def _aligned_axis(
     Where the object hardly turns between scenes, places that are all off by the same few millimetres yield
     nearly as good a hull, and refitting corrects them too slowly; so the displacement is searched for.
     """
-    _, halfwidth = _yaw_range(np.array([se3.yaw_of(scene.T_world_obj) for scene in posed]), 2 * np.pi)
+    _, halfwidth = yaw_range(np.array([se3.yaw_of(scene.T_world_obj) for scene in posed]), 2 * np.pi)
     if halfwidth > NARROW_YAW:
         return posed
     worth_asking = shape.around(cloud, half_size)
@@ -250,7 +228,7 @@ def _symmetrise(
     posed: list[Posed], half_size: float, cloud: Cloud, limits: tuple[float, float]
 ) -> tuple[Cloud, list[Posed], float]:
     """The most symmetric shape that explains the masks as well as the free one, poses and yaw period."""
-    _, halfwidth = _yaw_range(np.array([se3.yaw_of(scene.T_world_obj) for scene in posed]), 2 * np.pi)
+    _, halfwidth = yaw_range(np.array([se3.yaw_of(scene.T_world_obj) for scene in posed]), 2 * np.pi)
     free = float(
         np.mean([one.score for one in (_refit(scene, cloud, 2 * np.pi) for scene in _reliable(posed, cloud))])
     )
@@ -363,10 +341,15 @@ def _moved(posed: Sequence[Posed], fits: Sequence[Fit]) -> list[Posed]:
 
 
 def _model(
-    name: str, log_odds: NDArray[np.float32], cloud: Cloud, posed: list[Posed], period: float, scores: Array
+    name: str,
+    log_odds: NDArray[np.float32] | None,
+    cloud: Cloud,
+    posed: list[Posed],
+    period: float,
+    scores: Array,
 ) -> ObjectModel:
     """Put the frame at the footprint's centre, x along its long side; summarise the demonstrations."""
-    centre, turn = shape.footprint(cloud.points)
+    centre, turn, _ = shape.footprint(cloud.points)
     bottom = float(cloud.points[:, 2].min()) - cloud.spacing / 2
     turn = 0.0 if period == 0 else turn
     T_old_new = se3.from_yaw([*centre, bottom], turn)
@@ -374,23 +357,9 @@ def _model(
     yaws = (
         np.array([se3.yaw_of(scene.T_world_obj) for scene in posed])[scores > 0.8 * np.median(scores)] + turn
     )
-    yaw_centre, halfwidth = _yaw_range(yaws, period)
+    yaw_centre, halfwidth = yaw_range(yaws, period)
     height = float(np.median([scene.T_world_obj[2, 3] for scene in posed])) + bottom
     return ObjectModel(
         name, log_odds, points.astype(np.float32), cloud.spacing, height, period, yaw_centre, halfwidth,
         float(np.median(scores)),
     )  # fmt: skip
-
-
-def _yaw_range(yaws: Array, period: float) -> tuple[float, float]:
-    """Middle and half width of the yaws to search: the period, or the part the demonstrations kept to."""
-    if period == 0:
-        return 0.0, 0.0
-    ordered = np.sort(np.mod(yaws, period))
-    gaps = np.diff(np.append(ordered, ordered[0] + period))
-    widest = int(gaps.argmax())
-    halfwidth = (period - gaps[widest]) / 2
-    centre = float(se3.wrap_angle(ordered[(widest + 1) % len(ordered)] + halfwidth, 2 * np.pi))
-    if halfwidth > 0.2 * period:
-        return centre, period / 2
-    return centre, float(min(halfwidth + YAW_MARGIN, period / 2))

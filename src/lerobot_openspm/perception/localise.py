@@ -1,24 +1,37 @@
-"""Finding a learned object in new images: candidates from colour, poses by aligning silhouettes."""
+"""Finding learned objects in new images, whatever they are known by.
+
+An object known by its shape: candidates from patches of foreground (its colours, or a segmenter's masks),
+poses by aligning silhouettes. Those known by patches or boxes are found in modules of their own.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Literal
 
 import numpy as np
 
-from lerobot_openspm.errors import ObservationError
+from lerobot_openspm.errors import ObservationError, PerceptionError
 from lerobot_openspm.geometry import se3
 from lerobot_openspm.geometry.camera import intersect_plane, project
 from lerobot_openspm.geometry.se3 import Array
 from lerobot_openspm.perception import colour
 from lerobot_openspm.perception.blobs import find_blobs
-from lerobot_openspm.perception.fitting import COARSE_PX, Cloud, Evidence, Fit, Freedom, fit
-from lerobot_openspm.perception.model import KnownObject, ObjectModel, PatchModel
+from lerobot_openspm.perception.box_finding import localise_box
+from lerobot_openspm.perception.fitting import COARSE_PX, Cloud, Evidence, Fit, Freedom, fit, verdict
+from lerobot_openspm.perception.model import BoxModel, KnownObject, ObjectModel, PatchModel
 from lerobot_openspm.perception.patches import localise_patches
-from lerobot_openspm.perception.types import UNKNOWN_YAW_STD, Mask, PoseEstimate, Support, View
+from lerobot_openspm.perception.sightings import Instances
+from lerobot_openspm.perception.types import (
+    UNKNOWN_YAW_STD,
+    Mask,
+    PoseEstimate,
+    Segmenter,
+    Support,
+    View,
+)
+from lerobot_openspm.perception.yaw import canonical
 
 COARSE_CUTS_PX = (30.0, 30.0, 20.0, 12.0)
 FINE_CUTS_PX = (6.0, 4.0, 3.0, 3.0)
@@ -28,18 +41,17 @@ MAX_CANDIDATES = 3
 WEAK_SHARE = 0.2
 # A candidate that fits so much worse than another is not worth a finer look.
 POOR_SHARE = 0.7
+# Corners of a box of unit size that stands on its origin.
+CORNERS = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (0.0, 1.0)])
 # A share of points is told by every so many-th.
 SHARE_STEP = 5
 # An object that is followed: how far from where it is expected it is looked for before everywhere else, and
 # how well it must be seen there for that to be left out.
 NEARBY_CUTS_PX = (12.0, 6.0, 4.0, 3.0)
 NEARBY_M, NEARBY_HEIGHT_M, NEARBY_RAD = 0.03, 0.003, 0.3
+NEARBY_CONFIDENCE = 0.9
 # An object this far above or below the plane it was learned on does not stand there.
 LIFTED_M = 0.005
-NEARBY_CONFIDENCE = 0.9
-# Relative to the overlap that is typical of the object's demonstrations.
-FOUND_CONFIDENCE = 0.5
-RIVAL_SHARE = 0.93
 
 
 @dataclass(frozen=True)
@@ -71,10 +83,39 @@ def prepare(view: View) -> Prepared:
     return Prepared(view)
 
 
+def localise_all(
+    views: Mapping[str, View],
+    models: Mapping[str, KnownObject],
+    segmenter: Segmenter | None = None,
+    hidden: Mapping[str, Mask] | None = None,
+    expected: Mapping[str, Array] | None = None,
+) -> dict[str, PoseEstimate]:
+    """Find several objects in the views of one moment; a segmenter is asked once for all of them.
+
+    Args:
+        views: Views by camera name.
+        models: The objects by phrase.
+        segmenter: Finds the masks of objects that were learned from a segmenter's; None if none were.
+        hidden: Pixels ``(H, W)`` by camera name that something may be in front of.
+        expected: Poses ``(4, 4)`` by phrase at which objects are looked for first.
+
+    Raises:
+        ObservationError: There is no view, or one is malformed.
+        PerceptionError: An object needs a segmenter and there is none, or the segmenter cannot be used.
+    """
+    prepared = {camera: prepare(view) for camera, view in views.items()}
+    instances = segmenter.segment(views, list(models)) if segmenter is not None and models else {}
+    return {
+        name: localise(prepared, model, None, instances.get(name), hidden, (expected or {}).get(name))
+        for name, model in models.items()
+    }
+
+
 def localise(
     views: Mapping[str, View | Prepared],
     model: KnownObject,
     freedom: Freedom | None = None,
+    instances: Instances | None = None,
     hidden: Mapping[str, Mask] | None = None,
     T_expected: Array | None = None,
 ) -> PoseEstimate:
@@ -86,61 +127,72 @@ def localise(
         freedom: Prior around the start poses; by default the object stands on its support plane, at any place
             and any yaw within the range that its demonstrations showed. An object known by patches is sought
             near its demonstrated places, whatever this says.
+        instances: What a segmenter found of the object's phrase, by camera; for objects that were learned
+            from a segmenter's masks.
         hidden: Pixels ``(H, W)`` by camera name that something may be in front of; no evidence.
         T_expected: Pose ``(4, 4)`` at which the object is looked for first; elsewhere only if it is not
             there.
 
     Raises:
         ObservationError: There is no view, or one is malformed.
+        PerceptionError: The object was learned from masks, and none are given.
     """
     if not views:
         raise ObservationError("no camera views to look for an object in; pass at least one")
     prepared = [view if isinstance(view, Prepared) else prepare(view) for view in views.values()]
+    plain = {name: one.view for name, one in zip(views, prepared, strict=True)}
     hidden = hidden or {}
     if isinstance(model, PatchModel):
-        pictures = {name: one.view for name, one in zip(views, prepared, strict=True)}
-        return localise_patches(pictures, model, hidden, T_expected)
-    evidence = [
-        Evidence(
-            one.view,
-            colour.foreground(one.bins, model.log_odds),
-            None if name not in hidden else 1 - hidden[name].astype(np.float32),
-        )
-        for name, one in zip(views, prepared, strict=True)
-    ]
+        return localise_patches(plain, model, hidden, T_expected)
+    if isinstance(model, BoxModel):
+        found = localise_box(plain, model, _required(instances, model.name))
+        place = found.T_world_obj if found.status == "found" or T_expected is None else T_expected
+        corners = model.size * CORNERS
+        return replace(found, visible=seen_share(plain, hidden, se3.apply(place, corners)))
+    evidence = _evidence(plain, prepared, model, instances, hidden)
+    return _localise_shape(plain, evidence, model, freedom or Freedom(), hidden, T_expected)
+
+
+def _localise_shape(
+    views: Mapping[str, View],
+    evidence: Sequence[Evidence],
+    model: ObjectModel,
+    freedom: Freedom,
+    hidden: Mapping[str, Mask],
+    T_expected: Array | None,
+) -> PoseEstimate:
     masks = {name: one.probability > 0.5 for name, one in zip(views, evidence, strict=True)}
     cloud = Cloud(model.points.astype(float), model.spacing)
+
+    def share(T_world_obj: Array) -> float:
+        return seen_share(views, hidden, se3.apply(T_world_obj, cloud.points[::SHARE_STEP]))
+
     if T_expected is not None:
         there = fit(evidence, cloud, T_expected, _nearby(model, T_expected), NEARBY_CUTS_PX)
         if there.score >= NEARBY_CONFIDENCE * model.typical_overlap:
-            return _estimate("found", there, model, masks, seen_share(evidence, cloud, there.T_world_obj))
-    fits = search(evidence, model, freedom or Freedom())
+            return _estimate([there], model, masks, share(there.T_world_obj))
+    fits = search(evidence, model, freedom)
     if not fits:
-        share = 1.0 if T_expected is None else seen_share(evidence, cloud, T_expected)
-        return PoseEstimate("not_found", np.eye(4), _ignorance(), 0.0, masks, share)
-    best = fits[0]
-    status = "found" if best.score >= FOUND_CONFIDENCE * model.typical_overlap else "not_found"
-    if status == "found" and len(fits) > 1 and fits[1].score > RIVAL_SHARE * best.score:
-        status = "ambiguous"
-    place = best.T_world_obj if status == "found" or T_expected is None else T_expected
-    return _estimate(status, best, model, masks, seen_share(evidence, cloud, place))
+        in_sight = 1.0 if T_expected is None else share(T_expected)
+        return PoseEstimate("not_found", np.eye(4), _ignorance(), 0.0, masks, in_sight)
+    estimate = _estimate(fits, model, masks, 1.0)
+    place = fits[0].T_world_obj if T_expected is None or estimate.status == "found" else T_expected
+    return replace(estimate, visible=share(place))
 
 
 def _estimate(
-    status: Literal["found", "not_found", "ambiguous"],
-    best: Fit,
-    model: ObjectModel,
-    masks: dict[str, Mask],
-    share: float,
+    fits: Sequence[Fit], model: ObjectModel, masks: dict[str, Mask], visible: float
 ) -> PoseEstimate:
-    confidence = float(np.clip(best.score / max(model.typical_overlap, 1e-3), 0, 1))
+    """The best of several fits, and what the others say of it."""
+    best = fits[0]
+    status, confidence = verdict([one.score for one in fits], model.typical_overlap)
     covariance = best.covariance.copy()
     if model.yaw_period == 0:
         covariance[3, :] = covariance[:, 3] = 0
         covariance[3, 3] = UNKNOWN_YAW_STD**2
-    T_world_obj = canonical(best.T_world_obj, model)
+    T_world_obj = canonical(best.T_world_obj, model.yaw_period, model.yaw_centre)
     support = _support(best, model, masks)
-    return PoseEstimate(status, T_world_obj, covariance, confidence, masks, share, support)
+    return PoseEstimate(status, T_world_obj, covariance, confidence, masks, visible, support)
 
 
 def _support(best: Fit, model: ObjectModel, masks: Mapping[str, Mask]) -> Support:
@@ -159,19 +211,54 @@ def _nearby(model: ObjectModel, T_expected: Array) -> Freedom:
     )
 
 
-def seen_share(evidence: Sequence[Evidence], cloud: Cloud, T_world_obj: Array) -> float:
-    """Share of a model's points that the view that shows it best has in the picture, not hidden."""
-    points = se3.apply(T_world_obj, cloud.points[::SHARE_STEP])
+def seen_share(views: Mapping[str, View], hidden: Mapping[str, Mask], points_world: Array) -> float:
+    """Share of points ``(n, 3)`` that are in the picture and not hidden, in the view that shows most."""
     shares = [0.0]
-    for one in evidence:
-        uv, depth = project(one.view.camera, one.view.T_world_cam, points)
+    for name, view in views.items():
+        uv, depth = project(view.camera, view.T_world_cam, points_world)
         uv = np.nan_to_num(uv, nan=-1.0)
-        size = np.array([one.view.camera.width, one.view.camera.height])
+        size = np.array([view.camera.width, view.camera.height])
         inside = (depth > 0) & (uv >= 0).all(1) & (uv <= size - 1).all(1)
-        if one.visible is not None:
-            inside[inside] = one.visible[tuple(np.rint(uv[inside]).astype(int).T[::-1])] > 0.5
+        if name in hidden:
+            inside[inside] = ~hidden[name][tuple(np.rint(uv[inside]).astype(int).T[::-1])]
         shares.append(float(inside.mean()))
     return max(shares)
+
+
+def _evidence(
+    views: Mapping[str, View],
+    prepared: Sequence[Prepared],
+    model: ObjectModel,
+    instances: Instances | None,
+    hidden: Mapping[str, Mask],
+) -> list[Evidence]:
+    """Every view with the foreground probability of the object's pixels, and what of it is in sight."""
+    if model.log_odds is None:
+        evidence = masked_evidence(views, _required(instances, model.name))
+    else:
+        evidence = [Evidence(one.view, colour.foreground(one.bins, model.log_odds)) for one in prepared]
+    visible = [None if name not in hidden else 1 - hidden[name].astype(np.float32) for name in views]
+    return [replace(one, visible=mask) for one, mask in zip(evidence, visible, strict=True)]
+
+
+def masked_evidence(views: Mapping[str, View], instances: Instances) -> list[Evidence]:
+    """Every view with all instances of a phrase as foreground, in the order of the views."""
+    evidence = []
+    for name, view in views.items():
+        mask = np.zeros(view.image.shape[:2], np.float32)
+        for one in instances.get(name, ()):
+            mask[one.mask] = 1.0
+        evidence.append(Evidence(view, mask, camera=name))
+    return evidence
+
+
+def _required(instances: Instances | None, name: str) -> Instances:
+    if instances is None:
+        raise PerceptionError(
+            f"{name!r} was learned from a segmenter's masks, and is to be found without them; give the "
+            "segmenter that it was learned with"
+        )
+    return instances
 
 
 def search(evidence: Sequence[Evidence], model: ObjectModel, freedom: Freedom) -> list[Fit]:
@@ -224,14 +311,6 @@ def candidates(evidence: Sequence[Evidence], model: ObjectModel) -> list[Array]:
     order = np.argsort(-np.array(strength), kind="stable")[:MAX_CANDIDATES]
     order = [i for i in order if strength[i] >= WEAK_SHARE * max(strength)]
     return [np.array([places[i][0], places[i][1], model.height]) for i in order]
-
-
-def canonical(T_world_obj: Array, model: ObjectModel) -> Array:
-    """The same pose with its yaw brought to within half a period of the demonstrations' middle yaw."""
-    if model.yaw_period == 0:
-        return se3.from_yaw(T_world_obj[:3, 3], 0.0)
-    turn = se3.wrap_angle(se3.yaw_of(T_world_obj) - model.yaw_centre, model.yaw_period)
-    return se3.from_yaw(T_world_obj[:3, 3], model.yaw_centre + turn)
 
 
 def _distinct(fits: list[Fit], radius: float) -> list[Fit]:

@@ -1,4 +1,4 @@
-"""What is known of one object after learning: colours and a shape, or patches of the images around it."""
+"""What is known of one object after learning: colours and a shape, patches of the images, or a box."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ Picture = NDArray[np.uint8]
 
 @dataclass(frozen=True)
 class ObjectModel:
-    """An object known by its colours and its shape.
+    """An object known by its shape, and by its colours where these tell its pixels.
 
     Attributes:
         name: The noun phrase.
-        log_odds: Foreground log-odds ``(N_BINS,)`` per colour, float32.
+        log_odds: Foreground log-odds ``(N_BINS,)`` per colour, float32; None where a segmenter finds it.
         points: Surface points ``(n, 3)`` in the object's frame, metres, float32. The frame is upright, its
             origin at the footprint's centre on the support plane.
         spacing: Distance between neighbouring points, metres.
@@ -31,7 +31,7 @@ class ObjectModel:
     """
 
     name: str
-    log_odds: NDArray[np.float32]
+    log_odds: NDArray[np.float32] | None
     points: NDArray[np.float32]
     spacing: float
     height: float
@@ -115,4 +115,46 @@ class PatchModel:
         return 2 * np.pi
 
 
-KnownObject = ObjectModel | PatchModel
+# A footprint whose sides differ by less than this share is a square: which is the longer cannot be seen.
+SQUARE_SHARE = 0.06
+
+
+@dataclass(frozen=True)
+class BoxModel:
+    """An object known by the upright box around it; a segmenter gives its masks.
+
+    Attributes:
+        name: The noun phrase.
+        size: Long side, short side and height ``(3,)``, metres.
+        height: World z of the support plane the object stood on, metres.
+        yaw_period: Turning by this angle (radians) leaves the object unchanged, as far as one can know: 0 for
+            round footprints, else that of the box where its demonstrations showed it at all yaws, and a full
+            turn where they did not, because nothing showed that it looks alike from the other sides.
+        yaw_centre: Middle of the yaws seen in the demonstrations, radians.
+        typical_overlap: Intersection over union of box and masks, median over the demonstrations.
+    """
+
+    name: str
+    size: Array
+    height: float
+    yaw_period: float
+    yaw_centre: float
+    typical_overlap: float
+
+    @property
+    def is_round(self) -> bool:
+        """Whether the body is the cylinder inscribed in the box."""
+        return self.yaw_period == 0
+
+    @property
+    def box_period(self) -> float:
+        """Angle in radians that turns the box, if not the object, into itself: all it shows of the yaw."""
+        return 0.0 if self.is_round else box_period(self.size)
+
+
+def box_period(size: Array) -> float:
+    """Angle in radians that turns a box of ``size (3,)``, the long side first, into itself."""
+    return float(np.pi / 2 if size[0] - size[1] < SQUARE_SHARE * size[0] else np.pi)
+
+
+KnownObject = ObjectModel | PatchModel | BoxModel

@@ -56,7 +56,7 @@ class Picture:
         seed = np.zeros(self.bins.shape, bool)
         for hint in self.hints:
             if hint.kind == "release":
-                for point in self._column(hint):
+                for point in column(hint, self.floor):
                     seed |= disc(self.view, point, RELEASE_RADIUS)
                 continue
             near = disc(self.view, hint.point_world, SEED_RADIUS)
@@ -69,13 +69,15 @@ class Picture:
         """Pixels ``(H, W)`` within a wide radius of the hints."""
         mask = np.zeros(self.bins.shape, bool)
         for hint in self.hints:
-            for point in self._column(hint) if hint.kind == "release" else [hint.point_world]:
+            for point in column(hint, self.floor) if hint.kind == "release" else [hint.point_world]:
                 mask |= disc(self.view, point, NEUTRAL_RADIUS)
         return mask
 
-    def _column(self, hint: Hint) -> list[NDArray[np.float64]]:
-        heights = np.arange(hint.point_world[2], self.floor - 1e-9, -0.02)
-        return [np.array([*hint.point_world[:2], z], dtype=np.float64) for z in heights]
+
+def column(hint: Hint, floor: float) -> list[NDArray[np.float64]]:
+    """Points ``(3,)`` every 2 cm from a hint straight down to the world height ``floor``."""
+    heights = np.arange(hint.point_world[2], floor - 1e-9, -0.02)
+    return [np.array([*hint.point_world[:2], z], dtype=np.float64) for z in heights]
 
 
 def changed_pixels(first: View, later: View) -> Mask | None:

@@ -118,11 +118,16 @@ def vote(scenes: Sequence[Posed], half_size: float, worth: NDArray[np.bool_] | N
     return Votes(share, spacing)
 
 
-def footprint(points: Array) -> tuple[Array, float]:
-    """Centre ``(2,)`` and long axis (radians) of the smallest rectangle around points ``(n, 3)``."""
+def footprint(points: Array) -> tuple[Array, float, Array]:
+    """The smallest upright rectangle around points ``(n, 3)``, whatever their heights.
+
+    Returns:
+        Its centre ``(2,)``, the direction of its long side (radians), its sides ``(2,)``, the longer first.
+    """
     (x, y), (width, depth), angle = cv2.minAreaRect(points[:, :2].astype(np.float32) * 1000)
     long_axis = np.deg2rad(angle) + (0.0 if width >= depth else np.pi / 2)
-    return np.array([x, y]) / 1000, float(se3.wrap_angle(long_axis, np.pi))
+    sides = np.array([max(width, depth), min(width, depth)]) / 1000
+    return np.array([x, y]) / 1000, float(se3.wrap_angle(long_axis, np.pi)), sides
 
 
 def around(cloud: Cloud, half_size: float) -> NDArray[np.bool_]:

@@ -12,7 +12,7 @@ from lerobot_openspm.errors import MemoryFormatError
 from lerobot_openspm.geometry import se3
 from lerobot_openspm.geometry.camera import Camera
 from lerobot_openspm.perception.colour import N_BINS
-from lerobot_openspm.perception.model import KnownObject, ObjectModel, Patch, PatchModel, Probe
+from lerobot_openspm.perception.model import BoxModel, KnownObject, ObjectModel, Patch, PatchModel, Probe
 
 VERSION = 1
 MAX_POINTS = 200_000
@@ -27,15 +27,27 @@ NUMBERS = {
     "yaw_halfwidth": (0.0, np.pi + 1e-9),
     "typical_overlap": (0.0, 1.0),
 }
+BOX_NUMBERS = ("height", "yaw_period", "yaw_centre", "typical_overlap")
+BOX_SIZES = (1e-4, 10.0)
+# Where the pixels of an object known by its shape come from.
+COLOURS, SEGMENTER = "colours", "segmenter"
 
 
 def to_parts(model: KnownObject) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
     """Split a model into what belongs in JSON and what belongs in a safetensors file."""
     if isinstance(model, PatchModel):
         return _patches_to_parts(model)
+    if isinstance(model, BoxModel):
+        own = {name: float(getattr(model, name)) for name in BOX_NUMBERS}
+        size = [float(side) for side in model.size]
+        return {"version": VERSION, "kind": "box", "name": model.name, "size": size, **own}, {}
     numbers = {name: float(getattr(model, name)) for name in NUMBERS}
-    arrays = {"log_odds": model.log_odds.astype(np.float32), "points": model.points.astype(np.float32)}
-    return {"version": VERSION, "kind": "shape", "name": model.name, **numbers}, arrays
+    arrays = {"points": model.points.astype(np.float32)}
+    if model.log_odds is not None:
+        arrays = {"log_odds": model.log_odds.astype(np.float32), **arrays}
+    foreground = SEGMENTER if model.log_odds is None else COLOURS
+    fields = {"version": VERSION, "kind": "shape", "foreground": foreground, "name": model.name, **numbers}
+    return fields, arrays
 
 
 def from_parts(data: Mapping[str, Any], arrays: Mapping[str, NDArray[Any]], where: str) -> KnownObject:
@@ -55,16 +67,38 @@ def from_parts(data: Mapping[str, Any], arrays: Mapping[str, NDArray[Any]], wher
     kind = data.get("kind", "shape")
     if kind == "patches":
         return _patches_from_parts(name, data, arrays, where)
+    if kind == "box":
+        return _box_from_parts(name, data, where)
     if kind != "shape":
         raise MemoryFormatError(
-            f"{where}: object {name!r} is of kind {kind!r}, expected shape or patches; learn it again"
+            f"{where}: object {name!r} is of kind {kind!r}, expected shape, patches or box; learn it again"
+        )
+    # Until version 3 all memories held colours, and did not say so.
+    foreground = data.get("foreground", COLOURS)
+    if foreground not in (COLOURS, SEGMENTER):
+        raise MemoryFormatError(
+            f"{where}: 'foreground' of {name!r} is {foreground!r}, expected {COLOURS} or {SEGMENTER}"
         )
     numbers = {key: _number(data, key, *NUMBERS[key], where) for key in NUMBERS}
-    log_odds = _array(arrays, "log_odds", (N_BINS,), where)
+    log_odds = _array(arrays, "log_odds", (N_BINS,), where) if foreground == COLOURS else None
     points = _array(arrays, "points", (-1, 3), where)
     if not 8 <= len(points) <= MAX_POINTS:
         raise MemoryFormatError(f"{where}: 'points' has {len(points)} rows, expected 8 to {MAX_POINTS}")
     return ObjectModel(name=name, log_odds=log_odds, points=points, **numbers)
+
+
+def _box_from_parts(name: str, data: Mapping[str, Any], where: str) -> BoxModel:
+    numbers = {key: _number(data, key, *NUMBERS[key], where) for key in BOX_NUMBERS}
+    sides = data.get("size")
+    if not isinstance(sides, list) or len(sides) != 3:
+        raise MemoryFormatError(f"{where}: 'size' of {name!r} is {sides!r}, expected a list of 3 lengths")
+    size = [_number({"size": side}, "size", *BOX_SIZES, where) for side in sides]
+    if size[0] < size[1] or (numbers["yaw_period"] == 0 and size[0] != size[1]):
+        raise MemoryFormatError(
+            f"{where}: 'size' of {name!r} is {sides}, expected the long side first, and both alike for a yaw "
+            "period of 0; learn it again"
+        )
+    return BoxModel(name=name, size=np.array(size), **numbers)
 
 
 def _patches_to_parts(model: PatchModel) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:

@@ -5,12 +5,13 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 
 import numpy as np
+from numpy.typing import NDArray
 
 from lerobot_openspm.errors import PerceptionError
 from lerobot_openspm.perception import colour
 from lerobot_openspm.perception.blobs import find_blobs
 from lerobot_openspm.perception.localise import Prepared
-from lerobot_openspm.perception.model import KnownObject, ObjectModel
+from lerobot_openspm.perception.model import KnownObject, ObjectModel, PatchModel
 from lerobot_openspm.perception.segmentation.instances import check_query, distinct_instances
 from lerobot_openspm.perception.types import Segmentation, View
 
@@ -46,19 +47,25 @@ class LearnedSegmenter:
             ObservationError: A view is malformed.
         """
         prepared, wanted = check_query(views, phrases)
-        models = {phrase: self._model(phrase) for phrase in wanted}
+        colours = {phrase: self._colours(phrase) for phrase in wanted}
         return {
-            phrase: {camera: _find(view, model) for camera, view in prepared.items()}
-            for phrase, model in models.items()
+            phrase: {camera: _find(view, log_odds) for camera, view in prepared.items()}
+            for phrase, log_odds in colours.items()
         }
 
-    def _model(self, phrase: str) -> ObjectModel:
+    def _colours(self, phrase: str) -> NDArray[np.float32]:
         model = self._objects.get(phrase)
-        if isinstance(model, ObjectModel):
-            return model
-        masked = [name for name, one in self._objects.items() if isinstance(one, ObjectModel)]
+        if isinstance(model, ObjectModel) and model.log_odds is not None:
+            return model.log_odds
+        masked = [
+            name
+            for name, one in self._objects.items()
+            if isinstance(one, ObjectModel) and one.log_odds is not None
+        ]
         if model is None:
             what, how = f"the demonstrations taught no {phrase!r}", "that touch it"
+        elif not isinstance(model, PatchModel):
+            what, how = f"{phrase!r} was learned from another segmenter's masks, not by its colours", "of it"
         else:
             what = f"{phrase!r} is known by patches of the images, which have a pose but are no mask of it"
             how = "in which it stands in places more than 3 cm apart"
@@ -69,8 +76,8 @@ class LearnedSegmenter:
         )
 
 
-def _find(view: Prepared, model: ObjectModel) -> tuple[Segmentation, ...]:
-    probability = colour.foreground(view.bins, model.log_odds)
+def _find(view: Prepared, log_odds: NDArray[np.float32]) -> tuple[Segmentation, ...]:
+    probability = colour.foreground(view.bins, log_odds)
     blobs = find_blobs(probability, MIN_BLOB_PX, MAX_BLOBS)
     if not blobs:
         return ()
