@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -171,20 +171,27 @@ def load_experience(directory: Path) -> Experience:
         own = {key.removeprefix(prefix): value for key, value in arrays.items() if key.startswith(prefix)}
         models[name] = object_from_parts(fields, own, where)
     entries = entries_from_parts(rows, arrays, where)
-    if perception != "oracle":
-        _check_anchors(entries, models, where)
     cameras = load_cameras(directory / CAMERAS_JSON)
     return Experience(entries, models, robot, cameras, perception, simulator_objects, segmentation, shape)
 
 
-def _check_anchors(entries: Sequence[MemoryEntry], models: Mapping[str, KnownObject], where: str) -> None:
-    """Every object that a key pose is relative to has to be one that perception can look for."""
-    for i, entry in enumerate(entries):
+def check_anchors(experience: Experience, where: str) -> None:
+    """Every object that a key pose is relative to has to be one that perception can look for.
+
+    Args:
+        experience: What was loaded.
+        where: Names its file in errors.
+
+    Raises:
+        MemoryFormatError: There is no model of an object.
+    """
+    known = experience.objects
+    for i, entry in enumerate(experience.entries):
         for name in entry.objects:
-            if name not in models:
+            if name not in known and experience.perception != "oracle":
                 raise MemoryFormatError(
                     f"{where}: entries[{i}] has key poses at {name!r}, which is none of the 'objects' that "
-                    f"perception knows ({', '.join(sorted(models)) or 'none'}); train or pull it again"
+                    f"perception knows ({', '.join(sorted(known)) or 'none'}); train or pull it again"
                 )
 
 

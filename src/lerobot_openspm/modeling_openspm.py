@@ -21,7 +21,15 @@ from torch import Tensor
 from lerobot_openspm.configuration_openspm import OpenSPMConfig
 from lerobot_openspm.control.row import Knowledge, Row
 from lerobot_openspm.errors import DatasetError, MemoryFormatError
-from lerobot_openspm.experience import CAMERAS_JSON, FILES, Experience, load_experience, save_experience
+from lerobot_openspm.experience import (
+    CAMERAS_JSON,
+    FILES,
+    MEMORY_JSON,
+    Experience,
+    check_anchors,
+    load_experience,
+    save_experience,
+)  # fmt: skip
 from lerobot_openspm.flow.condition import CONDITION_DIM, Query, encode, to_world_frame
 from lerobot_openspm.flow.network import VelocityField
 from lerobot_openspm.flow.training_set import TrainingSet
@@ -262,6 +270,7 @@ class OpenSPMPolicy(PreTrainedPolicy):
             raise MemoryFormatError(
                 f"the memory in {directory} holds no entries, so nothing can be done with it; train again"
             )
+        check_anchors(self.experience, str(directory / MEMORY_JSON))
         for name in ("perception", "segmentation", "shape"):
             made, asked = getattr(self.experience, name), getattr(self.config, name)
             if made != asked:

@@ -241,5 +241,38 @@ def test_a_dataset_without_the_calibrated_camera_is_refused(
     (tmp_path / "cameras.json").write_text(json.dumps(data))
     config = new_config(tiny_meta)
     config.cameras = str(tmp_path / "cameras.json")
-    with pytest.raises(DatasetError, match=r"no camera 'observation\.images\.roof'.*front"):
+    message = r"cameras\.json: cameras\['observation\.images\.roof'\] has no images.*images\.front"
+    with pytest.raises(CalibrationError, match=message):
         OpenSPMPolicy(config, dataset_meta=tiny_meta)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"width": 640, "height": 480}, r"cameras\['observation\.images\.front'\] 'width' and 'height'.*480"),
+        ({"T_mount_cam": np.diag([1.0, 1.0, 1.1, 1.0]).tolist()}, "front.*'T_mount_cam' is not a rigid"),
+        ({"fx": 0.0}, "front.*focal lengths must be positive"),
+    ],
+)
+def test_a_calibration_that_cannot_be_is_refused_when_it_is_loaded(
+    checkpoint: Path, tmp_path: Path, change: dict, message: str
+):
+    shutil.copytree(checkpoint, tmp_path / "changed")
+    file = tmp_path / "changed" / "cameras.json"
+    data = json.loads(file.read_text())
+    data["cameras"][FRONT] |= change
+    file.write_text(json.dumps(data))
+    with pytest.raises(CalibrationError, match=r"changed/cameras\.json: .*" + message):
+        OpenSPMPolicy.from_pretrained(tmp_path / "changed")
+
+
+def test_an_object_that_perception_does_not_know_is_refused_when_it_is_loaded(
+    checkpoint: Path, tmp_path: Path
+):
+    shutil.copytree(checkpoint, tmp_path / "changed")
+    file = tmp_path / "changed" / "memory.json"
+    data = json.loads(file.read_text())
+    name = data["objects"].pop(0)["name"]
+    file.write_text(json.dumps(data))
+    with pytest.raises(MemoryFormatError, match=rf"memory\.json: entries\[\d+\] has key poses at '{name}'"):
+        OpenSPMPolicy.from_pretrained(tmp_path / "changed")
