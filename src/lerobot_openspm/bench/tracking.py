@@ -16,7 +16,8 @@ from lerobot_openspm.bench.episode import run_episode
 from lerobot_openspm.bench.tabletop import GRASPED, Disturbance, TabletopWorld, move_cameras
 from lerobot_openspm.cli.pipeline import rate
 from lerobot_openspm.envs.tabletop_env import TabletopEnv
-from lerobot_openspm.envs.tasks import TASK_NAMES
+from lerobot_openspm.envs.tasks import TASK_NAMES, select_tasks
+from lerobot_openspm.errors import OpenSPMError
 from lerobot_openspm.modeling_openspm import OpenSPMPolicy
 
 
@@ -86,13 +87,25 @@ def run(checkpoint: str, condition: Condition, task: str, seed: int) -> Result:
     )  # fmt: skip
 
 
-def jobs(conditions: Sequence[Condition], episodes: int, seed: int) -> list[tuple[Condition, str, int]]:
-    """So many episodes of every condition, the tasks in turn, every task from the same seeds."""
-    return [
-        (condition, condition.tasks[i % len(condition.tasks)], seed + i // len(condition.tasks))
-        for i in range(episodes)
-        for condition in conditions
-    ]
+def jobs(
+    conditions: Sequence[Condition], selection: str, episodes: int, seed: int
+) -> list[tuple[Condition, str, int]]:
+    """So many episodes of every condition, the selected tasks in turn, every task from the same seeds.
+
+    Raises:
+        OpenSPMError: A condition makes sense for none of the selected tasks.
+    """
+    found = []
+    for condition in conditions:
+        tasks = [task for task in select_tasks(selection) if task in condition.tasks]
+        if not tasks:
+            raise OpenSPMError(
+                f"env.task={selection}: nothing can be {condition.name} there, expected some of "
+                f"{', '.join(condition.tasks)}"
+            )
+        found.append([(condition, tasks[i % len(tasks)], seed + i // len(tasks)) for i in range(episodes)])
+    # In turns, so that an interrupted run has as many of each.
+    return [job for turn in zip(*found, strict=True) for job in turn]
 
 
 def read(log: Path) -> dict[tuple[str, str, int], Result]:
@@ -108,9 +121,10 @@ def read(log: Path) -> dict[tuple[str, str, int], Result]:
 
 
 def write_line(log: Path, result: Result) -> None:
-    """Write a result down."""
+    """Write a result down, on a line of its own even if the one before was torn."""
+    torn = log.exists() and not log.read_bytes().endswith(b"\n")
     with log.open("a") as file:
-        file.write(json.dumps(asdict(result)) + "\n")
+        file.write("\n" * torn + json.dumps(asdict(result)) + "\n")
 
 
 def summarise(results: Sequence[Result]) -> dict[str, Any]:

@@ -138,7 +138,7 @@ def _disturbed(config: BenchConfig, what: str, conditions: Sequence[Any]) -> dic
         raise OpenSPMError(f"bench {what} disturbs the tabletop alone, got env.type={config.env.type}")
     log = config.folder(what) / "episodes.jsonl"
     checkpoint = str(config.checkpoint)
-    jobs = measure.jobs(conditions, config.episodes, config.seed)
+    jobs = measure.jobs(conditions, config.env.task, config.episodes, config.seed)
     done = measure.read(log)
     left = [(checkpoint, *job) for job in jobs if (job[0].name, *job[1:]) not in done]
     for result in _each(config.workers, measure.run, left):
