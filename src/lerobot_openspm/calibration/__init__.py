@@ -1,1 +1,1 @@
-"""Estimating a camera's pose, and its focal length, from demonstrations: the hand's known poses against images."""
+"""Estimating a camera's pose and focal length from demonstrations: the hand's poses against images."""

@@ -22,7 +22,7 @@ class Problem:
 
     Attributes:
         observations: Where the tracks were seen.
-        feature: Feature of each track ``(n_tracks,)``, numbered from 0; tracks of one feature share its place.
+        feature: Feature of each track ``(n_tracks,)``, from 0; tracks of one feature share its place.
         weights: Weight of each track ``(n_tracks,)``.
         scale_px: Residuals beyond this count by their length and not by its square (pseudo-Huber loss).
         free_focal: Whether the focal length is adjusted too.
@@ -139,7 +139,7 @@ def normal_equations(camera: Camera, points: Array, problem: Problem) -> Normal:
 
 
 def moved(camera: Camera, step: Array) -> Camera:
-    """A camera after a step: rotation vector, displacement, and change of the logarithm of the focal length."""
+    """A camera after a step: rotation vector, displacement, change of the focal length's logarithm."""
     T = se3.transform(
         se3.exp_so3(step[:3]) @ camera.T_mount_cam[:3, :3], camera.T_mount_cam[:3, 3] + step[3:6]
     )

@@ -59,7 +59,7 @@ def estimate_camera(
     mirrored: bool | None,
     rng: np.random.Generator,
 ) -> Estimate:
-    """Estimate a camera's pose from features that move with the hand, or that lie still while it carries the camera.
+    """Estimate a camera's pose from features that move with the hand, or lie still where the hand carries it.
 
     Args:
         tracks: Features that were followed; many may be of other things.
@@ -79,9 +79,7 @@ def estimate_camera(
     blank = Camera(width, height, focal, focal, (width - 1) / 2, (height - 1) / 2, mount, np.eye(4))
     free_focal = fov_deg is None
     tracks = moving(tracks, height)
-    camera = first_estimate(
-        tracks, T_world_ee, blank, free_focal=free_focal, mirrored=mirrored, rng=rng
-    )
+    camera = first_estimate(tracks, T_world_ee, blank, free_focal=free_focal, mirrored=mirrored, rng=rng)
     camera, believed = refine(camera, observe(tracks, T_world_ee, mount), free_focal=free_focal)
     if believed.n_tracks < MIN_TRACKS:
         raise CalibrationError(
@@ -111,7 +109,7 @@ def _refuse_what_is_uncertain(estimate: Estimate) -> None:
     raise CalibrationError(
         f"the episodes leave the camera's position open by {1e3 * position_m:.0f} mm and its orientation by "
         f"{np.rad2deg(rotation_rad):.1f} degrees (standard deviations), expected at most "
-        f"{1e3 * MAX_POSITION_SD_M:.0f} mm and {np.rad2deg(MAX_ROTATION_SD_RAD):.0f}; record episodes in which "
-        "the hand turns about two axes by 45 degrees or more while the camera sees it, and name them in "
+        f"{1e3 * MAX_POSITION_SD_M:.0f} mm and {np.rad2deg(MAX_ROTATION_SD_RAD):.0f}; record episodes in "
+        "which the hand turns about two axes by 45 degrees or more while the camera sees it, and name them in "
         "--episodes=[...]"
     )

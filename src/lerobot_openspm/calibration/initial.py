@@ -1,9 +1,10 @@
 """A first estimate of the camera from features whose place on their body is not known.
 
-While the hand does not turn, a feature fixed to it moves as the hand does, from an unknown start: its image is
-that of the hand's position shifted by three unknown numbers. These are eliminated from the linear equations of
-the projection; what is left, over a few tracks, is the camera's rotation and focal length. The camera's
-position is known only up to where the features are, which the turning of the hand tells later (`refine`).
+While the hand does not turn, a feature fixed to it moves as the hand does, from an unknown start: its image
+is that of the hand's position shifted by three unknown numbers. These are eliminated from the linear
+equations of the projection; what is left, over a few tracks, is the camera's rotation and focal length. The
+camera's position is known only up to where the features are, which the turning of the hand tells later
+(`refine`).
 """
 
 from __future__ import annotations
@@ -84,9 +85,9 @@ def first_estimate(
     pieces = moving(without_turns(tracks, T_world_ee), camera.height)
     if len(pieces) < MIN_TRACKS:
         raise CalibrationError(
-            f"only {len(pieces)} features were seen to move by {MIN_MOTION:.0%} of the image's height, expected "
-            f"at least {MIN_TRACKS}; give more episodes with --episodes=[...], or check --mount (a camera on the "
-            "hand needs --mount=ee)"
+            f"only {len(pieces)} features were seen to move by {MIN_MOTION:.0%} of the image's height, "
+            f"expected at least {MIN_TRACKS}; give more episodes with --episodes=[...], or check --mount (a "
+            "camera on the hand needs --mount=ee)"
         )
     seen = [observe([piece], T_world_ee, camera.mount) for piece in pieces]
     chance = np.array([np.sqrt(np.ptp(p.uv, axis=0).max() * len(p.uv)) for p in pieces])

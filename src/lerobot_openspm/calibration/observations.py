@@ -1,7 +1,7 @@
 """Tracks of many episodes as flat arrays, the same for cameras in the world and on the hand.
 
-A camera is fixed to its *mount*, and the features it follows are fixed to a *body*: hand features for a camera
-in the world, things that lie still for a camera on the hand. Either way a feature at ``x`` in the body is at
+A camera is fixed to its *mount*, and the features it follows are fixed to a *body*: the hand for a camera in
+the world, things that lie still for a camera on the hand. Either way a feature at ``x`` in the body is at
 ``T_mount_body @ x`` in the mount, with a ``T_mount_body`` that the robot's state gives for every frame.
 """
 

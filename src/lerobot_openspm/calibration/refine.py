@@ -26,6 +26,8 @@ BELIEVED = 2.0
 # No feature may bring more than this share of what is known about any direction of the camera's pose. One that
 # the hand holds while it turns stands still in the hand's camera and would be taken for the hub of the world.
 MAX_SHARE = 0.04
+# A corner of the hand that many episodes show may bring more.
+MAX_SHARED = 0.3
 # Tracks nearer to one another than about this are taken for one feature.
 FEATURE_SIZES_M = (0.008, 0.005, 0.003)
 TRACK_ERROR, SAME_FEATURE_CHI2, MAX_APART = 0.4 / 256, 9.0, 4.0
@@ -44,26 +46,28 @@ def refine(camera: Camera, observations: Observations, *, free_focal: bool) -> t
         scale_px = part * camera.height
         points = triangulate(camera, observations, np.arange(observations.n_tracks))
         r, p_cam = residuals(camera, points[observations.track], observations.T_mount_body, observations.uv)
-        good = (observations.rms(r) < BELIEVED * scale_px) & possible(points, p_cam, observations, camera.mount)
+        good = (observations.rms(r) < BELIEVED * scale_px) & possible(
+            points, p_cam, observations, camera.mount
+        )
         believed, points = observations.select(good), points[good]
         feature = np.arange(believed.n_tracks)
         problem = Problem(believed, feature, np.ones(believed.n_tracks), scale_px, free_focal)
-        problem = with_limited_shares(camera, points, problem)
+        problem = with_limited_shares(camera, points, problem, MAX_SHARE)
         camera, _ = adjust(camera, points, problem)
         logger.debug("scale %.2f px: %d tracks", scale_px, believed.n_tracks)
     return camera, believed
 
 
-def with_limited_shares(camera: Camera, points: Array, problem: Problem) -> Problem:
-    """The problem with less weight for features that would decide alone (see MAX_SHARE)."""
+def with_limited_shares(camera: Camera, points: Array, problem: Problem, limit: float) -> Problem:
+    """The problem with less weight for features that would decide alone."""
     information, _ = normal_equations(camera, points, problem).reduced()
     weight = np.ones(len(information))
     for _ in range(20):
         whiten = np.linalg.inv(np.linalg.cholesky(_positive((weight[:, None, None] * information).sum(0))))
         share = weight * np.linalg.norm(whiten @ information @ whiten.T, ord=2, axis=(1, 2))
-        if share.max() <= 1.2 * MAX_SHARE:
+        if share.max() <= 1.2 * limit:
             break
-        weight *= np.minimum(1, MAX_SHARE / np.maximum(share, 1e-12))
+        weight *= np.minimum(1, limit / np.maximum(share, 1e-12))
     return replace(problem, weights=problem.weights * weight[problem.feature])
 
 
@@ -93,7 +97,7 @@ def refine_with_shared_features(
         for _ in range(2):
             problem = Problem(observations, feature, 1 / np.sqrt(places), scale_px, free_focal)
             points = triangulate(camera, observations, feature)
-            problem = with_limited_shares(camera, points, problem)
+            problem = with_limited_shares(camera, points, problem, MAX_SHARED)
             camera, points = adjust(camera, points, problem)
             r, _ = residuals(
                 camera, points[problem.feature_of_place], observations.T_mount_body, observations.uv

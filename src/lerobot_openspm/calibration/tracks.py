@@ -12,16 +12,16 @@ from lerobot_openspm.geometry.se3 import Array
 
 # Images are enlarged or reduced to this height: windows and thresholds below are in its pixels.
 WORKING_HEIGHT = 512
-WINDOW_PX = 23
+WINDOW_PX = 15
 CORNER_HALF_WINDOW_PX = 5
-CORNER_SHIFT_PX = 2.0
+CORNER_SHIFT_PX = 3.0
 FORWARD_BACKWARD_PX = 0.6
 BORDER_PX = 6.0
 SPACING_PX = 8
 QUALITY = 0.02
 MAX_CORNERS = 300
 # New features are looked for every so many frames; "moving" is what changed within so many frames.
-SEARCH_STEPS, CHANGE_STEPS = 4, 3
+SEARCH_STEPS, CHANGE_STEPS = 2, 3
 CHANGE_LEVELS = 12
 MIN_FRAMES = 6
 
@@ -100,7 +100,7 @@ def _new_corners(grey: Array, mask: Array, taken: Sequence[Array]) -> Array:
         return np.zeros((0, 2), np.float32)
     corners = corners.reshape(-1, 2)
     on_corner, shift = _refined(grey, corners)
-    return on_corner[shift < 1.5 * CORNER_SHIFT_PX]
+    return on_corner[shift < CORNER_SHIFT_PX]
 
 
 def _refined(grey: Array, uv: Array) -> tuple[Array, Array]:
