@@ -1,8 +1,8 @@
 """Error of cameras that were estimated from ten episodes, against the simulators' own.
 
-``python -m benchmarks.calibration [--libero=FOLDER]``: the tabletop's demonstrations are those of `make demo`;
-LIBERO's are a dataset that ``openspm collect --env.type=libero --episodes=10`` recorded, left out if not given.
-Ten episodes are the k-th of each task, for several k.
+``python -m benchmarks.calibration [--libero=FOLDER]``: the tabletop's demonstrations are those of `make
+demo`; LIBERO's are a dataset that ``openspm collect --env.type=libero --episodes=10`` recorded, left out if
+not given. Ten episodes are the k-th of each task, for several k.
 """
 
 import argparse

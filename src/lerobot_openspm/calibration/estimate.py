@@ -9,8 +9,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lerobot_openspm.calibration.initial import first_estimate, moving
 from lerobot_openspm.calibration.adjust import residuals
+from lerobot_openspm.calibration.initial import first_estimate, moving
 from lerobot_openspm.calibration.observations import Mount, observe
 from lerobot_openspm.calibration.refine import covariance, refine, refine_with_shared_features
 from lerobot_openspm.calibration.tracks import Track
@@ -110,6 +110,6 @@ def _refuse_what_is_uncertain(estimate: Estimate) -> None:
         f"the episodes leave the camera's position open by {1e3 * position_m:.0f} mm and its orientation by "
         f"{np.rad2deg(rotation_rad):.1f} degrees (standard deviations), expected at most "
         f"{1e3 * MAX_POSITION_SD_M:.0f} mm and {np.rad2deg(MAX_ROTATION_SD_RAD):.0f}; record episodes in "
-        "which the hand turns about two axes by 45 degrees or more while the camera sees it, and name them in "
-        "--episodes=[...]"
+        "which the hand turns about two axes by 45 degrees or more while the camera sees it, and name them "
+        "in --episodes=[...]"
     )

@@ -1,4 +1,4 @@
-"""From a first estimate to the last: which tracks to believe, which are of one feature, and how sure it is."""
+"""From a first estimate to the last: which tracks to believe, which show one feature, how sure it is."""
 
 from __future__ import annotations
 
@@ -16,15 +16,15 @@ from lerobot_openspm.calibration.adjust import (
     triangulate,
 )
 from lerobot_openspm.calibration.initial import possible
-from lerobot_openspm.calibration.observations import Observations, sums
+from lerobot_openspm.calibration.observations import Observations
 from lerobot_openspm.geometry.camera import Camera
 from lerobot_openspm.geometry.se3 import Array
 
 # From coarse to fine, in parts of the image height; tracks worse than BELIEVED times that are left out.
 SCALES = tuple(px / 256 for px in (8, 8, 4, 4, 2, 2, 1, 1, 0.5, 0.5))
 BELIEVED = 2.0
-# No feature may bring more than this share of what is known about any direction of the camera's pose. One that
-# the hand holds while it turns stands still in the hand's camera and would be taken for the hub of the world.
+# No feature may bring more than this share of what is known about any direction of the camera's pose. One
+# that the hand holds while it turns stands still in the hand's camera: the hub of the world, it would seem.
 MAX_SHARE = 0.04
 # A corner of the hand that many episodes show may bring more.
 MAX_SHARED = 0.3
@@ -82,8 +82,8 @@ def refine_with_shared_features(
     """Adjust again, with tracks that meet at one place taken for one feature.
 
     A corner of the hand that is seen before and after a turn, in one episode and in another, has one place on
-    the hand: that tells where on the hand all of them are. A camera on the hand sees things that lie elsewhere
-    in every episode: there features are shared within an episode only.
+    the hand: that tells where on the hand all of them are. A camera on the hand sees things that lie
+    elsewhere in every episode: there features are shared within an episode only.
 
     Returns:
         The camera, the features' places ``(n, 3)`` in the body, and the adjusted problem.

@@ -1,4 +1,4 @@
-"""`openspm calibrate`: estimate a camera's pose from a dataset's own episodes, and write the calibration file."""
+"""`openspm calibrate`: estimate a camera's pose from a dataset's own episodes, write a calibration file."""
 
 from __future__ import annotations
 
@@ -47,7 +47,8 @@ class CalibrateConfig:
         truth: Calibration file to compare with; the dataset's ``meta/openspm_cameras.json`` if not given and
             there.
         seed: Seed of the first estimate's random draws.
-        policy: Options of the policy that say how to read the state, e.g. ``--policy.state_rotation=axis_angle``.
+        policy: Options of the policy that say how to read the state, e.g.
+            ``--policy.state_rotation=axis_angle``.
     """
 
     repo_id: str = "local/openspm_tabletop"
@@ -96,7 +97,7 @@ def main(args: list[str]) -> None:
 
 
 def choose_episodes(episodes: Sequence[Episode], count: int) -> list[Episode]:
-    """The first of every task, those first in which the hand turns most, then the second of every task, ..."""
+    """The first of every task, those before in which the hand turns more, then the second of every task ..."""
     seen: Counter[str] = Counter()
     ranked = []
     for episode in episodes:
