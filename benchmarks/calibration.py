@@ -1,8 +1,8 @@
 """Error of cameras that were estimated from ten episodes, against the simulators' own.
 
-``python -m benchmarks.calibration [--libero=FOLDER]``: the tabletop's demonstrations are those of `make
-demo`; LIBERO's are a dataset that ``openspm collect --env.type=libero --episodes=10`` recorded, left out if
-not given. Ten episodes are the k-th of each task, for several k.
+``python -m benchmarks.calibration [--tabletop=FOLDER] [--libero=FOLDER]``: the tabletop's demonstrations are
+those of `make demo` if not given; LIBERO's are a dataset that ``openspm collect --env.type=libero
+--episodes=10`` recorded, left out if not given. Ten episodes are the k-th of each task, for several k.
 """
 
 import argparse
@@ -11,6 +11,7 @@ import math
 import time
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -42,9 +43,12 @@ class Source:
 
 def main() -> dict:
     parser = argparse.ArgumentParser()
+    parser.add_argument("--tabletop", type=Path, help="folder of the tabletop's demonstrations")
     parser.add_argument("--libero", type=Path, help="folder of LIBERO demonstrations")
     arguments = parser.parse_args()
-    folders = {"tabletop": dataset()} | ({"libero": arguments.libero} if arguments.libero else {})
+    folders = {"tabletop": arguments.tabletop or dataset()} | (
+        {"libero": arguments.libero} if arguments.libero else {}
+    )
     cv2.setNumThreads(1)
     rows = {}
     for name, folder in folders.items():
@@ -80,7 +84,7 @@ def estimate(source: Source, key: str, truth: Camera, k: int) -> list[dict]:
     runs = []
     for fov_deg in (math.degrees(2 * math.atan(truth.height / 2 / truth.fy)), None):
         start_s = time.monotonic()
-        run = {"k": k, "fov_given": fov_deg is not None, "refused": None}
+        run: dict[str, Any] = {"k": k, "fov_given": fov_deg is not None, "refused": None}
         try:
             found = estimate_camera(
                 tracks,

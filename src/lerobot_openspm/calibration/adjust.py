@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from lerobot_openspm.calibration.observations import Observations, sums
 from lerobot_openspm.geometry import se3
@@ -29,7 +31,7 @@ class Problem:
     """
 
     observations: Observations
-    feature: Array
+    feature: NDArray[Any]
     weights: Array
     scale_px: float
     free_focal: bool
@@ -40,7 +42,7 @@ class Problem:
         return int(self.feature.max(initial=-1)) + 1
 
     @property
-    def feature_of_place(self) -> Array:
+    def feature_of_place(self) -> NDArray[Any]:
         """Feature of each place ``(m,)``."""
         return self.feature[self.observations.track]
 
@@ -90,7 +92,7 @@ def residuals(camera: Camera, points: Array, T_mount_body: Array, uv: Array) -> 
     return seen - uv, p_cam
 
 
-def triangulate(camera: Camera, observations: Observations, feature: Array) -> Array:
+def triangulate(camera: Camera, observations: Observations, feature: NDArray[Any]) -> Array:
     """Places ``(n, 3)`` in the body that least squares of the projection's linear form give each feature.
 
     Args:

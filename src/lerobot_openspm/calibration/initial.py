@@ -11,8 +11,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from lerobot_openspm.calibration.adjust import residuals, triangulate
 from lerobot_openspm.calibration.observations import Mount, Observations, observe
@@ -54,7 +56,7 @@ def without_turns(tracks: Sequence[Track], T_world_ee: Sequence[Array]) -> list[
     return pieces
 
 
-def possible(points: Array, p_cam: Array, observations: Observations, mount: Mount) -> Array:
+def possible(points: Array, p_cam: Array, observations: Observations, mount: Mount) -> NDArray[Any]:
     """Which features ``(n_tracks,)`` lie in front of the camera and within reach."""
     behind = observations.per_track((p_cam[:, 2] < NEAREST_M).astype(float)) > 0
     return ~behind & (np.linalg.norm(points, axis=1) < REACH_M[mount])

@@ -9,9 +9,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
+from numpy.typing import NDArray
 
 from lerobot_openspm.calibration.tracks import Track
 from lerobot_openspm.geometry import se3
@@ -36,12 +37,12 @@ class Observations:
     """
 
     n_tracks: int
-    track: Array
+    track: NDArray[Any]
     T_mount_body: Array
     uv: Array
-    episode: Array
+    episode: NDArray[Any]
 
-    def select(self, chosen: Array) -> Observations:
+    def select(self, chosen: NDArray[Any]) -> Observations:
         """Only the tracks that a mask ``(n_tracks,)`` names, renumbered."""
         keep = chosen[self.track]
         number = np.cumsum(chosen) - 1
@@ -59,7 +60,7 @@ class Observations:
         return np.sqrt(self.per_track((residuals**2).sum(axis=1)) / self.per_track(np.ones(len(self.track))))
 
 
-def sums(index: Array, values: Array, count: int) -> Array:
+def sums(index: NDArray[Any], values: Array, count: int) -> Array:
     """Add up values ``(m, ...)`` that share an index ``(m,)``."""
     flat = values.reshape(len(values), -1)
     added = np.stack([np.bincount(index, column, count) for column in flat.T], axis=-1)

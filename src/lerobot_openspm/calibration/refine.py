@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import logging
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from lerobot_openspm.calibration.adjust import (
     Normal,
@@ -109,7 +111,9 @@ def refine_with_shared_features(
     return camera, points, problem
 
 
-def shared_features(camera: Camera, observations: Observations, group: Array, size_m: float) -> Array:
+def shared_features(
+    camera: Camera, observations: Observations, group: NDArray[Any], size_m: float
+) -> NDArray[Any]:
     """Number ``(n_tracks,)`` of the feature that each track shows; only tracks of a group share one.
 
     Tracks are taken in the order of how exactly their place is known. One joins the nearest feature if their

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from lerobot_openspm.geometry.se3 import Array
 
@@ -41,7 +43,7 @@ class Track:
     uv: Array
 
 
-def track_features(images: Array, episode: int, *, moving_only: bool) -> list[Track]:
+def track_features(images: NDArray[Any], episode: int, *, moving_only: bool) -> list[Track]:
     """Follow corners by Lucas-Kanade flow, and put each back on its corner in every frame.
 
     Flow alone drifts, and takes a point beside a corner for the corner: when the hand has turned, that point
@@ -54,8 +56,8 @@ def track_features(images: Array, episode: int, *, moving_only: bool) -> list[Tr
     """
     scale = WORKING_HEIGHT / images.shape[1]
     grey = [_working_image(image, scale) for image in images]
-    finished: list[tuple[int, list[Array]]] = []
-    active: list[tuple[int, list[Array]]] = []
+    finished: list[tuple[int, list[NDArray[Any]]]] = []
+    active: list[tuple[int, list[NDArray[Any]]]] = []
     for frame in range(len(grey) - 1):
         if frame % SEARCH_STEPS == 0:
             changed = _changed(grey, frame) if moving_only else np.full(grey[frame].shape, 255, np.uint8)
@@ -76,13 +78,13 @@ def track_features(images: Array, episode: int, *, moving_only: bool) -> list[Tr
     ]
 
 
-def _working_image(image: Array, scale: float) -> Array:
+def _working_image(image: NDArray[Any], scale: float) -> NDArray[Any]:
     grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
     how = cv2.INTER_CUBIC if scale > 1 else cv2.INTER_AREA
     return cv2.resize(grey, (round(grey.shape[1] * scale), WORKING_HEIGHT), interpolation=how)
 
 
-def _changed(grey: Sequence[Array], frame: int) -> Array:
+def _changed(grey: Sequence[NDArray[Any]], frame: int) -> NDArray[Any]:
     """Mask of what differs from the frames a little before and after."""
     others = [t for t in (frame - CHANGE_STEPS, frame + CHANGE_STEPS) if 0 <= t < len(grey)]
     change = np.max([cv2.absdiff(grey[frame], grey[t]) for t in others], axis=0) if others else grey[0] * 0
@@ -90,7 +92,7 @@ def _changed(grey: Sequence[Array], frame: int) -> Array:
     return cv2.dilate(mask, np.ones((10, 10), np.uint8))
 
 
-def _new_corners(grey: Array, mask: Array, taken: Sequence[Array]) -> Array:
+def _new_corners(grey: NDArray[Any], mask: NDArray[Any], taken: Sequence[NDArray[Any]]) -> NDArray[Any]:
     """Corners ``(n, 2)`` within a mask, away from those that are followed already."""
     mask = mask.copy()
     for u, v in taken:
@@ -103,7 +105,7 @@ def _new_corners(grey: Array, mask: Array, taken: Sequence[Array]) -> Array:
     return on_corner[shift < CORNER_SHIFT_PX]
 
 
-def _refined(grey: Array, uv: Array) -> tuple[Array, Array]:
+def _refined(grey: NDArray[Any], uv: NDArray[Any]) -> tuple[NDArray[Any], NDArray[Any]]:
     """The corners next to points ``(n, 2)``, and how far they lie from them."""
     inside = np.clip(uv, 1, np.array(grey.shape[::-1], np.float32) - 2).astype(np.float32)
     half, stop = (CORNER_HALF_WINDOW_PX,) * 2, (cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, 20, 0.01)
@@ -111,7 +113,7 @@ def _refined(grey: Array, uv: Array) -> tuple[Array, Array]:
     return refined, np.linalg.norm(refined - uv, axis=1)
 
 
-def _follow(before: Array, after: Array, uv: Array) -> tuple[Array, Array]:
+def _follow(before: NDArray[Any], after: NDArray[Any], uv: NDArray[Any]) -> tuple[NDArray[Any], NDArray[Any]]:
     """Where points ``(n, 2)`` went, and which of them can be believed."""
     points, window = uv.astype(np.float32)[:, None], (WINDOW_PX, WINDOW_PX)
     there, found, _ = cv2.calcOpticalFlowPyrLK(before, after, points, points.copy(), winSize=window)

@@ -97,7 +97,7 @@ def main(args: list[str]) -> None:
 
 
 def choose_episodes(episodes: Sequence[Episode], count: int) -> list[Episode]:
-    """The first of every task, those before in which the hand turns more, then the second of every task ..."""
+    """The first of every task, in the order of how far the hand turns, then the second of every task ..."""
     seen: Counter[str] = Counter()
     ranked = []
     for episode in episodes:

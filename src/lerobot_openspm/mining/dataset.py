@@ -9,6 +9,7 @@ import numpy as np
 from lerobot.datasets import LeRobotDataset
 from lerobot.datasets.video_utils import decode_video_frames
 from lerobot.utils.constants import ACTION, OBS_STATE
+from numpy.typing import NDArray
 
 from lerobot_openspm.errors import DatasetError
 from lerobot_openspm.geometry import se3
@@ -89,7 +90,7 @@ class Demonstrations:
             views[key] = View(image, scaled, scaled.T_world_cam(episode.T_world_ee[frame]))
         return views
 
-    def images(self, episode: Episode, camera: str) -> Array:
+    def images(self, episode: Episode, camera: str) -> NDArray[np.uint8]:
         """All images ``(n, height, width, 3)`` of one camera, uint8 RGB, decoded in one go.
 
         Raises:
@@ -100,12 +101,13 @@ class Demonstrations:
             raise DatasetError(f"dataset {self.name} has no camera {camera!r}; it has {meta.camera_keys}")
         frames = range(episode.from_index, episode.from_index + len(episode))
         if camera in meta.video_keys:
-            begin = float(meta.episodes[episode.index][f"videos/{camera}/from_timestamp"])
-            rows = self._dataset.hf_dataset.select_columns(["timestamp"]).with_format("numpy")
-            times = [begin + float(t) for t in rows[frames.start : frames.stop]["timestamp"]]
+            rows: Any = meta.episodes
+            begin = float(rows[episode.index][f"videos/{camera}/from_timestamp"])
+            stamps: Any = self._dataset.hf_dataset.select_columns(["timestamp"]).with_format("numpy")
+            times = [begin + float(t) for t in stamps[frames.start : frames.stop]["timestamp"]]
             path = self._dataset.root / meta.get_video_file_path(episode.index, camera)
             images = decode_video_frames(path, times, self._dataset.tolerance_s, "pyav", return_uint8=True)
-            images = images.numpy()
+            images = np.asarray(images.numpy())
         else:
             column = self._dataset.hf_dataset.select_columns([camera])
             images = np.stack([np.asarray(column[frame][camera]) for frame in frames])
