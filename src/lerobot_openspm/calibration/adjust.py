@@ -108,7 +108,8 @@ def triangulate(camera: Camera, observations: Observations, feature: NDArray[Any
     rows = R_cam_mount[:2] - xy[:, :, None] * R_cam_mount[2]
     A, b = rows @ R, -(rows @ (p - camera.T_mount_cam[:3, 3])[..., None])[..., 0]
     AtA, Atb = np.swapaxes(A, 1, 2) @ A, (np.swapaxes(A, 1, 2) @ b[..., None])[..., 0]
-    return np.linalg.solve(sums(index, AtA, n) + 1e-6 * np.eye(3), sums(index, Atb, n)[..., None])[..., 0]
+    information = sums(index, AtA, n) + 1e-6 * np.eye(3)
+    return np.asarray(np.linalg.solve(information, sums(index, Atb, n)[..., None])[..., 0], float)
 
 
 def normal_equations(camera: Camera, points: Array, problem: Problem) -> Normal:

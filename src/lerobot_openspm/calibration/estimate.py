@@ -12,15 +12,14 @@ import numpy as np
 from lerobot_openspm.calibration.adjust import residuals
 from lerobot_openspm.calibration.initial import first_estimate, moving
 from lerobot_openspm.calibration.observations import Mount, observe
-from lerobot_openspm.calibration.refine import covariance, refine, refine_with_shared_features
+from lerobot_openspm.calibration.refine import refine, refine_with_shared_features, variances
 from lerobot_openspm.calibration.tracks import Track
 from lerobot_openspm.errors import CalibrationError
 from lerobot_openspm.geometry.camera import Camera
 from lerobot_openspm.geometry.se3 import Array
 
-# An estimate less certain than this is refused.
-MAX_POSITION_SD_M, MAX_ROTATION_SD_RAD = 0.02, np.deg2rad(2)
-MIN_TRACKS = 30
+# An estimate less certain than this is refused: two of these are 2 cm and 2 degrees.
+MAX_POSITION_SD_M, MAX_ROTATION_SD_RAD = 0.01, np.deg2rad(1)
 
 logger = logging.getLogger(__name__)
 
@@ -81,14 +80,9 @@ def estimate_camera(
     tracks = moving(tracks, height)
     camera = first_estimate(tracks, T_world_ee, blank, free_focal=free_focal, mirrored=mirrored, rng=rng)
     camera, believed = refine(camera, observe(tracks, T_world_ee, mount), free_focal=free_focal)
-    if believed.n_tracks < MIN_TRACKS:
-        raise CalibrationError(
-            f"only {believed.n_tracks} of {len(tracks)} features agree on a camera, expected at least "
-            f"{MIN_TRACKS}; check --mount and --fov_deg, or give more episodes with --episodes=[...]"
-        )
     camera, points, problem = refine_with_shared_features(camera, believed, free_focal=free_focal)
     r, _ = residuals(camera, points[problem.feature_of_place], believed.T_mount_body, believed.uv)
-    variance = np.diag(covariance(camera, points, problem))
+    variance = variances(camera, points, problem)
     estimate = Estimate(
         camera,
         reprojection_px=float(np.sqrt((r**2).sum(axis=1).mean())),

@@ -154,5 +154,5 @@ def _without_offset(positions: Array, xy: Array) -> tuple[Array, Array]:
         B[:, axis, axis] = 1
         B[:, axis, 2] = -xy[:, axis]
     A, B = A.reshape(-1, 9), B.reshape(-1, 3)
-    offset = -np.linalg.lstsq(B, A, rcond=None)[0]
+    offset = -np.asarray(np.linalg.lstsq(B, A, rcond=None)[0], float)
     return A + B @ offset, offset

@@ -60,10 +60,10 @@ class Observations:
         return np.sqrt(self.per_track((residuals**2).sum(axis=1)) / self.per_track(np.ones(len(self.track))))
 
 
-def sums(index: NDArray[Any], values: Array, count: int) -> Array:
+def sums(index: NDArray[Any], values: NDArray[Any], count: int) -> Array:
     """Add up values ``(m, ...)`` that share an index ``(m,)``."""
-    flat = values.reshape(len(values), -1)
-    added = np.stack([np.bincount(index, column, count) for column in flat.T], axis=-1)
+    flat = values.reshape(len(values), int(np.prod(values.shape[1:])))
+    added = np.stack([np.bincount(index, column, count) for column in flat.T], axis=-1).astype(float)
     return added.reshape(count, *values.shape[1:])
 
 

@@ -19,12 +19,14 @@ from lerobot_openspm.calibration.adjust import (
 )
 from lerobot_openspm.calibration.initial import possible
 from lerobot_openspm.calibration.observations import Observations
+from lerobot_openspm.errors import CalibrationError
 from lerobot_openspm.geometry.camera import Camera
 from lerobot_openspm.geometry.se3 import Array
 
 # From coarse to fine, in parts of the image height; tracks worse than BELIEVED times that are left out.
 SCALES = tuple(px / 256 for px in (8, 8, 4, 4, 2, 2, 1, 1, 0.5, 0.5))
 BELIEVED = 2.0
+MIN_TRACKS = 30
 # No feature may bring more than this share of what is known about any direction of the camera's pose. One
 # that the hand holds while it turns stands still in the hand's camera: the hub of the world, it would seem.
 MAX_SHARE = 0.04
@@ -32,6 +34,8 @@ MAX_SHARE = 0.04
 MAX_SHARED = 0.3
 # Tracks nearer to one another than about this are taken for one feature.
 FEATURE_SIZES_M = (0.008, 0.005, 0.003)
+# Median of the square of a standard normal number.
+CHI2_MEDIAN = 0.455
 TRACK_ERROR, SAME_FEATURE_CHI2, MAX_APART = 0.4 / 256, 9.0, 4.0
 
 logger = logging.getLogger(__name__)
@@ -42,6 +46,9 @@ def refine(camera: Camera, observations: Observations, *, free_focal: bool) -> t
 
     Returns:
         The camera, and the tracks that it explains.
+
+    Raises:
+        CalibrationError: Too few tracks agree.
     """
     believed = observations
     for part in SCALES:
@@ -51,6 +58,11 @@ def refine(camera: Camera, observations: Observations, *, free_focal: bool) -> t
         good = (observations.rms(r) < BELIEVED * scale_px) & possible(
             points, p_cam, observations, camera.mount
         )
+        if good.sum() < MIN_TRACKS:
+            raise CalibrationError(
+                f"only {good.sum()} of {len(good)} features agree on a camera, expected at least "
+                f"{MIN_TRACKS}; check --mount and --fov_deg, or give more episodes with --episodes=[...]"
+            )
         believed, points = observations.select(good), points[good]
         feature = np.arange(believed.n_tracks)
         problem = Problem(believed, feature, np.ones(believed.n_tracks), scale_px, free_focal)
@@ -147,16 +159,20 @@ def shared_features(
     return feature
 
 
-def covariance(camera: Camera, points: Array, problem: Problem) -> Array:
-    """Covariance ``(k, k)`` of the camera's pose (turn, displacement, logarithm of the focal length).
+def variances(camera: Camera, points: Array, problem: Problem) -> Array:
+    """Variances ``(k,)`` of the camera's pose (turn, displacement, logarithm of the focal length).
 
-    Places in a track err alike, so each track counts once: the spread of what single tracks ask for.
+    Places in a track err alike, so each track counts once. Of two estimates the larger: from how far what
+    single tracks ask for is spread, and from the residuals. The first holds whatever the errors are like, but
+    knows nothing of a direction about which no track says anything.
     """
-    normal = normal_equations(camera, points, problem)
-    information, _ = normal.reduced()
-    inverse = np.linalg.inv(_positive(information.sum(axis=0)))
-    by_track = _gradients(camera, points, problem, normal)
-    return inverse @ (by_track.T @ by_track) @ inverse
+    seen, normal = problem.observations, normal_equations(camera, points, problem)
+    inverse = np.linalg.inv(_positive(normal.reduced()[0].sum(axis=0)))
+    spread = inverse @ _gradients(camera, points, problem, normal).T
+    r, _ = residuals(camera, points[problem.feature_of_place], seen.T_mount_body, seen.uv)
+    alike = problem.weights * seen.per_track(np.ones(len(r)))
+    from_residuals = np.diag(inverse) * np.median(r**2) / CHI2_MEDIAN * alike.mean()
+    return np.maximum((spread**2).sum(axis=1), from_residuals)
 
 
 def _gradients(camera: Camera, points: Array, problem: Problem, normal: Normal) -> Array:

@@ -98,7 +98,7 @@ def _new_corners(grey: NDArray[Any], mask: NDArray[Any], taken: Sequence[NDArray
     for u, v in taken:
         cv2.circle(mask, (int(u), int(v)), SPACING_PX, 0, -1)
     corners = cv2.goodFeaturesToTrack(grey, MAX_CORNERS, QUALITY, SPACING_PX, mask=mask, blockSize=6)
-    if corners is None:
+    if corners is None:  # pyright: ignore[reportUnnecessaryComparison]
         return np.zeros((0, 2), np.float32)
     corners = corners.reshape(-1, 2)
     on_corner, shift = _refined(grey, corners)
