@@ -97,7 +97,7 @@ def _new_corners(grey: NDArray[Any], mask: NDArray[Any], taken: Sequence[NDArray
     mask = mask.copy()
     for u, v in taken:
         cv2.circle(mask, (int(u), int(v)), SPACING_PX, 0, -1)
-    corners = cv2.goodFeaturesToTrack(grey, MAX_CORNERS, QUALITY, SPACING_PX, mask=mask, blockSize=6)
+    corners = cv2.goodFeaturesToTrack(grey, MAX_CORNERS, QUALITY, SPACING_PX, mask=mask, blockSize=5)
     if corners is None:  # pyright: ignore[reportUnnecessaryComparison]
         return np.zeros((0, 2), np.float32)
     corners = corners.reshape(-1, 2)
