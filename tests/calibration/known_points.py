@@ -7,7 +7,7 @@ from lerobot_openspm.calibration.tracks import Track
 from lerobot_openspm.geometry import se3
 from lerobot_openspm.geometry.camera import Camera, project
 
-SIZE, FOCAL, NOISE_PX = 256, 300.0, 0.2
+SIZE, FOCAL = 256, 300.0
 # Where a camera stands and what it looks at, in its mount.
 PLACES = {"world": ([0.9, 0.1, 0.9], [0, 0, 0.2]), "ee": ([0.06, 0.01, -0.1], [0, 0, 0.2])}
 # How far features lie from the middle of the hand, and of the table.
@@ -38,7 +38,12 @@ def hand_paths(rng: np.random.Generator, episodes: int, frames: int, *, turning:
 
 
 def follow(
-    rng: np.random.Generator, truth: Camera, paths: list[np.ndarray], points: int, outliers: int
+    rng: np.random.Generator,
+    truth: Camera,
+    paths: list[np.ndarray],
+    points: int,
+    outliers: int,
+    noise_px: float = 0.2,
 ) -> list[Track]:
     """Tracks of points fixed to the hand or, for its own camera, to the table; and of others."""
     tracks = []
@@ -52,7 +57,7 @@ def follow(
             ]
             uv = np.array([project(truth, T_world_cam[t], p)[0] for t, p in zip(frames, at, strict=True)])
             if np.isfinite(uv).all():
-                tracks.append(Track(episode, begin, uv + rng.normal(0, NOISE_PX, uv.shape)))
+                tracks.append(Track(episode, begin, uv + rng.normal(0, noise_px, uv.shape)))
         for start, end in rng.uniform(0, SIZE, (outliers, 2, 2)):
             part = np.linspace(0, 1, len(T_world_ee))[:, None] ** 2
             tracks.append(Track(episode, 0, start + part * (end - start)))

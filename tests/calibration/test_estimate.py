@@ -20,11 +20,13 @@ def run(tracks: list[Track], paths: list[np.ndarray], truth: Camera, **options) 
     return estimate_camera(tracks, paths, width=SIZE, height=SIZE, mount=truth.mount, **given)
 
 
-def scene(mount: str, *, mirrored: bool = False, turning: bool = True, outliers: int = 12):
+def scene(
+    mount: str, *, mirrored: bool = False, turning: bool = True, outliers: int = 12, noise_px: float = 0.2
+):
     rng = np.random.default_rng(3)
     truth = camera(mount, mirrored)
     paths = hand_paths(rng, 6, 90, turning=turning)
-    return truth, paths, follow(rng, truth, paths, 30, outliers)
+    return truth, paths, follow(rng, truth, paths, 30, outliers, noise_px)
 
 
 @pytest.mark.parametrize("mirrored", [False, True])
@@ -43,7 +45,7 @@ def test_pose_and_mirroring_are_recovered_among_outliers(mount: str, mirrored: b
 
 @pytest.mark.parametrize("mount", ["world", "ee"])
 def test_the_focal_length_is_found_too(mount: str):
-    truth, paths, tracks = scene(mount)
+    truth, paths, tracks = scene(mount, noise_px=0.1)
     found = run(tracks, paths, truth, fov_deg=None)
     assert found.camera.fy == pytest.approx(FOCAL, rel=0.01)
     assert se3.distances(found.camera.T_mount_cam, truth.T_mount_cam)[0] < 0.01

@@ -12,8 +12,9 @@ from numpy.typing import NDArray
 
 from lerobot_openspm.geometry.se3 import Array
 
-# Images are enlarged or reduced to this height: windows and thresholds below are in its pixels.
-WORKING_HEIGHT = 512
+# Images are enlarged or reduced to this height, within a limit: windows and thresholds below are in pixels of
+# that. Corners of what is enlarged further are too round to be found.
+WORKING_HEIGHT, MAX_ENLARGEMENT = 512, 2.0
 WINDOW_PX = 15
 CORNER_HALF_WINDOW_PX = 5
 CORNER_SHIFT_PX = 3.0
@@ -54,7 +55,7 @@ def track_features(images: NDArray[Any], episode: int, *, moving_only: bool) -> 
         episode: Number to give to the tracks.
         moving_only: Begin tracks only where the image changes, as for a camera that stands still.
     """
-    scale = WORKING_HEIGHT / images.shape[1]
+    scale = min(WORKING_HEIGHT / images.shape[1], MAX_ENLARGEMENT)
     grey = [_working_image(image, scale) for image in images]
     finished: list[tuple[int, list[NDArray[Any]]]] = []
     active: list[tuple[int, list[NDArray[Any]]]] = []
@@ -81,7 +82,7 @@ def track_features(images: NDArray[Any], episode: int, *, moving_only: bool) -> 
 def _working_image(image: NDArray[Any], scale: float) -> NDArray[Any]:
     grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
     how = cv2.INTER_CUBIC if scale > 1 else cv2.INTER_AREA
-    return cv2.resize(grey, (round(grey.shape[1] * scale), WORKING_HEIGHT), interpolation=how)
+    return cv2.resize(grey, None, fx=scale, fy=scale, interpolation=how)
 
 
 def _changed(grey: Sequence[NDArray[Any]], frame: int) -> NDArray[Any]:
