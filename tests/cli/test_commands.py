@@ -52,14 +52,22 @@ def test_without_arguments_it_helps(openspm: Openspm):
 def test_an_unknown_command_is_named_with_the_known_ones(openspm: Openspm):
     code, out, err = openspm("juggle")
     assert (code, out) == (2, "")
-    assert err.startswith("openspm: unknown command 'juggle'; expected one of collect, mine, inspect")
+    assert err.startswith(
+        "openspm: unknown command 'juggle'; expected one of collect, calibrate, mine, inspect"
+    )
 
 
-@pytest.mark.parametrize("command", ["collect", "mine", "inspect"])
+@pytest.mark.parametrize("command", ["collect", "calibrate", "mine", "inspect"])
 def test_a_command_lists_its_options(openspm: Openspm, command: str):
     code, out, _ = openspm(command, "--help")
     assert code == 0
-    assert {"collect": "--episodes", "mine": "--policy.cameras", "inspect": "--instruction"}[command] in out
+    options = {
+        "collect": "--episodes",
+        "calibrate": "--fov_deg",
+        "mine": "--policy.cameras",
+        "inspect": "--instruction",
+    }
+    assert options[command] in out
 
 
 def test_mining_then_inspecting(openspm: Openspm, tiny_dataset: Path, tmp_path: Path):

@@ -1,4 +1,4 @@
-"""Imports go one way: geometry <- perception, mining, memory, flow <- control <- policy.
+"""Imports go one way: geometry <- calibration, perception, mining, memory, flow <- control <- policy.
 
 envs, bench and cli are leaves.
 """
@@ -17,6 +17,7 @@ LEAVES = {"envs", "cli", "bench"}
 # (configuration_openspm, modeling_openspm, processor_openspm and their helpers) are the part "policy".
 ALLOWED = {
     "geometry": set(),
+    "calibration": {"geometry"},
     "perception": {"geometry"},
     "memory": {"geometry"},
     "mining": {"geometry", "perception", "memory"},
@@ -24,7 +25,7 @@ ALLOWED = {
     "control": {"geometry", "perception", "memory", "flow"},
     "policy": {"geometry", "perception", "memory", "mining", "flow", "control"},
 }
-PURE = ("geometry", "perception", "memory", "control")
+PURE = ("geometry", "calibration", "perception", "memory", "control")
 
 
 def part_of(module: str) -> str:

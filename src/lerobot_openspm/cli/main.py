@@ -14,6 +14,7 @@ from lerobot_openspm.errors import OpenSPMError
 # Command -> module with `main(args)`, and what it is for. Modules are imported when they are asked for.
 COMMANDS = {
     "collect": ("lerobot_openspm.cli.collect", "record scripted demonstrations on the tabletop or LIBERO"),
+    "calibrate": ("lerobot_openspm.cli.calibrate", "estimate a camera's pose from a dataset's own episodes"),
     "mine": ("lerobot_openspm.cli.mine", "mine a dataset's key poses into a memory"),
     "inspect": ("lerobot_openspm.cli.inspect", "show the memory of a checkpoint"),
     "bench": ("lerobot_openspm.cli.bench", "measure a checkpoint: bench perception, tracking or cameras"),
@@ -26,7 +27,7 @@ def main() -> None:
     command, *args = sys.argv[1:] or ["--help"]
     if command in ("-h", "--help"):
         print("usage: openspm COMMAND [--option=value ...]\n\ncommands:")
-        print("\n".join(f"  {name:8s} {what}" for name, (_, what) in COMMANDS.items()))
+        print("\n".join(f"  {name:9s} {what}" for name, (_, what) in COMMANDS.items()))
         print("\n`openspm COMMAND --help` lists the options of one.")
         return
     if command not in COMMANDS:

@@ -7,7 +7,9 @@ from typing import Any
 
 import numpy as np
 from lerobot.datasets import LeRobotDataset
+from lerobot.datasets.video_utils import decode_video_frames
 from lerobot.utils.constants import ACTION, OBS_STATE
+from numpy.typing import NDArray
 
 from lerobot_openspm.errors import DatasetError
 from lerobot_openspm.geometry import se3
@@ -96,6 +98,34 @@ class Demonstrations:
             depth, labels = depth_of(layers, key, size), labels_of(layers, key, size)
             views[key] = View(image, scaled, scaled.T_world_cam(episode.T_world_ee[frame]), depth, labels)
         return views
+
+    def images(self, episode: Episode, camera: str) -> NDArray[np.uint8]:
+        """All images ``(n, height, width, 3)`` of one camera, uint8 RGB, decoded in one go.
+
+        Raises:
+            DatasetError: The dataset has no such camera, or its frames are not RGB.
+        """
+        meta = self._dataset.meta
+        if camera not in meta.camera_keys:
+            raise DatasetError(f"dataset {self.name} has no camera {camera!r}; it has {meta.camera_keys}")
+        frames = range(episode.from_index, episode.from_index + len(episode))
+        if camera in meta.video_keys:
+            rows: Any = meta.episodes
+            begin = float(rows[episode.index][f"videos/{camera}/from_timestamp"])
+            stamps: Any = self._dataset.hf_dataset.select_columns(["timestamp"]).with_format("numpy")
+            times = [begin + float(t) for t in stamps[frames.start : frames.stop]["timestamp"]]
+            path = self._dataset.root / meta.get_video_file_path(episode.index, camera)
+            images = decode_video_frames(path, times, self._dataset.tolerance_s, "pyav", return_uint8=True)
+            images = np.asarray(images.numpy())
+        else:
+            column = self._dataset.hf_dataset.select_columns([camera])
+            images = np.stack([np.asarray(column[frame][camera]) for frame in frames])
+        if images.ndim != 4 or images.shape[1] != 3:
+            raise DatasetError(
+                f"camera {camera!r} of dataset {self.name} is not RGB: frames {images.shape[1:]}"
+            )
+        images = images if images.dtype == np.uint8 else np.round(images * 255).astype(np.uint8)
+        return images.transpose(0, 2, 3, 1)
 
     def simulator_poses(self, episode: Episode, frame: int) -> dict[str, Array]:
         """True object poses ``T_world_obj`` by name, as a simulator recorded them (oracle ablation only)."""
