@@ -52,6 +52,9 @@ class OpenSPMConfig(PreTrainedConfig):
             "given": the numbers in ``observation.masks.<camera>``.
         shape: What is learned of an object that a segmenter finds. "demonstrations": its shape, from the
             masks of all of them. "box": the upright box or cylinder around it; one demonstration is enough.
+            "sam3d": the same, of the size that SAM 3D Objects tells, which runs in its own environment.
+        sam3d_python: Python of the environment that SAM 3D Objects is installed in, see ``docs/sam3d.md``.
+        sam3d_checkout: Folder of its repository, with its weights.
         mask_labels: Number of each phrase in the masks, for segmentation "given", e.g. ``{"bowl": 1}``.
         memory_episodes: Episodes that may enter the memory and the training samples; all if not given. Name
             them when some are held out: the policy is shown the whole dataset otherwise.
@@ -102,6 +105,8 @@ class OpenSPMConfig(PreTrainedConfig):
     tracking: bool = True
     segmentation: Segmentation = "demonstrations"
     shape: Shape = "demonstrations"
+    sam3d_python: str | None = None
+    sam3d_checkout: str | None = None
     mask_labels: dict[str, int] | None = None
     memory_episodes: list[int] | None = None
     memory_update: MemoryUpdate = "keep"
@@ -185,6 +190,11 @@ class OpenSPMConfig(PreTrainedConfig):
             raise ValueError(
                 f"shape is {self.shape!r}, but without a segmenter colours and shape are learned together; "
                 "pass --policy.segmentation=sam3, grounded_sam2 or given"
+            )
+        if self.shape != "sam3d" and (self.sam3d_python or self.sam3d_checkout):
+            raise ValueError(
+                f"sam3d_python and sam3d_checkout are for shape 'sam3d', got {self.shape!r}; pass "
+                "--policy.shape=sam3d too, or leave them out"
             )
         if self.segmentation != "demonstrations" and self.perception == "oracle":
             raise ValueError(

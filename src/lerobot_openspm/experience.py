@@ -49,7 +49,7 @@ class Experience:
         cameras: Calibration by camera key.
         perception: Whose object frames the entries are in: "demonstrations" or "oracle".
         segmentation: What found the objects' pixels: "demonstrations", or a segmenter by name.
-        shape: What was learned of the objects: "demonstrations" or "box".
+        shape: What was learned of the objects: "demonstrations", "box" or "sam3d".
         simulator_objects: Objects in the order of the simulator's pose vector (oracle ablation only).
     """
 

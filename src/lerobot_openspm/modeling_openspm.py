@@ -218,8 +218,10 @@ class OpenSPMPolicy(PreTrainedPolicy):
     def _save_pretrained(self, save_directory: Path, state_dict: dict[str, Tensor] | None = None) -> None:
         experience = self.require_experience()  # before anything is written
         super()._save_pretrained(save_directory, state_dict=state_dict)
-        # The calibration travels as a file of the checkpoint, not as a path that exists on one machine.
-        replace(self.config, cameras=None)._save_pretrained(Path(save_directory))
+        # What exists on one machine alone stays there; the calibration travels as a file of the checkpoint.
+        replace(self.config, cameras=None, sam3d_python=None, sam3d_checkout=None)._save_pretrained(
+            Path(save_directory)
+        )
         save_experience(experience, Path(save_directory))
 
     @classmethod

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +11,7 @@ import numpy as np
 from lerobot.datasets import LeRobotDataset
 
 from lerobot_openspm.configuration_openspm import OpenSPMConfig
-from lerobot_openspm.errors import CalibrationError, DatasetError
+from lerobot_openspm.errors import CalibrationError, DatasetError, PerceptionError
 from lerobot_openspm.experience import Experience
 from lerobot_openspm.flow.samples import perturbed, segment_frames
 from lerobot_openspm.flow.training_set import TrainingSet
@@ -25,6 +26,8 @@ from lerobot_openspm.mining.mine import (
     oracle_layouts,
 )
 from lerobot_openspm.mining.signals import observe_robot
+from lerobot_openspm.perception.object_shape import ShapeBackend
+from lerobot_openspm.perception.sam3d import Sam3dShape, worker_command
 from lerobot_openspm.perception.segmentation.make import make_segmenter
 from lerobot_openspm.perception.types import Segmenter
 
@@ -53,6 +56,23 @@ def segmenter_of(config: OpenSPMConfig) -> Segmenter | None:
     if config.segmentation == "demonstrations":
         return None
     return make_segmenter(config.segmentation, {}, config.mask_labels or {}, device=str(config.device))
+
+
+def shapes_of(config: OpenSPMConfig) -> AbstractContextManager[ShapeBackend | None]:
+    """The shape backend that a configuration asks for, to be closed after use; None where there is none.
+
+    Raises:
+        PerceptionError: It is not said where SAM 3D is.
+    """
+    if config.shape != "sam3d":
+        return nullcontext(None)
+    if config.sam3d_python is None or config.sam3d_checkout is None:
+        raise PerceptionError(
+            f"shape is 'sam3d', but sam3d_python is {config.sam3d_python!r} and sam3d_checkout "
+            f"{config.sam3d_checkout!r}; pass --policy.sam3d_python=PYTHON and --policy.sam3d_checkout=FOLDER, "
+            "see docs/sam3d.md"
+        )
+    return Sam3dShape(worker_command(Path(config.sam3d_python), Path(config.sam3d_checkout)))
 
 
 def mine_experience(
@@ -91,9 +111,11 @@ def mine_experience(
     robot = observe_robot(episodes, known.robot if known else None)
     mined = mine_key_poses(demonstrations, robot, config.memory_episodes)
     scenes = learn_scenes(demonstrations, mined.mined, cameras)
-    objects = layouts_in_scenes(
-        scenes, mined.mined, known.objects if known else {}, np.random.default_rng(0), segmenter, config.shape
-    )
+    models = known.objects if known else {}
+    with shapes_of(config) as shapes:
+        objects = layouts_in_scenes(
+            scenes, mined.mined, models, np.random.default_rng(0), segmenter, config.shape, shapes
+        )
     names: tuple[str, ...] = ()
     layouts = objects.layouts
     if config.perception == "oracle":

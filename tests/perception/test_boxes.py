@@ -22,6 +22,7 @@ from lerobot_openspm.perception.box_learning import learn_boxes
 from lerobot_openspm.perception.learning import learn_objects
 from lerobot_openspm.perception.localise import localise, localise_all
 from lerobot_openspm.perception.model import BoxModel, ObjectModel
+from lerobot_openspm.perception.object_shape import ObjectShape
 from lerobot_openspm.perception.segmentation.learned import LearnedSegmenter
 from lerobot_openspm.perception.sightings import touched
 from lerobot_openspm.perception.types import Hint, Segmentation
@@ -248,3 +249,30 @@ def test_what_was_learned_from_masks_is_not_sought_without(models, unseen):
     shaped = ObjectModel("cup", None, np.zeros((8, 3), np.float32), 0.01, 0.0, 0.0, 0.0, 0.0, 0.9)
     with pytest.raises(PerceptionError, match="'cup' was learned from a segmenter's masks"):
         localise(views, shaped)
+
+
+class Told:
+    """A shape backend that knows how large things truly are, and remembers what it was asked for."""
+
+    def __init__(self):
+        self.asked = []
+
+    def describe(self, view, segmentation, points_world=None):
+        name = next(name for name in NAMES if (view.labels == LABELS[name])[segmentation.mask].mean() > 0.5)
+        self.asked.append(name)
+        foot = np.append(points_world[:, :2].mean(axis=0), 0.0)
+        return ObjectShape(se3.from_yaw(foot, 0.0), np.asarray(body(name, np.eye(4)).size, float), 0.9)
+
+
+def test_a_shape_backend_tells_the_size_once_per_object_and_the_masks_the_rest(scenes, unseen):
+    told = Told()
+    models = learn_boxes(NAMES, scenes, segmenter(), told)
+    assert sorted(told.asked) == sorted(NAMES)
+    for name in NAMES:
+        assert models[name].size == pytest.approx(body(name, np.eye(4)).size, abs=1e-9)
+    assert models["cup"].yaw_period == 0
+    assert models["block"].yaw_period == pytest.approx(np.pi)
+    views = masked_views(unseen[0])
+    for name in NAMES:
+        found = localise_box(views, models[name], instances_of(views, name))
+        assert np.linalg.norm(found.T_world_obj[:2, 3] - unseen[0][name][:2, 3]) < 0.004

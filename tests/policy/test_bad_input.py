@@ -22,6 +22,7 @@ from lerobot_openspm.errors import (
     MemoryFormatError,
     ObservationError,
     OpenSPMError,
+    PerceptionError,
 )
 from lerobot_openspm.experience import VERSION
 from lerobot_openspm.modeling_openspm import OpenSPMPolicy
@@ -276,3 +277,13 @@ def test_an_object_that_perception_does_not_know_is_refused_when_it_is_loaded(
     file.write_text(json.dumps(data))
     with pytest.raises(MemoryFormatError, match=rf"memory\.json: entries\[\d+\] has key poses at '{name}'"):
         OpenSPMPolicy.from_pretrained(tmp_path / "changed")
+
+
+def test_sam3d_that_nobody_said_where_to_find_is_an_error(
+    tiny_meta: LeRobotDatasetMetadata, checkpoint: Path
+):
+    config = new_config(tiny_meta)
+    config.segmentation, config.shape, config.mask_labels = "given", "sam3d", {"bowl": 1}
+    config.cameras = str(checkpoint / "cameras.json")
+    with pytest.raises(PerceptionError, match=r"sam3d_python is None.*--policy\.sam3d_python=PYTHON"):
+        OpenSPMPolicy(config, dataset_meta=tiny_meta)

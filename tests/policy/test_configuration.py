@@ -36,6 +36,7 @@ LABELS = {"bowl": 1, "wine bottle": 4}
     ("options", "words"),
     [
         ({"shape": "box"}, "shape is 'box', but without a segmenter.*segmentation=sam3"),
+        ({"sam3d_python": "python"}, "are for shape 'sam3d', got 'demonstrations'"),
         ({"segmentation": "sam3", "perception": "oracle"}, "'sam3', but perception=oracle"),
         ({"segmentation": "given"}, "mask_labels is None.*--policy.mask_labels='"),
         ({"segmentation": "sam3", "mask_labels": LABELS}, "'sam3', mask_labels is {'bowl'"),

@@ -34,6 +34,7 @@ from lerobot_openspm.mining.signals import Episode
 from lerobot_openspm.perception.learning import Shape, learn_objects
 from lerobot_openspm.perception.localise import localise_all
 from lerobot_openspm.perception.model import KnownObject
+from lerobot_openspm.perception.object_shape import ShapeBackend
 from lerobot_openspm.perception.types import Hint, Scene, Segmenter
 
 logger = logging.getLogger(__name__)
@@ -126,6 +127,7 @@ def layouts_in_scenes(
     rng: np.random.Generator,
     segmenter: Segmenter | None = None,
     shape: Shape = "demonstrations",
+    shapes: ShapeBackend | None = None,
 ) -> LearnedObjects:
     """Learn the objects that are not known yet, and find those that each episode's instruction names.
 
@@ -136,6 +138,7 @@ def layouts_in_scenes(
         rng: Chooses among the demonstrations of an object where there are more than needed.
         segmenter: Finds the objects' masks; None to learn what they look like.
         shape: What is learned of an object that a segmenter finds.
+        shapes: Tells the sizes of objects, for shape "sam3d".
     """
     named = sorted({hint.name for scene in scenes for hint in scene.hints} - set(known))
     models = dict(known)
@@ -145,7 +148,7 @@ def layouts_in_scenes(
             replace(scene, hints=tuple(hint for hint in scene.hints if hint.name in named))
             for scene in scenes
         ]
-        learned = learn_objects(unknown, rng, known.values(), segmenter, shape)
+        learned = learn_objects(unknown, rng, known.values(), segmenter, shape, shapes)
         models |= learned
         if missing := [name for name in named if name not in learned]:
             logger.warning("could not learn what %s looks like; no key pose will be anchored there", missing)

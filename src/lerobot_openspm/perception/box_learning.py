@@ -14,6 +14,7 @@ from lerobot_openspm.perception.box import Box, oriented_box
 from lerobot_openspm.perception.box_finding import place
 from lerobot_openspm.perception.lifting import Lifted, lift, support_height
 from lerobot_openspm.perception.model import BoxModel, box_period
+from lerobot_openspm.perception.object_shape import ShapeBackend
 from lerobot_openspm.perception.outline import OutlineFit, fit_outlines, outline
 from lerobot_openspm.perception.sightings import Instances, Sighting, segmented, touched, whole_mask
 from lerobot_openspm.perception.types import Scene, Segmentation, Segmenter, View
@@ -58,20 +59,28 @@ class Seen:
         return float(np.median(heights)) if heights else floor
 
 
-def learn_boxes(phrases: Sequence[str], scenes: Sequence[Scene], segmenter: Segmenter) -> dict[str, BoxModel]:
+def learn_boxes(
+    phrases: Sequence[str],
+    scenes: Sequence[Scene],
+    segmenter: Segmenter,
+    shapes: ShapeBackend | None = None,
+) -> dict[str, BoxModel]:
     """Learn the boxes of objects from where their demonstrations' first frames show them.
 
     Args:
         phrases: Names of the objects.
         scenes: First frames and hints of the demonstrations of all tasks.
         segmenter: Finds the instances of a phrase; of several, the one that the hand touched is meant.
+        shapes: Tells the size of each object, once, from the view that shows it largest; by default the
+            outlines of all its masks do.
 
     Returns:
         Models by phrase. One that is seen in no demonstration is left out, and the log says so.
 
     Raises:
         DatasetError: There are no phrases.
-        PerceptionError: The segmenter cannot know a phrase, or a view lacks what it needs.
+        PerceptionError: The segmenter cannot know a phrase, a view lacks what it needs, or the shape backend
+            cannot be used.
     """
     if not phrases:
         raise DatasetError(
@@ -83,7 +92,7 @@ def learn_boxes(phrases: Sequence[str], scenes: Sequence[Scene], segmenter: Segm
         seen = [_see(scene, phrase, found, floor) for scene, found in pairs]
         ones = [one for one in seen if one is not None]
         if ones:
-            models[phrase] = _learn(phrase, ones, floor)
+            models[phrase] = _learn(phrase, ones, floor, shapes)
         else:
             log.warning("perception: no mask of %r near where the hand touched it", phrase)
     return models
@@ -108,7 +117,20 @@ def _see(scene: Scene, name: str, instances: Instances, floor: float) -> Seen | 
     return Seen(scene.views, sighting, lifted)
 
 
-def _learn(name: str, seen: Sequence[Seen], floor: float) -> BoxModel:
+def _learn(name: str, seen: Sequence[Seen], floor: float, shapes: ShapeBackend | None) -> BoxModel:
+    trial = _from_outlines(name, seen, floor) if shapes is None else _described(name, seen, shapes)
+    size, height, period = trial.size, trial.height, trial.yaw_period
+    placed = [place(one.views, one.sighting, trial) for one in seen]
+    yaws = np.array([float(se3.yaw_of(one.fit.body.T_world_obj)) for one in placed])
+    centre, halfwidth = yaw_range(yaws, period)
+    # Where the yaws keep to a part of the circle nothing shows a symmetry, and nothing needs it.
+    shown = period if halfwidth >= period / 2 else 2 * np.pi
+    overlap = float(np.median([one.score for one in placed]))
+    return BoxModel(name, size, height, float(shown), centre, overlap)
+
+
+def _from_outlines(name: str, seen: Sequence[Seen], floor: float) -> BoxModel:
+    """A first model, of the size that fills the masks of all demonstrations."""
     # One view alone tells a small body nearby from a large one further off only by the plane below it.
     telling = [one for one in seen if one.shows_plane] or list(seen)
     boxes = [_free_fit(one, floor, is_round=False) for one in telling]
@@ -117,15 +139,22 @@ def _learn(name: str, seen: Sequence[Seen], floor: float) -> BoxModel:
     bodies = [fit.body for fit in (rounds if is_round else boxes)]
     size = np.median([_long_first(body).size for body in bodies], axis=0)
     height = float(np.median([body.T_world_obj[2, 3] for body in bodies]))
-    period = 0.0 if is_round else box_period(size)
-    trial = BoxModel(name, size, height, period, 0.0, 1.0)
-    placed = [place(one.views, one.sighting, trial) for one in seen]
-    yaws = np.array([float(se3.yaw_of(one.fit.body.T_world_obj)) for one in placed])
-    centre, halfwidth = yaw_range(yaws, period)
-    # Where the yaws keep to a part of the circle nothing shows a symmetry, and nothing needs it.
-    shown = period if halfwidth >= period / 2 else 2 * np.pi
-    overlap = float(np.median([one.score for one in placed]))
-    return BoxModel(name, size, height, float(shown), centre, overlap)
+    return BoxModel(name, size, height, 0.0 if is_round else box_period(size), 0.0, 1.0)
+
+
+def _described(name: str, seen: Sequence[Seen], shapes: ShapeBackend) -> BoxModel:
+    """A first model, of the size that a shape backend tells from the view that shows the object largest."""
+    one, camera = max(
+        ((one, camera) for one in seen for camera in one.sighting),
+        key=lambda pair: int(pair[0].sighting[pair[1]].mask.sum()),
+    )
+    shape = shapes.describe(one.views[camera], one.sighting[camera], one.lifted.points_world)
+    log.info("perception: %r is %s m, quality %.2f", name, np.round(shape.extents, 3), shape.quality)
+    height = float(shape.T_world_obj[2, 3])
+    trials = [
+        BoxModel(name, shape.extents, height, period, 0.0, 1.0) for period in (0.0, box_period(shape.extents))
+    ]
+    return min(trials, key=lambda trial: _residual([place(s.views, s.sighting, trial).fit for s in seen]))
 
 
 def _free_fit(seen: Seen, floor: float, is_round: bool) -> OutlineFit:

@@ -29,6 +29,7 @@ from lerobot_openspm.perception.fitting import (
 )
 from lerobot_openspm.perception.localise import COARSE_CUTS_PX, FINE_CUTS_PX
 from lerobot_openspm.perception.model import KnownObject, ObjectModel
+from lerobot_openspm.perception.object_shape import ShapeBackend
 from lerobot_openspm.perception.patch_learning import learn_patches
 from lerobot_openspm.perception.shape import Posed, Votes
 from lerobot_openspm.perception.sightings import segmented
@@ -59,7 +60,7 @@ NEAR_YAWS = np.deg2rad([-30.0, -10.0, 10.0, 30.0])
 TURN_GAIN = 0.008
 
 
-Shape = Literal["demonstrations", "box"]
+Shape = Literal["demonstrations", "box", "sam3d"]
 SHAPES: tuple[Shape, ...] = get_args(Shape)
 
 
@@ -69,6 +70,7 @@ def learn_objects(
     known: Collection[KnownObject] = (),
     segmenter: Segmenter | None = None,
     shape_source: Shape = "demonstrations",
+    shapes: ShapeBackend | None = None,
 ) -> dict[str, KnownObject]:
     """Learn every object that some scene hints at.
 
@@ -78,7 +80,9 @@ def learn_objects(
         known: Objects that are known already; none of the new ones is one of them.
         segmenter: Finds the objects' masks; by default the demonstrations teach their colours and patches.
         shape_source: With a segmenter, "box" learns the boxes around the objects and "demonstrations" their
-            shapes; without one, there is only the latter.
+            shapes; without one, there is only the latter. "sam3d" learns boxes of the sizes that `shapes`
+            tells.
+        shapes: Tells the size of an object from one view of it, for "sam3d".
 
     Returns:
         Models by name. An object that cannot be learned (never visible, no consistent colour) is left out,
@@ -92,8 +96,8 @@ def learn_objects(
         raise DatasetError(
             "no demonstration shows a grasp, contact or release; perception has nothing to learn from"
         )
-    if segmenter is not None and shape_source == "box":
-        return {**learn_boxes(names, scenes, segmenter)}
+    if segmenter is not None and shape_source != "demonstrations":
+        return {**learn_boxes(names, scenes, segmenter, shapes)}
     floor = min(float(hint.point_world[2]) for scene in scenes for hint in scene.hints) - 0.02
     if segmenter is not None:
         return _learn_masked(names, scenes, floor, segmenter)
