@@ -69,7 +69,7 @@ def shapes_of(config: OpenSPMConfig) -> AbstractContextManager[ShapeBackend | No
     if config.sam3d_python is None or config.sam3d_checkout is None:
         raise PerceptionError(
             f"shape is 'sam3d', but sam3d_python is {config.sam3d_python!r} and sam3d_checkout "
-            f"{config.sam3d_checkout!r}; pass --policy.sam3d_python=PYTHON and --policy.sam3d_checkout=FOLDER, "
+            f"{config.sam3d_checkout!r}; pass --policy.sam3d_python=PYTHON and --policy.sam3d_checkout=DIR, "
             "see docs/sam3d.md"
         )
     return Sam3dShape(worker_command(Path(config.sam3d_python), Path(config.sam3d_checkout)))
