@@ -3,8 +3,8 @@
     python -m benchmarks.measurement_noise --env.type=libero
 
 Errors are those of the estimates that the policy gets along episodes from tuning seeds, the hand in the way
-and all. Weights are fitted on all seeds but the last and judged on that; they go into `perception/measurement.py`
-by hand. Takes the options of `openspm bench`; episodes are counted per task.
+and all. Weights are fitted on all seeds but the last and judged on that; they go by hand into
+`perception/measurement.py`. Takes the options of `openspm bench`; episodes are counted per task.
 """
 
 from __future__ import annotations

@@ -5,6 +5,7 @@ from typing import Any
 
 from benchmarks.libero.tables import libero_parts
 from benchmarks.markdown import part, rates, table
+from benchmarks.perception_tables import perception_parts
 
 INTRODUCTION = """# Results on the tabletop
 
@@ -25,6 +26,7 @@ def write_page() -> None:
         part("What the flow model is told, from pixels", "conditioning", _conditioning, "figures"),
         part("Error of the object poses on unseen scenes", "perception", _perception, "figures"),
         *libero_parts(),
+        *perception_parts(),
     ]
     PAGE.write_text("\n\n".join(parts) + "\n")
 
