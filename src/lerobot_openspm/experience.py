@@ -195,6 +195,24 @@ def check_anchors(experience: Experience, where: str) -> None:
                 )
 
 
+def check_labels(experience: Experience, labels: Mapping[str, int] | None, where: str) -> None:
+    """Every object that is found by given masks has to have a number in them.
+
+    Args:
+        experience: What was loaded.
+        labels: Number by phrase; None where masks are not given.
+        where: Names the file with the labels in errors.
+
+    Raises:
+        MemoryFormatError: An object has none.
+    """
+    if labels is not None and (missing := sorted(set(experience.objects) - set(labels))):
+        raise MemoryFormatError(
+            f"{where}: 'mask_labels' has no number for {', '.join(missing)}, which the memory has key poses "
+            f"at; it has {', '.join(sorted(labels))}. Pass --policy.mask_labels='{{...}}' with all of them"
+        )
+
+
 def _read_json(path: Path) -> dict[str, Any]:
     try:
         data = json.loads(_read(path, MAX_JSON_BYTES))

@@ -27,6 +27,7 @@ from lerobot_openspm.experience import (
     MEMORY_JSON,
     Experience,
     check_anchors,
+    check_labels,
     load_experience,
     save_experience,
 )  # fmt: skip
@@ -272,7 +273,10 @@ class OpenSPMPolicy(PreTrainedPolicy):
             raise MemoryFormatError(
                 f"the memory in {directory} holds no entries, so nothing can be done with it; train again"
             )
-        check_anchors(self.experience, str(directory / MEMORY_JSON))
+        if self.config.memory_update == "keep" or dataset_meta is None:
+            check_anchors(self.experience, str(directory / MEMORY_JSON))
+            check_labels(self.experience, self.config.mask_labels, str(directory / CONFIG_NAME))
+        _ = self.segmenter  # what cannot be used is an error now, not at the first observation
         for name in ("perception", "segmentation", "shape"):
             made, asked = getattr(self.experience, name), getattr(self.config, name)
             if made != asked:

@@ -102,6 +102,10 @@ class Observation:
                 f"{OBJECT_POSES!r} has shape {self.object_poses.shape}, expected ({7 * len(names)},): "
                 f"position and quat_wxyz of {', '.join(names)}, as in the demonstrations"
             )
+        if not np.isfinite(self.object_poses).all():
+            raise ObservationError(
+                f"{OBJECT_POSES!r} is not finite: {self.object_poses}; check the simulation"
+            )
         rows = self.object_poses.reshape(len(names), 7)
         T = se3.transform(se3.matrix_from_quat_xyzw(rows[:, [4, 5, 6, 3]]), rows[:, :3])
         return dict(zip(names, T, strict=True))

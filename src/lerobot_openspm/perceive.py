@@ -36,6 +36,7 @@ class Eyes:
     segmenter: Segmenter | None = None
     _watch: CameraWatch = field(default_factory=CameraWatch)
     _has_looked: bool = False
+    _labelled: set[str] = field(default_factory=set)
 
     def look(
         self, observation: Observation, names: Sequence[str], expected: Mapping[str, Array], time_s: float
@@ -58,6 +59,11 @@ class Eyes:
             observation.views(self.experience.cameras)
             self._has_looked = True
         views, absent = observation.usable_views(self.experience.cameras)
+        for camera in [name for name in self._labelled if name in views and views[name].labels is None]:
+            absent[camera] = "gave no masks, which it did before"
+            del views[camera]
+        if self.segmenter is not None:
+            self._labelled |= {name for name, view in views.items() if view.labels is not None}
         T_world_ee = observation.hand.T_world_ee
         faults = self._watch.check(views, absent, T_world_ee, time_s)
         good = {camera: view for camera, view in views.items() if camera not in faults}

@@ -57,6 +57,17 @@ def test_a_task_in_which_nothing_can_be_dropped_is_refused(
     assert "nothing can be displaced there, expected some of bowl_on_plate" in err
 
 
+def test_a_folder_of_somebody_else_is_left_alone(openspm: Openspm, checkpoint: Path, tmp_path: Path):
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine" / "precious.txt").write_text("do not remove")
+    code, _, err = openspm(
+        "bench", "tracking", f"--policy.path={checkpoint}", f"--output={tmp_path / 'mine'}"
+    )
+    assert code == 2
+    assert "holds something that was not measured here; choose another --output" in err
+    assert (tmp_path / "mine" / "precious.txt").read_text() == "do not remove"
+
+
 def test_tracking_is_measured_and_goes_on_where_it_was(openspm: Openspm, checkpoint: Path, tmp_path: Path):
     arguments = (
         "bench", "tracking", f"--policy.path={checkpoint}", "--env.task=bowl_on_plate", "--episodes=1",

@@ -57,12 +57,24 @@ def test_a_late_camera_that_repeats_a_frame_now_and_then_is_forgiven():
         assert watch.check({"front": view(seed=step // 2)}, {}, hand(0.008 * step), 0.05 * step) == {}
 
 
-def test_faults_last_from_when_they_began_until_they_end():
+def test_faults_are_timed_from_the_last_sound_picture():
     watch = CameraWatch()
+    watch.check({"front": view()}, {}, hand(), 0.75)
     seconds = [
-        watch.check({}, {"front": "is missing"}, hand(), time_s)["front"].seconds
-        for time_s in (1.0, 1.25, 1.5)
+        watch.check({}, {"front": "is missing"}, hand(), time_s)["front"].seconds for time_s in (1.0, 1.5)
     ]
-    assert seconds == [0.0, 0.25, 0.5]
-    assert watch.check({"front": view()}, {}, hand(), 1.75) == {}
-    assert watch.check({"front": view(level=0)}, {}, hand(), 2.0)["front"].seconds == 0.0
+    assert seconds == [0.25, 0.75]
+    assert watch.check({"front": view(seed=1)}, {}, hand(), 1.75) == {}
+    assert watch.check({"front": view(level=0)}, {}, hand(), 2.0)["front"].seconds == 0.25
+
+
+def test_a_camera_that_never_worked_is_timed_from_the_start():
+    assert CameraWatch().check({"front": view(level=0)}, {}, hand(), 1.5)["front"].seconds == 1.5
+
+
+def test_a_frozen_picture_is_timed_from_when_the_hand_began_to_move():
+    watch = CameraWatch()
+    for time_s in (0.0, 1.0, 2.0):
+        assert watch.check({"front": view()}, {}, hand(), time_s) == {}
+    watch.check({"front": view()}, {}, hand(0.01), 2.25)
+    assert watch.check({"front": view()}, {}, hand(0.03), 2.5)["front"].seconds == 0.5

@@ -103,6 +103,31 @@ def test_a_poor_sight_changes_nothing(poor):
     assert_allclose(pose(one), CUP)
 
 
+def test_two_places_that_explain_the_pictures_are_ambiguous_then_stale_then_lost():
+    one = tracker()
+    statuses = []
+    for _ in range(10):
+        look(one, seen(shifted(CUP, 0.1, 0.0, 0.0), "ambiguous"))
+        statuses.append(one.status("cup"))
+    assert statuses[0] is TrackStatus.AMBIGUOUS
+    assert statuses[1:7] == [TrackStatus.STALE] * 6
+    assert statuses[-1] is TrackStatus.LOST
+
+
+def test_a_hidden_object_is_not_carried_off_by_a_velocity_of_noise():
+    rng = np.random.default_rng(3)
+    far = []
+    for _ in range(20):
+        one = tracker()
+        for _ in range(12):
+            look(one, seen(shifted(CUP, *rng.normal(0, 1e-3, 2), 0.0)))
+        for _ in range(40):  # ten seconds
+            look(one, unseen(visible=0.0))
+        look(one, seen(CUP))
+        far.append(np.linalg.norm(pose(one)[:3, 3] - CUP[:3, 3]))
+    assert max(far) < 0.003
+
+
 def test_doubt_makes_one_look_enough_but_no_glimpse():
     one, there = tracker(), shifted(CUP, 0.1, 0.0, 0.0)
     one.doubt(["cup", "never seen"], FAR_HAND)

@@ -128,17 +128,19 @@ def write_line(log: Path, result: Result) -> None:
 
 
 def summarise(results: Sequence[Result]) -> dict[str, Any]:
-    """Success by condition, of the episodes in which what was to be done was done."""
+    """Success by condition, of the episodes in which what was to be done was done; the others are counted."""
     by_condition: dict[str, list[Result]] = defaultdict(list)
     for result in results:
         by_condition[result.condition].append(result)
+    disturbances = {one.name for one in (*TRACKING, *CAMERAS) if one.disturbance}
     summary: dict[str, Any] = {}
     for name, found in by_condition.items():
-        is_disturbed = any(result.disturbed_at is not None for result in found)
-        counted = [result for result in found if result.disturbed_at is not None or not is_disturbed]
+        counted = [r for r in found if r.disturbed_at is not None or name not in disturbances]
+        undisturbed = [r for r in found if r not in counted]
         summary[name] = {
             **rate(sum(result.success for result in counted), len(counted)),
-            "undisturbed": len(found) - len(counted),
+            "undisturbed": len(undisturbed),
+            "undisturbed_failed": sum(not result.success for result in undisturbed),
             "failed": [[r.task, r.seed, r.status] for r in counted if not r.success],
         }
     return summary

@@ -87,7 +87,13 @@ class BenchConfig:
 
         folder = Path(self.output or f"outputs/bench/{what}_{self.env.type}")
         files = [self.checkpoint / name for name in ("model.safetensors", "memory.json", "cameras.json")]
-        discard_unless(folder, digest(files, [what]))
+        ours = folder.with_name(f"{folder.name}.sha256")
+        if folder.is_dir() and any(folder.iterdir()) and not ours.is_file():
+            raise OpenSPMError(
+                f"{folder} holds something that was not measured here; choose another --output"
+            )
+        root = str(self.dataset.root or DEFAULTS[self.env.type][0])
+        discard_unless(folder, digest(files, [what, self.env.type, root]))
         folder.mkdir(parents=True, exist_ok=True)
         return folder
 

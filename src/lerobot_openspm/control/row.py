@@ -23,10 +23,10 @@ from lerobot_openspm.perception.types import PoseEstimate
 
 logger = logging.getLogger(__name__)
 
-# An object that is not found is looked for again after this many steps; while things go well, all are.
-LOOK_AGAIN_STEPS = 5
-# What looks wrong is looked at again after this many.
-SECOND_LOOK_STEPS = 3
+# An object that is not found is looked for again after this long; while things go well, all are.
+LOOK_AGAIN_S = 0.25
+# What looks wrong is looked at again after this long.
+SECOND_LOOK_S = 0.15
 
 # Without a sound picture of every camera the hand goes on for so long, then holds still, then gives up.
 BLIND_S, GIVE_UP_S = 0.5, 2.0
@@ -107,7 +107,10 @@ class Row:
         self.seen: Seen | None = None
         self.is_paused = False
         self._step = -1
-        self._looked_at_step = -LOOK_AGAIN_STEPS
+        # Both at least one step; four looks a second whatever the robot's rate.
+        self._look_again_steps = max(1, round(LOOK_AGAIN_S / knowledge.step_s))
+        self._second_look_steps = max(1, round(SECOND_LOOK_S / knowledge.step_s))
+        self._looked_at_step = -self._look_again_steps
         self._planned_from = np.eye(4)  # the hand's pose when the plan was made
         # Told by what the episode shows first, so that it does not matter in which batch or row it runs.
         self._noise_key = (noise_seed, zlib.crc32(instruction.encode()), fingerprint)
@@ -122,10 +125,10 @@ class Row:
         self._step += 1
         self.tracker.predict(self._knowledge.step_s)
         if self.status in (Status.WAITING, Status.OBJECT_NOT_FOUND, Status.INFEASIBLE):
-            if self._waited_steps >= LOOK_AGAIN_STEPS:
+            if self._waited_steps >= self._look_again_steps:
                 self._plan(hand, look)
         elif self.status is Status.OBJECT_LOST:
-            if self._waited_steps >= SECOND_LOOK_STEPS:
+            if self._waited_steps >= self._second_look_steps:
                 self._look_around(hand, look)
         elif self.status is Status.RUNNING:
             index = self.executor.index
@@ -168,8 +171,8 @@ class Row:
             logger.warning("%r: %s", self.instruction, "; ".join(problems))
             self.executor.status = Status.INFEASIBLE
         else:
-            self._planned_from = hand.T_world_ee
-            self.executor.begin(self._transfer(best, hand.T_world_ee), hand)
+            self._begin(0, hand)
+            self._wait_for_what_is_needed(hand)
 
     def _try_again(self, hand: Hand, look: Look) -> None:
         """Find the objects of the remaining key poses again and go back to the approach of this contact."""
@@ -207,18 +210,20 @@ class Row:
         target = self.executor.target
         if target is None or (target.memory.dwell and not self.is_paused):
             return False  # done, or the fingers hide what they are around
-        if self.is_paused or self.faults or self.tracker.doubtful:
-            return self._waited_steps >= SECOND_LOOK_STEPS
-        return self.executor.index != index_before or self._waited_steps >= LOOK_AGAIN_STEPS
+        if self.faults:
+            return True
+        if self.is_paused or self.tracker.doubtful:
+            return self._waited_steps >= self._second_look_steps
+        return self.executor.index != index_before or self._waited_steps >= self._look_again_steps
 
     def _see(self, names: Sequence[str], hand: Hand, look: Look) -> frozenset[str]:
         """Look for objects; the names of those that are somewhere else than before."""
-        waited_s = min(self._waited_steps, LOOK_AGAIN_STEPS) * self._knowledge.step_s
+        waited_s = min(self._waited_steps, self._look_again_steps) * self._knowledge.step_s
         expected = {k: T for k, T in self.tracker.poses(hand.T_world_ee).items() if k in names}
         self.seen = look(names, expected, self._step * self._knowledge.step_s)
         self._looked_at_step = self._step
         for camera, fault in self.faults.items():
-            if fault.seconds > GIVE_UP_S:
+            if fault.seconds >= GIVE_UP_S:
                 logger.warning("%r: stopping, camera %r: %s", self.instruction, camera, fault.reason)
                 self.executor.stop(Status.CAMERA_FAULT)
         return self.tracker.look(self.seen.estimates, hand.T_world_ee, waited_s)
@@ -249,7 +254,7 @@ class Row:
     def _wait_for_what_is_needed(self, hand: Hand) -> None:
         """Hold still without sound pictures, and while what the hand is on its way to is not to be seen."""
         statuses = {name: self.tracker.status(name) for name in self._now_needed()}
-        blind = any(fault.seconds > BLIND_S for fault in self.faults.values())
+        blind = any(fault.seconds >= BLIND_S for fault in self.faults.values())
         if lost := [name for name, status in statuses.items() if status is TrackStatus.LOST]:
             if self.status is Status.RUNNING:
                 logger.info("%r: lost: %s", self.instruction, ", ".join(lost))
@@ -293,8 +298,11 @@ class Row:
     # Believing.
 
     def _begin(self, index: int, hand: Hand) -> None:
+        """Go to a key pose; what is grasped or pushed from there on is not in the hand any more."""
         self._planned_from = hand.T_world_ee
-        self.tracker.release(self.tracker.held, hand.T_world_ee)
+        ahead = self.ranked[0].entry.key_poses[index:]
+        regrasped = {pose.anchor.place for pose in ahead if pose.phase in ("approach", "grasp")}
+        self.tracker.release(self.tracker.held & regrasped, hand.T_world_ee)
         self.executor.begin(self._transfer(self.ranked[0].entry, self._planned_from), hand, index)
 
     def _update(self, names: Sequence[str], hand: Hand) -> set[str]:

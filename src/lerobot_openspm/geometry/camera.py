@@ -161,6 +161,9 @@ def _camera_from_dict(fields: Mapping[str, Any], where: str) -> Camera:
         mount, T_mount_cam = str(fields["mount"]), np.asarray(fields["T_mount_cam"], float)
     except (KeyError, TypeError, ValueError, OverflowError) as error:
         raise CalibrationError(f"{where}: missing or malformed field: {error}") from error
+    for name in ("width", "height"):
+        if float(fields[name]) != int(fields[name]):
+            raise CalibrationError(f"{where}: {name!r} is {fields[name]}, expected whole pixels")
     if mount not in ("world", "ee"):
         raise CalibrationError(f"{where}: 'mount' is {mount!r}, expected 'world' or 'ee'")
     if T_mount_cam.shape != (4, 4) or not se3.is_rigid(T_mount_cam):

@@ -17,11 +17,13 @@ from lerobot_openspm.perception.types import View
 MIN_CONTRAST = 2.0
 # A hand that has moved this far must have changed some pixel of a picture it is in.
 MOVED_M = 0.02
+# ... and one that moved less than this need not have.
+STILL_M = 0.001
 
 
 @dataclass(frozen=True)
 class Fault:
-    """What is wrong with a camera, and for how long it has been."""
+    """What is wrong with a camera, and seconds since its last sound picture."""
 
     reason: str
     seconds: float
@@ -29,10 +31,11 @@ class Fault:
 
 @dataclass
 class _Frame:
-    """The last picture of one camera that was new, and where the hand was then."""
+    """The last sound picture of one camera: its checksum, where the hand was, and until when it was news."""
 
     checksum: int
     T_world_ee: Array
+    time_s: float
 
 
 @dataclass
@@ -40,7 +43,6 @@ class CameraWatch:
     """Watches the cameras of one environment."""
 
     _frames: dict[str, _Frame] = field(default_factory=dict)
-    _since_s: dict[str, float] = field(default_factory=dict)
 
     def check(
         self, views: Mapping[str, View], absent: Mapping[str, str], T_world_ee: Array, time_s: float
@@ -55,20 +57,25 @@ class CameraWatch:
         """
         reasons = dict(absent)
         for camera, view in views.items():
-            if reason := self._wrong(camera, view, T_world_ee):
+            if reason := self._wrong(camera, view, T_world_ee, time_s):
                 reasons[camera] = reason
-        self._since_s = {camera: self._since_s.get(camera, time_s) for camera in reasons}
-        return {camera: Fault(reasons[camera], time_s - since) for camera, since in self._since_s.items()}
+        return {camera: Fault(reason, time_s - self._sound_s(camera)) for camera, reason in reasons.items()}
 
-    def _wrong(self, camera: str, view: View, T_world_ee: Array) -> str | None:
+    def _sound_s(self, camera: str) -> float:
+        """When a camera's last sound picture was taken; the start of the episode if there was none."""
+        return self._frames[camera].time_s if camera in self._frames else 0.0
+
+    def _wrong(self, camera: str, view: View, T_world_ee: Array, time_s: float) -> str | None:
         if float(view.image[::4, ::4].std()) < MIN_CONTRAST:
             return "is black or blank"
         checksum = zlib.crc32(np.ascontiguousarray(view.image))
         before = self._frames.get(camera)
         if before is None or before.checksum != checksum:
-            self._frames[camera] = _Frame(checksum, T_world_ee)
+            self._frames[camera] = _Frame(checksum, T_world_ee, time_s)
             return None
         moved = float(se3.distance(before.T_world_ee, T_world_ee))
+        if moved < STILL_M:  # nothing has happened that could be seen
+            before.time_s = time_s
         if moved > MOVED_M and all(_shows(view, T) for T in (before.T_world_ee, T_world_ee)):
             return "is frozen: the hand moved, and no pixel changed"
         return None

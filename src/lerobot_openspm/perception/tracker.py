@@ -27,7 +27,7 @@ class TrackStatus(StrEnum):
     TRACKED = "tracked"
     HELD = "held"  # moves with the hand
     HIDDEN = "hidden"  # something is in the way, most often the hand; it is taken to be where it was
-    AMBIGUOUS = "ambiguous"  # two places explain the images, or it was seen elsewhere once
+    AMBIGUOUS = "ambiguous"  # two places explain the images, or it was seen elsewhere than expected
     STALE = "stale"  # it should have been seen for a while, and was not
     LOST = "lost"  # ... for so long that it is not believed to be there any more
 
@@ -78,6 +78,7 @@ class _Track:
         rival: Where it was seen last, if that was not where it was expected; ``T_world_obj``.
         missed_s: For how long it has been looked for in vain.
         hidden: Whether the last look could not tell.
+        rivalled: Whether two places explained the last look's pictures.
         doubted: Whether the next sure sight is believed wherever it is.
     """
 
@@ -87,6 +88,7 @@ class _Track:
     rival: Array | None = None
     missed_s: float = 0.0
     hidden: bool = False
+    rivalled: bool = False
     doubted: bool = False
 
 
@@ -112,10 +114,10 @@ class Tracker:
         track = self._tracks.get(name)
         if track is None or track.missed_s >= self.settings.lost_s:
             return TrackStatus.LOST
-        if track.rival is not None:
-            return TrackStatus.AMBIGUOUS
         if track.missed_s >= self.settings.stale_s:
             return TrackStatus.STALE
+        if track.rival is not None or track.rivalled:
+            return TrackStatus.AMBIGUOUS
         if track.held:
             return TrackStatus.HELD
         return TrackStatus.HIDDEN if track.hidden else TrackStatus.TRACKED
@@ -123,7 +125,7 @@ class Tracker:
     @property
     def doubtful(self) -> bool:
         """Whether some object was last seen where it was not expected, and wants a second look."""
-        return any(track.rival is not None for track in self._tracks.values())
+        return any(track.rival is not None or track.rivalled for track in self._tracks.values())
 
     def predict(self, dt_s: float) -> None:
         """Let time pass."""
@@ -152,7 +154,7 @@ class Tracker:
                     self._begin(name, estimate.T_world_obj, estimate)
                     moved.add(name)
             elif self._is_seen(estimate):
-                if self._take(name, track, estimate, T_world_ee):
+                if self._take(name, track, estimate, T_world_ee, waited_s):
                     moved.add(name)
             else:
                 self._miss(track, estimate, T_world_ee, waited_s)
@@ -194,7 +196,9 @@ class Tracker:
             and estimate.visible >= self.settings.visible
         )
 
-    def _take(self, name: str, track: _Track, estimate: PoseEstimate, T_world_ee: Array) -> bool:
+    def _take(
+        self, name: str, track: _Track, estimate: PoseEstimate, T_world_ee: Array, waited_s: float
+    ) -> bool:
         """Update a track with a sure estimate; whether the object turned out to be elsewhere."""
         expected = _in_world(track.belief.T[0], track, T_world_ee)
         T_world_obj = nearest_equivalent(
@@ -206,15 +210,16 @@ class Tracker:
         if apart <= near_m:
             T_mount_world = se3.inverse(T_world_ee) if track.held else np.eye(4)
             belief, innovation = kalman.update(
-                track.belief, (T_mount_world @ T_world_obj)[None], _turned(R, T_mount_world)[None]
+                track.belief, (T_mount_world @ T_world_obj)[None], _rotated(R, T_mount_world)[None]
             )
             if innovation.accepted[0]:
                 track.belief, track.rival, track.missed_s = belief, None, 0.0
-                track.hidden = track.doubted = False
+                track.hidden = track.rivalled = track.doubted = False
                 track.smoothed = self._smoothed(track.smoothed, belief.T[0])
                 return False
         rival, track.rival = T_world_obj if track.doubted else track.rival, T_world_obj
         if rival is None or np.linalg.norm(rival[:3, 3] - T_world_obj[:3, 3]) > self.settings.agree_m:
+            track.missed_s += waited_s  # seen here and there, and not where it is taken to be
             return False
         self._begin(name, T_world_obj, estimate)
         return True
@@ -229,7 +234,11 @@ class Tracker:
             or estimate.status == "found"
             or float(np.linalg.norm(expected[:3, 3] - T_world_ee[:3, 3])) < near
         )
+        track.rivalled = estimate.status == "ambiguous" and not track.hidden
         track.missed_s = 0.0 if track.hidden or track.held else track.missed_s + waited_s
+        # What is not seen is taken to stand still: a velocity of noise would carry it off in seconds.
+        still = np.zeros((1, 3))
+        track.belief = track.belief._replace(velocity=still, angular_velocity=still)
 
     def _carry(self, track: _Track, T_new_old: Array, held: bool) -> None:
         """Express a track in the frame of what carries it from now on."""
@@ -262,9 +271,11 @@ def nearest_equivalent(T_world_obj: Array, expected: Array, period: float) -> Ar
 
 
 def _in_world(T_mount_obj: Array, track: _Track, T_world_ee: Array) -> Array:
+    """``T_world_obj`` ``(4, 4)`` of a pose in the frame that carries a track."""
     return T_world_ee @ T_mount_obj if track.held else T_mount_obj
 
 
-def _turned(R: Array, T: Array) -> Array:
+def _rotated(R: Array, T: Array) -> Array:
+    """A covariance ``(6, 6)`` in the axes of the frame that ``T`` ``(4, 4)`` leads to."""
     turn = np.kron(np.eye(2), T[:3, :3])
     return turn @ R @ turn.T
