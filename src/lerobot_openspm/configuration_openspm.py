@@ -46,10 +46,12 @@ class OpenSPMConfig(PreTrainedConfig):
         perception: "demonstrations" finds objects in the images, by what the demonstrations showed of them.
             "oracle" takes their poses from the simulator, for ablations only.
         tracking: Whether objects are followed through the episode, and key poses with them. Otherwise they
-            are found once, at its start, as in the paper.
+            are found once, at its start, as in the paper, and no picture is looked at, nor missed, after it.
         segmentation: What finds the objects' pixels. "demonstrations": the colours and patches that the
             demonstrations showed. "sam3" and "grounded_sam2": pretrained models that take any phrase.
             "given": the numbers in ``observation.masks.<camera>``.
+        segmentation_weights: Names on the Hub, or folders, of a pretrained segmenter's weights: one for
+            "sam3", detector and masks for "grounded_sam2"; the usual ones if not given.
         shape: What is learned of an object that a segmenter finds. "demonstrations": its shape, from the
             masks of all of them. "box": the upright box or cylinder around it; one demonstration is enough.
             "sam3d": the same, of the size that SAM 3D Objects tells, which runs in its own environment.
@@ -104,6 +106,7 @@ class OpenSPMConfig(PreTrainedConfig):
     perception: PerceptionSource = "demonstrations"
     tracking: bool = True
     segmentation: Segmentation = "demonstrations"
+    segmentation_weights: list[str] | None = None
     shape: Shape = "demonstrations"
     sam3d_python: str | None = None
     sam3d_checkout: str | None = None

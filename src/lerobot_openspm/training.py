@@ -55,7 +55,8 @@ def segmenter_of(config: OpenSPMConfig) -> Segmenter | None:
     """
     if config.segmentation == "demonstrations":
         return None
-    return make_segmenter(config.segmentation, {}, config.mask_labels or {}, device=str(config.device))
+    weights, labels = config.segmentation_weights or (), config.mask_labels or {}
+    return make_segmenter(config.segmentation, {}, labels, weights, str(config.device))
 
 
 def shapes_of(config: OpenSPMConfig) -> AbstractContextManager[ShapeBackend | None]:

@@ -287,3 +287,13 @@ def test_sam3d_that_nobody_said_where_to_find_is_an_error(
     config.cameras = str(checkpoint / "cameras.json")
     with pytest.raises(PerceptionError, match=r"sam3d_python is None.*--policy\.sam3d_python=PYTHON"):
         OpenSPMPolicy(config, dataset_meta=tiny_meta)
+
+
+def test_weights_that_are_not_there_are_an_error_when_the_policy_is_made(
+    tiny_meta: LeRobotDatasetMetadata, checkpoint: Path, tmp_path: Path
+):
+    config = new_config(tiny_meta)
+    config.segmentation, config.segmentation_weights = "sam3", [str(tmp_path / "nowhere")]
+    config.cameras = str(checkpoint / "cameras.json")
+    with pytest.raises(PerceptionError, match="nowhere"):
+        OpenSPMPolicy(config, dataset_meta=tiny_meta)

@@ -63,17 +63,15 @@ def world(env_type: str, task: str, seed: int) -> Generator[World]:
         from lerobot_openspm.bench.tabletop import TabletopWorld
         from lerobot_openspm.envs.tabletop_env import TabletopEnv
 
-        env = TabletopEnv(task=task)
-        yield TabletopWorld(env, seed)
-        env.close()
+        with contextlib.closing(TabletopEnv(task=task)) as env:
+            yield TabletopWorld(env, seed)
     else:
         from lerobot_openspm.bench.libero import IMAGE_SIZE, LiberoWorld
         from lerobot_openspm.envs.libero.simulator import LiberoSimulator
 
-        simulator = LiberoSimulator(task, IMAGE_SIZE, render_steps=False)
-        simulator.reset(seed)
-        yield LiberoWorld(simulator)
-        simulator.close()
+        with contextlib.closing(LiberoSimulator(task, IMAGE_SIZE, render_steps=False)) as simulator:
+            simulator.reset(seed)
+            yield LiberoWorld(simulator)
 
 
 def file_of(folder: Path, task: str, seed: int) -> Path:

@@ -131,7 +131,8 @@ def localise(
             from a segmenter's masks.
         hidden: Pixels ``(H, W)`` by camera name that something may be in front of; no evidence.
         T_expected: Pose ``(4, 4)`` at which the object is looked for first; elsewhere only if it is not
-            there.
+            there. An object known by a box is sought in all masks, whatever these two say; they only tell
+            how much of it is in sight.
 
     Raises:
         ObservationError: There is no view, or one is malformed.
