@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+import io
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Protocol
@@ -69,6 +71,13 @@ class LazyImages(Mapping[str, torch.Tensor]):
 
     def __len__(self) -> int:
         return len(self._cameras)
+
+
+def load(checkpoint: str) -> OpenSPMPolicy:
+    """A policy on one thread, without the line that LeRobot prints for every one that is loaded."""
+    torch.set_num_threads(1)
+    with contextlib.redirect_stdout(io.StringIO()):
+        return OpenSPMPolicy.from_pretrained(checkpoint)
 
 
 @dataclass(frozen=True)

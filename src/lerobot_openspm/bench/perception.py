@@ -12,10 +12,9 @@ from typing import Any
 
 import cv2
 import numpy as np
-import torch
 from lerobot.datasets import LeRobotDatasetMetadata
 
-from lerobot_openspm.bench.episode import IMAGES, World, run_episode
+from lerobot_openspm.bench.episode import IMAGES, World, load, run_episode
 from lerobot_openspm.bench.object_frames import offset
 from lerobot_openspm.bench.truth import Truth, pose_error, true_period
 from lerobot_openspm.control.row import Row
@@ -81,8 +80,7 @@ def file_of(folder: Path, task: str, seed: int) -> Path:
 
 def run(setting: Setting, folder: Path, task: str, seed: int) -> None:
     """Measure one episode and write its samples down."""
-    torch.set_num_threads(1)
-    policy = OpenSPMPolicy.from_pretrained(setting.checkpoint)
+    policy = load(setting.checkpoint)
     meta = LeRobotDatasetMetadata(setting.repo_id, root=setting.dataset)
     demonstrations = open_demonstrations(meta, policy.config)
     experience = policy.require_experience()
@@ -103,9 +101,8 @@ def read(folder: Path, jobs: Sequence[tuple[str, int]]) -> dict[str, list[Sample
 
 def costs(setting: Setting) -> dict[str, Any]:
     """What a look at three objects in two views of 256 pixels takes, and a step of the filter; one thread."""
-    torch.set_num_threads(1)
     cv2.setNumThreads(1)
-    policy = OpenSPMPolicy.from_pretrained(setting.checkpoint)
+    policy = load(setting.checkpoint)
     experience = policy.require_experience()
     task = tasks(setting.env_type, "all")[0]
     with world(setting.env_type, task, 0) as scene:

@@ -10,15 +10,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 
-from lerobot_openspm.bench.episode import run_episode
+from lerobot_openspm.bench.episode import load, run_episode
 from lerobot_openspm.bench.tabletop import GRASPED, Disturbance, TabletopWorld, move_cameras
 from lerobot_openspm.cli.pipeline import rate
 from lerobot_openspm.envs.tabletop_env import TabletopEnv
 from lerobot_openspm.envs.tasks import TASK_NAMES, select_tasks
 from lerobot_openspm.errors import OpenSPMError
-from lerobot_openspm.modeling_openspm import OpenSPMPolicy
 
 
 @dataclass(frozen=True)
@@ -69,8 +67,7 @@ class Result:
 
 def run(checkpoint: str, condition: Condition, task: str, seed: int) -> Result:
     """Run one episode under one condition."""
-    torch.set_num_threads(1)
-    policy = OpenSPMPolicy.from_pretrained(checkpoint)
+    policy = load(checkpoint)
     policy.config.tracking = condition.tracking
     env = TabletopEnv(task=task)
     world = TabletopWorld(env, seed)
