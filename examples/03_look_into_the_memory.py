@@ -8,6 +8,7 @@ carried over to where the objects are now, into the camera image.
 """
 
 import argparse
+from functools import partial
 from pathlib import Path
 
 import torch
@@ -19,7 +20,7 @@ from lerobot_openspm.control.transfer import transfer
 from lerobot_openspm.envs.tabletop_env import ACTION_NAMES, STATE_NAMES, TabletopEnv
 from lerobot_openspm.experience import load_experience
 from lerobot_openspm.observation import split_batch
-from lerobot_openspm.perceive import find_objects
+from lerobot_openspm.perceive import Eyes
 
 CAMERA = "observation.images.front"
 
@@ -49,7 +50,7 @@ def main() -> None:
         config.transfer_limits, config.control_settings,
     )  # fmt: skip
     row = Row(knowledge, options.instruction, observation.fingerprint(), noise_seed=0)
-    row.observe(observation.hand, lambda names, _: find_objects(names, observation, experience))
+    row.observe(observation.hand, partial(Eyes(experience, config.hand_radius_m).look, observation))
 
     print(f"{options.instruction!r}: {row.status.name.lower()}")
     for name, T_world_obj in row.layout.items():

@@ -105,7 +105,8 @@ def mine_experience(
             "mining needs the cameras' calibration, got none; pass --policy.cameras=FILE, e.g. "
             "configs/cameras/openspm_tabletop.json"
         )
-    check_sizes(cameras, config.image_sizes, config.cameras or "the checkpoint's calibration")
+    sizes = {key: tuple(dataset_meta.features[key]["shape"][:2]) for key in dataset_meta.camera_keys}
+    check_sizes(cameras, sizes, config.cameras or "the checkpoint's calibration")
     _compare_rates(dataset_meta, config)
     demonstrations = open_demonstrations(dataset_meta, config)
     episodes = demonstrations.episodes(config.memory_episodes)
