@@ -273,10 +273,6 @@ class OpenSPMPolicy(PreTrainedPolicy):
             raise MemoryFormatError(
                 f"the memory in {directory} holds no entries, so nothing can be done with it; train again"
             )
-        if self.config.memory_update == "keep" or dataset_meta is None:
-            check_anchors(self.experience, str(directory / MEMORY_JSON))
-            check_labels(self.experience, self.config.mask_labels, str(directory / CONFIG_NAME))
-        _ = self.segmenter  # what cannot be used is an error now, not at the first observation
         for name in ("perception", "segmentation", "shape"):
             made, asked = getattr(self.experience, name), getattr(self.config, name)
             if made != asked:
@@ -284,6 +280,10 @@ class OpenSPMPolicy(PreTrainedPolicy):
                     f"the memory in {directory} holds key poses in the frames of {name}={made}, got "
                     f"--policy.{name}={asked}; the two cannot be mixed, train with the one you evaluate"
                 )
+        if self.config.memory_update == "keep" or dataset_meta is None:
+            check_anchors(self.experience, str(directory / MEMORY_JSON))
+            check_labels(self.experience, self.config.mask_labels, str(directory / CONFIG_NAME))
+        _ = self.segmenter  # what cannot be used is an error now, not at the first observation
         if self.config.cameras is not None:
             self.experience = replace(self.experience, cameras=load_cameras(Path(self.config.cameras)))
         where = self.config.cameras or str(directory / CAMERAS_JSON)

@@ -105,7 +105,9 @@ def mine_experience(
             "mining needs the cameras' calibration, got none; pass --policy.cameras=FILE, e.g. "
             "configs/cameras/openspm_tabletop.json"
         )
-    sizes = {key: tuple(dataset_meta.features[key]["shape"][:2]) for key in dataset_meta.camera_keys}
+    shapes_of_images = {key: tuple(dataset_meta.features[key]["shape"]) for key in dataset_meta.camera_keys}
+    # Datasets write the channels last, but some write them first.
+    sizes = {key: shape[1:] if shape[0] == 3 else shape[:2] for key, shape in shapes_of_images.items()}
     check_sizes(cameras, sizes, config.cameras or "the checkpoint's calibration")
     _compare_rates(dataset_meta, config)
     demonstrations = open_demonstrations(dataset_meta, config)

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from lerobot_openspm.envs.gl_backend import set_default_gl_backend
+from lerobot_openspm.envs.tasks import select_tasks
 from lerobot_openspm.errors import OpenSPMError
 
 logger = logging.getLogger(__name__)
@@ -67,6 +68,8 @@ class BenchConfig:
             raise ValueError(f"env.type is {self.env.type!r}, expected one of {', '.join(DEFAULTS)}")
         if self.env.type == "libero" and importlib.util.find_spec("libero") is None:
             raise ValueError("env.type=libero needs LIBERO; install it with: pip install 'lerobot[libero]'")
+        if self.env.type == "openspm_tabletop":
+            select_tasks(self.env.task)
         if self.episodes < 1 or self.workers < 1:
             raise ValueError(
                 f"episodes and workers must be at least 1, got {self.episodes} and {self.workers}"
@@ -81,6 +84,11 @@ class BenchConfig:
             raise FileNotFoundError(f"no checkpoint of this policy at {path}; pass --policy.path, or {make}")
         return path
 
+    @property
+    def demonstrations(self) -> Path:
+        """Folder of the demonstrations."""
+        return Path(self.dataset.root or Path(DEFAULTS[self.env.type][0]) / "dataset")
+
     def folder(self, what: str) -> Path:
         """Where results go; what was measured of other code or another checkpoint is discarded."""
         from lerobot_openspm.cli.pipeline import digest, discard_unless
@@ -92,8 +100,8 @@ class BenchConfig:
             raise OpenSPMError(
                 f"{folder} holds something that was not measured here; choose another --output"
             )
-        root = str(self.dataset.root or DEFAULTS[self.env.type][0])
-        discard_unless(folder, digest(files, [what, self.env.type, root]))
+        options = [what, self.env.type, *([str(self.demonstrations)] if what == "perception" else [])]
+        discard_unless(folder, digest(files, options))
         folder.mkdir(parents=True, exist_ok=True)
         return folder
 
@@ -102,14 +110,13 @@ def perception(config: BenchConfig) -> dict[str, Any]:
     """Errors of the poses that are followed, and what perception and the filter cost."""
     from lerobot_openspm.bench import perception as measure
 
-    folder = config.folder("perception")
-    root, repo_id = DEFAULTS[config.env.type]
     setting = measure.Setting(
-        config.env.type, str(config.checkpoint), config.dataset.root or f"{root}/dataset",
-        config.dataset.repo_id or repo_id,
+        config.env.type, str(config.checkpoint), str(config.demonstrations),
+        config.dataset.repo_id or DEFAULTS[config.env.type][1],
     )  # fmt: skip
-    if not (Path(setting.dataset) / "meta/info.json").is_file():
+    if not (config.demonstrations / "meta/info.json").is_file():
         raise FileNotFoundError(f"no demonstrations at {setting.dataset}; pass --dataset.root")
+    folder = config.folder("perception")
     tasks = measure.tasks(config.env.type, config.env.task)
     jobs = [(tasks[i % len(tasks)], config.seed + i // len(tasks)) for i in range(config.episodes)]
     left = [job for job in jobs if not measure.file_of(folder, *job).is_file()]
