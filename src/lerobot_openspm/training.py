@@ -98,17 +98,7 @@ def mine_experience(
         CalibrationError: No calibration is given, or it does not fit.
         DatasetError: The dataset yields no key poses or no anchors.
     """
-    if config.cameras is not None:
-        cameras = load_cameras(Path(config.cameras))
-    if cameras is None:
-        raise CalibrationError(
-            "mining needs the cameras' calibration, got none; pass --policy.cameras=FILE, e.g. "
-            "configs/cameras/openspm_tabletop.json"
-        )
-    shapes_of_images = {key: tuple(dataset_meta.features[key]["shape"]) for key in dataset_meta.camera_keys}
-    # Datasets write the channels last, but some write them first.
-    sizes = {key: shape[1:] if shape[0] == 3 else shape[:2] for key, shape in shapes_of_images.items()}
-    check_sizes(cameras, sizes, config.cameras or "the checkpoint's calibration")
+    cameras = _calibration(dataset_meta, config, cameras)
     _compare_rates(dataset_meta, config)
     demonstrations = open_demonstrations(dataset_meta, config)
     episodes = demonstrations.episodes(config.memory_episodes)
@@ -137,20 +127,31 @@ def mine_experience(
         len(entries), len(mined.mined), len(mined.skipped), ", ".join(sorted(objects.models)),
     )  # fmt: skip
     experience = Experience(
-        entries,
-        objects.models,
-        robot,
-        dict(cameras),
-        config.perception,
-        names,
-        config.segmentation,
-        config.shape,
+        entries, objects.models, robot, cameras, config.perception, names, config.segmentation, config.shape
     )
     return known.appended(experience) if known else experience
 
 
+def _calibration(
+    dataset_meta: Any, config: OpenSPMConfig, cameras: dict[str, Camera] | None
+) -> dict[str, Camera]:
+    """The calibration that the configuration names, or else the one given, compared with the images."""
+    if config.cameras is not None:
+        cameras = load_cameras(Path(config.cameras))
+    if cameras is None:
+        raise CalibrationError(
+            "mining needs the cameras' calibration, got none; pass --policy.cameras=FILE, e.g. "
+            "configs/cameras/openspm_tabletop.json"
+        )
+    shapes = {key: tuple(dataset_meta.features[key]["shape"]) for key in dataset_meta.camera_keys}
+    # Datasets write the channels last, but some write them first.
+    sizes = {key: shape[1:] if shape[0] == 3 else shape[:2] for key, shape in shapes.items()}
+    check_sizes(cameras, sizes, config.cameras or "the checkpoint's calibration")
+    return cameras
+
+
 def _compare_rates(dataset_meta: Any, config: OpenSPMConfig) -> None:
-    """Say so where a dataset claims another rate than the robot's; nothing is computed from either."""
+    """Say so where a dataset claims another rate than the robot's; no motion is computed from either."""
     if config.control_hz is None or float(dataset_meta.fps) == config.control_hz:
         return
     logger.warning(

@@ -2,29 +2,10 @@
 
 import json
 import shutil
-from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-
-from lerobot_openspm.cli.main import main
-
-Openspm = Callable[..., tuple[int, str, str]]
-
-
-@pytest.fixture
-def openspm(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Openspm:
-    def run(*arguments: str) -> tuple[int, str, str]:
-        monkeypatch.setattr("sys.argv", ["openspm", *arguments])
-        code = 0
-        try:
-            main()
-        except SystemExit as stop:
-            code = int(stop.code or 0)
-        out, err = capsys.readouterr()
-        return code, out, err
-
-    return run
+from tests.cli.conftest import Openspm
 
 
 @pytest.mark.parametrize(

@@ -2,37 +2,15 @@
 
 import json
 import subprocess
-import sys
-from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+from tests.cli.conftest import Openspm
 from tests.policy.lerobot_commands import CALIBRATION, run_command
 
-from lerobot_openspm.cli.main import COMMANDS, main
+from lerobot_openspm.cli.main import COMMANDS
 
 BOWL, STOVE = "put the bowl on the plate", "turn on the stove"
-
-Openspm = Callable[..., tuple[int, str, str]]
-
-
-@pytest.fixture
-def openspm(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Openspm:
-    """Run a command line in this process; returns exit code, stdout and stderr."""
-
-    def run(*arguments: str) -> tuple[int, str, str]:
-        monkeypatch.setattr("sys.argv", ["openspm", *arguments])
-        code = 0
-        try:
-            main()
-        except SystemExit as stop:
-            code = stop.code if isinstance(stop.code, int) else int(stop.code is not None)
-            if isinstance(stop.code, str):
-                print(stop.code, file=sys.stderr)
-        out, err = capsys.readouterr()
-        return code, out, err
-
-    return run
 
 
 def last_line(text: str) -> dict:

@@ -307,6 +307,22 @@ def test_how_soon_a_jump_is_noticed_does_not_hang_on_the_robots_rate(step_s):
     assert_allclose(one.executor.plan[0].T_world_ee, moved @ entry().key_poses[0].T_obj_ee)
 
 
+@pytest.mark.parametrize("off", [{"tracking": False}, {"execution": "open_loop"}])
+def test_a_camera_fault_at_the_start_does_not_hold_up_what_never_looks_again(off):
+    eyes, one = Eyes(entry().layout), row(**off)
+    eyes.faults = {"observation.images.front": Fault("is black or blank", 1.0)}
+    one.observe(HAND, eyes)
+    assert one.status is Status.RUNNING
+    assert not one.is_paused
+    eyes, one = Eyes(entry().layout), row()
+    eyes.faults = {"observation.images.front": Fault("is black or blank", 1.0)}
+    one.observe(HAND, eyes)
+    assert one.is_paused
+    eyes.faults = {}
+    watch(one, eyes, HAND, 2)
+    assert not one.is_paused
+
+
 def test_what_is_seen_here_and_there_is_waited_for():
     eyes, one = Eyes(entry().layout), row()
     one.observe(HAND, eyes)

@@ -172,7 +172,8 @@ class Row:
             self.executor.status = Status.INFEASIBLE
         else:
             self._begin(0, hand)
-            self._wait_for_what_is_needed(hand)
+            if self._is_tracking:  # else nothing is looked at any more that could end the waiting
+                self._wait_for_what_is_needed(hand)
 
     def _try_again(self, hand: Hand, look: Look) -> None:
         """Find the objects of the remaining key poses again and go back to the approach of this contact."""
@@ -204,8 +205,12 @@ class Row:
     def _waited_steps(self) -> int:
         return self._step - self._looked_at_step
 
+    @property
+    def _is_tracking(self) -> bool:
+        return self._knowledge.tracking and self._knowledge.settings.execution != "open_loop"
+
     def _is_time_to_look(self, index_before: int) -> bool:
-        if not self._knowledge.tracking or self._knowledge.settings.execution == "open_loop":
+        if not self._is_tracking:
             return False
         target = self.executor.target
         if target is None or (target.memory.dwell and not self.is_paused):
