@@ -33,3 +33,16 @@ def experience(**changes):
         "simulator_objects": ("bowl", "plate"),
     }
     return Experience(**{**fields, **changes})
+
+
+def same(a, b):
+    """Whether two of anything are equal, arrays bit by bit and with their types."""
+    if isinstance(a, np.ndarray):
+        return isinstance(b, np.ndarray) and a.dtype == b.dtype and np.array_equal(a, b)
+    if isinstance(a, dict):
+        return list(a) == list(b) and all(same(a[key], b[key]) for key in a)
+    if isinstance(a, tuple):
+        return len(a) == len(b) and all(same(x, y) for x, y in zip(a, b, strict=True))
+    if hasattr(a, "__dataclass_fields__"):
+        return type(a) is type(b) and same(vars(a), vars(b))
+    return type(a) is type(b) and a == b
