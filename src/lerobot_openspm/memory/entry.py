@@ -17,6 +17,22 @@ PHASES = (
 
 
 @dataclass(frozen=True)
+class Reference:
+    """How an instruction tells an object from others of its name, to be resolved in the scene.
+
+    "the bowl between the plate and the ramekin" is ``Reference("between", ("plate", "ramekin"))``, "the left
+    plate" is ``Reference("left")``.
+
+    Attributes:
+        relation: Where the object is: "between", "next to", "on", "in", "left", "right", "front", "back" ...
+        landmarks: The objects it is there relative to; none where it is meant among those of its own name.
+    """
+
+    relation: str
+    landmarks: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
 class SubTask:
     """One thing to do, as an instruction says it.
 
@@ -26,6 +42,8 @@ class SubTask:
         part: The part of the target that is meant ("top drawer"), or "".
         relation: Where the target goes relative to the landmark ("on", "in", "front of"), or "".
         landmark: The object it goes to, or "".
+        target_where: Which of several objects of the target's name is meant; None where it is not said.
+        landmark_where: Likewise for the landmark.
     """
 
     operation: str
@@ -33,6 +51,8 @@ class SubTask:
     part: str = ""
     relation: str = ""
     landmark: str = ""
+    target_where: Reference | None = None
+    landmark_where: Reference | None = None
 
     @property
     def objects(self) -> tuple[str, ...]:
@@ -120,6 +140,10 @@ class MemoryKeyPose:
         n_steps: Control steps the demonstration took to get here from the key pose before, pauses left out.
         dwell: Whether the hand stands still on the way here while the gripper opens or closes.
         axis: The constraint that the way here follows; None in free space.
+        sub_task: Which of the entry's sub-tasks the pose serves, counted from 0.
+        covariance: Spread ``(6, 6)`` of the merged demonstrations around the pose, over increments
+            ``(translation, rotation vector)`` in the anchor's frame, metres and radians; None for a pose of
+            one demonstration.
     """
 
     anchor: Anchor
@@ -131,6 +155,8 @@ class MemoryKeyPose:
     n_steps: int
     dwell: bool
     axis: Axis | None = None
+    sub_task: int = 0
+    covariance: Array | None = None
 
 
 @dataclass(frozen=True)
@@ -141,10 +167,13 @@ class MemoryEntry:
         key: What the entry is found by, ``k_i``.
         language: The instruction of the demonstration, ``l_i``.
         key_poses: In the order of execution.
-        quality: The paper's ``r_i``, 0 to 1: how closely the demonstration agrees with others of its task.
+        quality: The paper's ``r_i``, 0 to 1: how closely the demonstration agrees with others of its task,
+            updated by how it fared at deployment.
         version: The paper's ``nu_i``: counts up when an entry is replaced.
         source: Dataset and episode the entry was mined from.
         layout: Poses ``T_world_obj`` ``(4, 4)`` of the objects at the start of the demonstration.
+        trials: How often the entry was acted by at deployment, where the outcome is known.
+        successes: How many of these succeeded.
     """
 
     key: RetrievalKey
@@ -154,6 +183,8 @@ class MemoryEntry:
     version: int
     source: str
     layout: dict[str, Array] = field(default_factory=dict[str, Array])
+    trials: int = 0
+    successes: int = 0
 
     @property
     def objects(self) -> tuple[str, ...]:
