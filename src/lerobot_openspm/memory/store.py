@@ -18,6 +18,7 @@ from lerobot_openspm.memory.entry import (
     AxisKind,
     MemoryEntry,
     MemoryKeyPose,
+    Reference,
     RetrievalKey,
     SubTask,
 )
@@ -91,9 +92,7 @@ def entries_from_parts(
 def _entry(row: Mapping[str, Any], poses: Array, layouts: Array) -> MemoryEntry:
     if len(poses) != len(row["key_poses"]) or len(layouts) != len(row["layout"]):
         raise ValueError("fewer transforms than the entry names")
-    sub_tasks = tuple(
-        SubTask(**{str(k): str(v) for k, v in item.items()}) for item in row["key"]["sub_tasks"]
-    )
+    sub_tasks = tuple(_sub_task(item) for item in row["key"]["sub_tasks"])
     key = RetrievalKey(sub_tasks, tuple(str(phase) for phase in row["key"]["phases"]))
     key_poses = tuple(_key_pose(fields, T) for fields, T in zip(row["key_poses"], poses, strict=True))
     layout = {str(name): T for name, T in zip(row["layout"], layouts, strict=True)}
@@ -107,6 +106,21 @@ def _entry(row: Mapping[str, Any], poses: Array, layouts: Array) -> MemoryEntry:
     return MemoryEntry(
         key, str(row["language"]), key_poses, quality, int(row["version"]), str(row["source"]), layout
     )
+
+
+def _sub_task(fields: Mapping[str, Any]) -> SubTask:
+    words = {str(k): str(v) for k, v in fields.items() if not k.endswith("_where")}
+    return SubTask(
+        **words,
+        target_where=_reference(fields.get("target_where")),
+        landmark_where=_reference(fields.get("landmark_where")),
+    )
+
+
+def _reference(fields: Mapping[str, Any] | None) -> Reference | None:
+    if fields is None:
+        return None
+    return Reference(str(fields["relation"]), tuple(str(name) for name in fields["landmarks"]))
 
 
 def _key_pose(fields: Mapping[str, Any], T_obj_ee: Array) -> MemoryKeyPose:
