@@ -1,7 +1,8 @@
-"""`openspm bench perception|tracking|cameras`: measure a checkpoint in the simulators, resumably."""
+"""`openspm bench ...`: what is measured in the simulators, resumably; and where the other measures are."""
 
 from __future__ import annotations
 
+import importlib
 import importlib.util
 import json
 import logging
@@ -174,11 +175,15 @@ def _each(workers: int, function: Callable[..., Any], jobs: Sequence[tuple[Any, 
             pool.shutdown(cancel_futures=True)
 
 
+# Measures of a checkpoint in a simulator, which share their options.
 MEASURES: dict[str, Callable[[BenchConfig], dict[str, Any]]] = {
     "perception": perception,
     "tracking": tracking,
     "cameras": cameras,
 }
+# Measures with options of their own: a module with a dataclass `Options` and `measure(options)`, which
+# returns what is printed. Imported when it is asked for.
+ON_THEIR_OWN: dict[str, str] = {}
 
 
 def main(args: Sequence[str] | None = None) -> None:
@@ -188,8 +193,13 @@ def main(args: Sequence[str] | None = None) -> None:
     import draccus
 
     what, *options = list(sys.argv[1:] if args is None else args) or [""]
-    if what not in MEASURES:
-        raise OpenSPMError(f"bench what? got {what!r}, expected one of {', '.join(MEASURES)}")
+    known = [*MEASURES, *ON_THEIR_OWN]
+    if what not in known:
+        raise OpenSPMError(f"bench what? got {what!r}, expected one of {', '.join(known)}")
     set_default_gl_backend()
-    config = draccus.parse(config_class=BenchConfig, args=options)
-    print(json.dumps(MEASURES[what](config)))
+    if what in MEASURES:
+        options_class, measure = BenchConfig, MEASURES[what]
+    else:
+        module = importlib.import_module(ON_THEIR_OWN[what])
+        options_class, measure = module.Options, module.measure
+    print(json.dumps(measure(draccus.parse(config_class=options_class, args=options))))
