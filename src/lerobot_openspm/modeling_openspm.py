@@ -19,7 +19,8 @@ from lerobot.policies import PreTrainedPolicy
 from torch import Tensor
 
 from lerobot_openspm.configuration_openspm import OpenSPMConfig
-from lerobot_openspm.control.row import Knowledge, Row
+from lerobot_openspm.control.knowledge import Knowledge
+from lerobot_openspm.control.row import Row
 from lerobot_openspm.errors import DatasetError, MemoryFormatError
 from lerobot_openspm.experience import (
     CAMERAS_JSON,

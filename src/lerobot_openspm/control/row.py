@@ -1,24 +1,29 @@
-"""One environment from instruction to actions: look, retrieve, transfer, follow, look again."""
+"""One environment from instruction to actions: look, retrieve, transfer, follow, look again.
+
+An instruction that no demonstration shows as a whole is carried out part by part: each is planned when it is
+reached, from a fresh look, because what the parts before it moved is elsewhere now.
+"""
 
 from __future__ import annotations
 
 import logging
 import zlib
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 
-from lerobot_openspm.control.executor import ControlSettings, Executor, Hand, Status
-from lerobot_openspm.control.transfer import Target, TransferLimits, check_transfer, shape_deviation, transfer
+from lerobot_openspm.control.executor import Executor, Hand, Status
+from lerobot_openspm.control.knowledge import Knowledge
+from lerobot_openspm.control.transfer import Target, rise
 from lerobot_openspm.flow.condition import Query
 from lerobot_openspm.geometry import se3
 from lerobot_openspm.geometry.se3 import Array
+from lerobot_openspm.memory.compound import Candidate, plan_parts
 from lerobot_openspm.memory.entry import MemoryEntry
-from lerobot_openspm.memory.retrieval import Scored, ScoreWeights, retrieve, semantic_candidates
-from lerobot_openspm.memory.robot import RobotModel
+from lerobot_openspm.memory.retrieval import Scored
 from lerobot_openspm.perception.camera_watch import Fault
-from lerobot_openspm.perception.tracker import Tracker, TrackerSettings, TrackStatus
+from lerobot_openspm.perception.tracker import Tracker, TrackStatus
 from lerobot_openspm.perception.types import PoseEstimate
 
 logger = logging.getLogger(__name__)
@@ -33,11 +38,6 @@ BLIND_S, GIVE_UP_S = 0.5, 2.0
 
 # An object that is this far from where the key poses took it to be takes them along; less is noise.
 MOVED_M, MOVED_RAD = 0.002, 0.05
-
-# An entry whose key poses lie this much differently to one another here counts as 1/e alike.
-SHAPE_SCALE_M = 0.1
-# An entry that can be executed at all scores at least this.
-MIN_USABLE_SCORE = 1e-3
 
 
 @dataclass(frozen=True)
@@ -57,33 +57,6 @@ class Seen:
 Look = Callable[[Sequence[str], Mapping[str, Array], float], Seen]
 
 
-@dataclass(frozen=True)
-class Knowledge:
-    """What every environment shares: the memory, the robot, how to choose and how to follow.
-
-    Attributes:
-        entries: The memory bank.
-        yaw_periods: Angle by object that turns it into itself, radians.
-        robot: The robot.
-        weights: Of retrieval.
-        limits: Of transferred key poses.
-        settings: How key poses are followed.
-        tracker: When poses are believed.
-        tracking: Whether objects are looked for again once a plan is made.
-        step_s: Seconds that a control step takes.
-    """
-
-    entries: Sequence[MemoryEntry]
-    yaw_periods: Mapping[str, float]
-    robot: RobotModel
-    weights: ScoreWeights
-    limits: TransferLimits
-    settings: ControlSettings
-    tracker: TrackerSettings = field(default_factory=TrackerSettings)
-    tracking: bool = True
-    step_s: float = 0.05
-
-
 class Row:
     """State of one environment, and nothing that another environment could see.
 
@@ -91,7 +64,8 @@ class Row:
         instruction: What is to be done.
         executor: Follows the plan.
         tracker: Follows the objects.
-        ranked: The entries of the last retrieval with their scores, best first.
+        ranked: The entries of the last retrieval with their scores, best first; where a part of the
+            instruction is carried out, those parts of entries that are about it.
         layout: Poses ``T_world_obj`` that the plan was made with: of what the hand has touched, from before.
         seen: What the last look brought; None before the first.
         is_paused: Whether the hand holds still until something is seen again.
@@ -106,6 +80,12 @@ class Row:
         self.layout: dict[str, Array] = {}
         self.seen: Seen | None = None
         self.is_paused = False
+        # What the instruction is carried out by; made at the first look, because it may be refused.
+        self._parts: tuple[tuple[Candidate, ...], ...] = ()
+        self._part = 0
+        self._used: list[MemoryEntry] = []
+        self._altered: set[str] = set()  # opened or turned by parts before: looks different, stands still
+        self._start_height = np.inf
         self._step = -1
         # Both at least one step; four looks a second whatever the robot's rate.
         self._look_again_steps = max(1, round(LOOK_AGAIN_S / knowledge.step_s))
@@ -119,6 +99,11 @@ class Row:
     def status(self) -> Status:
         """What the execution is up to."""
         return self.executor.status
+
+    @property
+    def used_entries(self) -> tuple[MemoryEntry, ...]:
+        """The entries of the bank that were acted by so far, each once, in order."""
+        return tuple(self._used)
 
     def observe(self, hand: Hand, look: Look) -> None:
         """Take in a new observation: plan, advance, look around, go where things are now, try again."""
@@ -134,7 +119,9 @@ class Row:
             index = self.executor.index
             is_to_retry = not self.is_paused and self.executor.advance(hand)
             self._carry(index, hand)
-            if is_to_retry:
+            if self._is_to_go_on():
+                self._begin_next_part(hand, look)
+            elif is_to_retry:
                 self._try_again(hand, look)
             elif self._is_time_to_look(index):
                 self._look_around(hand, look)
@@ -153,27 +140,54 @@ class Row:
 
     # Planning.
 
+    @property
+    def _is_last_part(self) -> bool:
+        return self._part + 1 >= len(self._parts)
+
     def _plan(self, hand: Hand, look: Look) -> None:
-        candidates = semantic_candidates(self.instruction, self._knowledge.entries)
-        names = list(dict.fromkeys(name for entry, _ in candidates for name in entry.objects))
-        self._see(names, hand, look)
+        """Plan the part that is to be carried out now, once its objects are found."""
+        if not self._parts:
+            self._parts = plan_parts(self.instruction, self._knowledge.entries)
+            self._start_height = float(hand.T_world_ee[2, 3])
+        self._see(self._sought(), hand, look)
         if self.status is Status.CAMERA_FAULT:
             return
         self.layout |= self.tracker.poses(hand.T_world_ee)
-        self.ranked = retrieve(
-            candidates, lambda entry: self._geometric_score(entry, hand.T_world_ee), self._knowledge.weights
-        )
+        candidates = self._parts[self._part]
+        self.ranked = self._knowledge.rank(candidates, self.layout, hand.T_world_ee)
         best = self.ranked[0].entry
         if missing := [name for name in best.objects if name not in self.layout]:
             logger.info("%r: cannot find %s", self.instruction, missing)
             self.executor.status = Status.OBJECT_NOT_FOUND
-        elif problems := self._problems(best, hand.T_world_ee):
+        elif problems := self._knowledge.problems(best, self.layout, hand.T_world_ee):
             logger.warning("%r: %s", self.instruction, "; ".join(problems))
             self.executor.status = Status.INFEASIBLE
         else:
+            source = next(one.source for one in candidates if one.entry is best)
+            if not any(used is source for used in self._used):
+                self._used.append(source)
             self._begin(0, hand)
             if self._is_tracking:  # else nothing is looked at any more that could end the waiting
                 self._wait_for_what_is_needed(hand)
+
+    def _sought(self) -> list[str]:
+        """Objects of this part, and of those to come, which it may hide; not what looks different now."""
+        entries = [one.entry for part in self._parts[self._part :] for one in part]
+        names = dict.fromkeys(name for entry in entries for name in entry.objects)
+        return [name for name in names if name not in self._altered]
+
+    def _is_to_go_on(self) -> bool:
+        """Whether a part is done that others follow."""
+        return self.status is Status.DONE and not self._is_last_part
+
+    def _begin_next_part(self, hand: Hand, look: Look) -> None:
+        """Look at what the hand has left behind, and go on from there."""
+        passed = [target.memory for target in self.executor.plan]
+        self._altered |= {memory.anchor.place for memory in passed if memory.phase in ("open", "turn")}
+        self._part += 1
+        logger.info("%r: part %d of %d", self.instruction, self._part + 1, len(self._parts))
+        self.executor.finish_part()
+        self._plan(hand, look)
 
     def _try_again(self, hand: Hand, look: Look) -> None:
         """Find the objects of the remaining key poses again and go back to the approach of this contact."""
@@ -289,7 +303,7 @@ class Row:
         """Objects of the key poses to come that still are where they were seen."""
         index = self.executor.index
         touched = {pose.memory.anchor.place for pose in self.executor.plan[:index] if _touches(pose)}
-        return [name for name in self._anchors(index) if name not in touched]
+        return [name for name in self._anchors(index) if name not in touched | self._altered]
 
     def _now_needed(self) -> list[str]:
         """Objects that the present key pose is relative to, unless the hand has touched them."""
@@ -322,25 +336,15 @@ class Row:
             return changed
         entry, believed = self.ranked[0].entry, self.layout
         self.layout = {**believed, **{name: poses[name] for name in changed}}
-        if problems := self._problems(entry, self._planned_from):
+        if problems := self._knowledge.problems(entry, self.layout, self._planned_from):
             logger.info("%r: not believed: %s", self.instruction, "; ".join(problems))
             self.layout = believed
             return set()
         return changed
 
-    def _geometric_score(self, entry: MemoryEntry, T_world_ee: Array) -> float:
-        """``S_geo``: 0 if an entry cannot be executed here, else how like its demonstration it would be."""
-        if any(name not in self.layout for name in entry.objects) or self._problems(entry, T_world_ee):
-            return 0.0
-        deviation = shape_deviation(entry, self._transfer(entry, T_world_ee))
-        return max(float(np.exp(-deviation / SHAPE_SCALE_M)), MIN_USABLE_SCORE)
-
     def _transfer(self, entry: MemoryEntry, T_world_ee: Array) -> tuple[Target, ...]:
-        return transfer(entry, self.layout, self._knowledge.yaw_periods, T_world_ee)
-
-    def _problems(self, entry: MemoryEntry, T_world_ee: Array) -> list[str]:
-        targets = self._transfer(entry, T_world_ee)
-        return check_transfer(targets, T_world_ee, self._knowledge.robot, self._knowledge.limits)
+        targets = self._knowledge.transfer(entry, self.layout, T_world_ee)
+        return targets if self._is_last_part else (*targets, *rise(targets[-1], self._start_height))
 
 
 def _touches(target: Target) -> bool:

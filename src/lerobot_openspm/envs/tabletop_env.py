@@ -12,7 +12,7 @@ from lerobot_openspm.envs import scene
 from lerobot_openspm.envs.layout import sample_layout
 from lerobot_openspm.envs.recording import pose_names, pose_vector
 from lerobot_openspm.envs.simulator import TabletopSimulator
-from lerobot_openspm.envs.tasks import TASKS, select_tasks
+from lerobot_openspm.envs.tasks import ANY_TASK, select_tasks
 
 STATE_NAMES = ("x", "y", "z", "axis_angle_x", "axis_angle_y", "axis_angle_z", "finger_left", "finger_right")
 ACTION_NAMES = (
@@ -66,7 +66,7 @@ class TabletopEnv(gym.Env):
     def __init__(
         self,
         task: str = "bowl_on_plate",
-        episode_length: int = 300,
+        episode_length: int | None = None,
         observation_height: int = 256,
         observation_width: int = 256,
         object_poses: bool = False,
@@ -82,11 +82,11 @@ class TabletopEnv(gym.Env):
         ):
             if not MIN_IMAGE_SIZE <= size <= MAX_IMAGE_SIZE:
                 raise ValueError(f"{label} must lie in [{MIN_IMAGE_SIZE}, {MAX_IMAGE_SIZE}], got {size}")
-        if episode_length <= 0:
+        if episode_length is not None and episode_length <= 0:
             raise ValueError(f"episode_length must be positive, got {episode_length}")
         (self.task,) = select_tasks(task)
-        self.task_description = TASKS[self.task].instruction
-        self._max_episode_steps = episode_length
+        self.task_description = ANY_TASK[self.task].instruction
+        self._max_episode_steps = episode_length or ANY_TASK[self.task].max_steps
         self.render_mode = render_mode
         self._size = (observation_height, observation_width)
         self._with_object_poses = object_poses
@@ -150,7 +150,7 @@ class TabletopEnv(gym.Env):
         self._steps += 1
         if self.simulator.is_unstable():
             return 0.0, True, False, self._info("unstable")
-        self._held = self._held + 1 if TASKS[self.task].is_done(self.simulator) else 0
+        self._held = self._held + 1 if ANY_TASK[self.task].is_done(self.simulator) else 0
         if self._held >= SUCCESS_HOLD_STEPS:
             return 1.0, True, False, self._info("success")
         truncated = self._steps >= self._max_episode_steps

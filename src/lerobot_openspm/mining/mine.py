@@ -14,6 +14,7 @@ from lerobot_openspm.errors import DatasetError, InstructionError
 from lerobot_openspm.geometry import se3
 from lerobot_openspm.geometry.camera import Camera
 from lerobot_openspm.geometry.se3 import Array
+from lerobot_openspm.memory.compound import sub_task_index
 from lerobot_openspm.memory.entry import Anchor, Axis, MemoryEntry, MemoryKeyPose, RetrievalKey, SubTask
 from lerobot_openspm.memory.instruction import parse_instruction
 from lerobot_openspm.memory.robot import RobotModel
@@ -249,7 +250,7 @@ def build_entries(
         anchors = consensus(group, sub_tasks)
         judged = zip(members, group, constrained_axes(group, anchors), qualities(group, anchors), strict=True)
         for i, demonstration, axes, quality in judged:
-            key_poses = _remember(demonstration, anchors, axes)
+            key_poses = _remember(demonstration, anchors, axes, len(sub_tasks))
             if key_poses is None:
                 logger.warning(
                     "skipping episode %d of %s: its anchors were not found", mined[i].episode.index, source
@@ -267,7 +268,10 @@ def build_entries(
 
 
 def _remember(
-    demonstration: Demonstration, anchors: Mapping[Role, Anchor], axes: Mapping[Role, Axis]
+    demonstration: Demonstration,
+    anchors: Mapping[Role, Anchor],
+    axes: Mapping[Role, Axis],
+    n_sub_tasks: int,
 ) -> tuple[MemoryKeyPose, ...] | None:
     """Express key poses in their anchors' frames; None if a contact's anchor was not found."""
     kept = []
@@ -289,6 +293,7 @@ def _remember(
                 pose.n_steps,
                 pose.dwell,
                 axes.get(role),
+                sub_task_index(pose.contact, pose.phase, n_sub_tasks),
             )
         )
     return tuple(kept)
