@@ -31,11 +31,13 @@ class Candidate:
         entry: What is executed: an entry of the bank, or one sub-task of it.
         semantic: Its ``S_sem``.
         source: The entry of the bank.
+        asked: What of the instruction it carries out, one for each of the entry's sub-tasks.
     """
 
     entry: MemoryEntry
     semantic: float
     source: MemoryEntry
+    asked: tuple[SubTask, ...] = ()
 
 
 def sub_task_index(contact: int, phase: str, count: int) -> int:
@@ -114,7 +116,7 @@ def plan_parts(instruction: str, entries: Sequence[MemoryEntry]) -> tuple[tuple[
         if len(asked) == 1 and not _about(asked, singles):
             raise
     else:
-        return (tuple(Candidate(entry, score, entry) for entry, score in whole),)
+        return (tuple(Candidate(entry, score, entry, asked) for entry, score in whole),)
     runs = [Candidate(entry, 0.0, entry) for entry in entries]
     chain: list[tuple[Candidate, ...]] = []
     i = 0
@@ -131,7 +133,10 @@ def plan_parts(instruction: str, entries: Sequence[MemoryEntry]) -> tuple[tuple[
 
 def _about(asked: Sequence[SubTask], candidates: Sequence[Candidate]) -> tuple[Candidate, ...]:
     """Those of some candidates that are about what is asked, with their score."""
-    scored = [replace(one, semantic=semantic_score(asked, one.entry.key.sub_tasks)) for one in candidates]
+    scored = [
+        replace(one, semantic=semantic_score(asked, one.entry.key.sub_tasks), asked=tuple(asked))
+        for one in candidates
+    ]
     return tuple(one for one in scored if one.semantic >= MIN_SEMANTIC)
 
 
