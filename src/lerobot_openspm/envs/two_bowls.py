@@ -1,4 +1,4 @@
-"""Tasks with two bowls that look alike: the instruction tells which one is meant by where it stands."""
+"""When a layout with two bowls that look alike leaves no doubt which one an instruction means."""
 
 from __future__ import annotations
 
@@ -40,6 +40,16 @@ def between(a: str, b: str) -> Callable[[Layout], bool]:
         return is_between and (other_off > OFF_M or is_outside)
 
     return is_clear
+
+
+def left(layout: Layout) -> bool:
+    """The first bowl is the left one, as seen from opposite the robot, which is the front camera's view."""
+    return layout["bowl"].y < layout[scene.SECOND_BOWL].y - SIDE_M
+
+
+def right(layout: Layout) -> bool:
+    """The first bowl is the right one, as seen from opposite the robot."""
+    return layout["bowl"].y > layout[scene.SECOND_BOWL].y + SIDE_M
 
 
 def _apart(layout: Layout, a: str, b: str) -> float:
