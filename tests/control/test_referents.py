@@ -42,6 +42,8 @@ def test_a_landmark_may_have_been_seen_before():
 
 def test_without_a_word_about_it_or_its_landmark_it_stays_ambiguous():
     assert look(Referents(), seen(FAR, NEAR)).status == "ambiguous"
+    assert look(Referents(), seen(FAR, NEAR, status="found")).status == "ambiguous"
+    assert look(Referents(), seen(FAR)).status == "found"
     estimates = {"bowl": seen(FAR, NEAR)}
     assert Referents({"bowl": NEXT_TO_RACK}).sort_out(estimates, {})["bowl"].status == "ambiguous"
 

@@ -73,13 +73,15 @@ class Referents:
     def _meant(self, name: str, estimate: PoseEstimate, layout: Mapping[str, Array]) -> PoseEstimate:
         if name in self._not_meant:
             return self._unless_another(name, estimate)
-        if name not in self.said or estimate.status == "not_found" or not estimate.others:
+        if estimate.status == "not_found" or not estimate.others:
             return estimate
         candidates = (estimate.T_world_obj, *estimate.others)
         landmarks = {mark: T for mark, T in layout.items() if mark != name}
-        index = choose(self.said[name], candidates, landmarks)
+        index = choose(self.said[name], candidates, landmarks) if name in self.said else None
         if index is None:
-            logger.info("cannot tell which of %d like objects is the %r meant", len(candidates), name)
+            where = self.said.get(name, "nothing")
+            logger.info("cannot tell which of %d objects like the %r is meant: %s is said of it",
+                        len(candidates), name, where)  # fmt: skip
             return replace(estimate, status="ambiguous")
         self._not_meant[name] = candidates[:index] + candidates[index + 1 :]
         return replace(estimate, status="found", T_world_obj=candidates[index], others=())
