@@ -125,6 +125,24 @@ def test_an_opened_drawer_looks_different_and_is_not_looked_for_again():
     assert_allclose(place.T_world_ee, cabinet @ place.memory.T_obj_ee)
 
 
+def test_what_was_opened_is_not_looked_for_when_a_later_grasp_is_tried_again():
+    cabinet = se3.from_yaw([0.2, 0.2, 0.0], 0.3)
+    putting = entry("put the bowl on the cabinet").key_poses
+    both = "open the top drawer and put the bowl on the cabinet"
+    whole = entry(both, (*opening().key_poses, *putting), {"cabinet": cabinet, "bowl": LAYOUT["bowl"]})
+    eyes, one = Eyes({**LAYOUT, "cabinet": cabinet}), row(whole, instruction=both)
+    one.observe(HAND, eyes)
+    hand = HAND
+    while one.executor.index < 9:  # the bowl is lifted
+        target = one.executor.target
+        hand = Hand(target.T_world_ee, target.memory.opening)
+        watch(one, eyes, hand, 1)
+    eyes.asked.clear()
+    watch(one, eyes, Hand(hand.T_world_ee, 0.0), 1)
+    assert one.executor.attempts == 1
+    assert eyes.asked == [["bowl"]]
+
+
 def test_a_part_that_cannot_be_found_is_waited_for():
     eyes, one = Eyes({k: T for k, T in LAYOUT.items() if k != "box"}), row(PLATE, BOX)
     one.observe(HAND, eyes)

@@ -27,8 +27,9 @@ HEIGHT_ERROR_M = 0.01
 # How much a metre to the side counts beside a metre of distance, beyond half a right angle.
 SIDEWAYS_SHARE = 3.0
 
-# Costs (n,) in metres of candidates (n, 3), given landmarks (k, 3): the least is meant. Infinite: not at all.
-_Cost = Callable[[Array, Array], Array]
+# Costs (n,) in metres of candidates (n, 3), given landmarks (k, 3): the least is meant. Infinite: not at all,
+# not even if the candidate lay so many metres more favourably.
+_Cost = Callable[[Array, Array, float], Array]
 
 _ALIASES = {
     "left of": "left", "right of": "right", "front of": "front", "in front of": "front", "behind": "back",
@@ -73,10 +74,12 @@ def choose(
         return None
     places = np.stack(candidates)[:, :3, 3]
     marks = np.array([landmarks[name][:3, 3] for name in reference.landmarks]).reshape(-1, 3)
-    costs = cost(places, marks)
-    best, second = np.argsort(costs, kind="stable")[:2]
-    is_clear = np.isfinite(costs[best]) and costs[second] - costs[best] >= MARGIN_M
-    return int(best) if is_clear else None
+    costs = cost(places, marks, 0.0)
+    best = int(np.argmin(costs))
+    # The best fulfils what is said; the others do not even nearly, or are clearly worse.
+    others = np.delete(cost(places, marks, MARGIN_M), best)
+    is_clear = np.isfinite(costs[best]) and others.min() - costs[best] >= MARGIN_M
+    return best if is_clear else None
 
 
 def _costs(looking: Array) -> dict[tuple[str, int], _Cost]:
@@ -100,47 +103,51 @@ def _costs(looking: Array) -> dict[tuple[str, int], _Cost]:
 
 def _furthest(way: Array) -> _Cost:
     """The one that is furthest in a direction ``(2,)``."""
-    return lambda places, _: -places[:, :2] @ way
+
+    def cost(places: Array, *_: object) -> Array:
+        return -places[:, :2] @ way
+
+    return cost
 
 
 def _at_side(way: Array) -> _Cost:
     """The nearest one on one side of the landmark: within half a right angle of a direction ``(2,)``."""
 
-    def cost(places: Array, marks: Array) -> Array:
+    def cost(places: Array, marks: Array, slack: float) -> Array:
         offset = places[:, :2] - marks[0, :2]
         along = offset @ way
         across = np.abs(offset @ np.array([way[1], -way[0]]))
         sideways = SIDEWAYS_SHARE * np.maximum(across - along, 0.0)
-        return np.where(along >= MARGIN_M, np.linalg.norm(offset, axis=1) + sideways, np.inf)
+        return np.where(along >= MARGIN_M - slack, np.linalg.norm(offset, axis=1) + sideways, np.inf)
 
     return cost
 
 
-def _middle(places: Array, _: Array) -> Array:
+def _middle(places: Array, *_: object) -> Array:
     """The one that is nearest to all others; of two, neither."""
     apart = np.linalg.norm(places[:, None, :2] - places[None, :, :2], axis=-1)
     return apart.sum(axis=1)
 
 
-def _between(places: Array, marks: Array) -> Array:
+def _between(places: Array, marks: Array, _: float) -> Array:
     """The one that makes the way between two landmarks longer by least."""
     legs = np.linalg.norm(places[:, None, :2] - marks[None, :, :2], axis=-1).sum(axis=1)
     return legs - float(np.linalg.norm(marks[0, :2] - marks[1, :2]))
 
 
-def _next_to(places: Array, marks: Array) -> Array:
+def _next_to(places: Array, marks: Array, slack: float) -> Array:
     """The nearest one that is not on or in the landmark."""
     away = np.linalg.norm(places[:, :2] - marks[0, :2], axis=1)
-    return np.where(away < WITHIN_M, np.inf, away)
+    return np.where(away < WITHIN_M - slack, np.inf, away)
 
 
-def _above(places: Array, marks: Array) -> Array:
+def _above(places: Array, marks: Array, slack: float) -> Array:
     """The nearest one, as seen from above, that is not lower than the landmark."""
     away = np.linalg.norm(places[:, :2] - marks[0, :2], axis=1)
-    return np.where(places[:, 2] < marks[0, 2] - HEIGHT_ERROR_M, np.inf, away)
+    return np.where(places[:, 2] < marks[0, 2] - HEIGHT_ERROR_M - slack, np.inf, away)
 
 
-def _below(places: Array, marks: Array) -> Array:
+def _below(places: Array, marks: Array, slack: float) -> Array:
     """The nearest one, as seen from above, that is not higher than the landmark."""
     away = np.linalg.norm(places[:, :2] - marks[0, :2], axis=1)
-    return np.where(places[:, 2] > marks[0, 2] + HEIGHT_ERROR_M, np.inf, away)
+    return np.where(places[:, 2] > marks[0, 2] + HEIGHT_ERROR_M + slack, np.inf, away)

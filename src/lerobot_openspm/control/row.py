@@ -86,7 +86,7 @@ class Row:
         self._part = 0
         self._used: list[MemoryEntry] = []
         self._referents = Referents()
-        self._altered: set[str] = set()  # opened or turned by parts before: looks different, stands still
+        self._altered: set[str] = set()  # opened or turned: looks different now, and stands still
         self._start_height = np.inf
         self._step = -1
         # Both at least one step; four looks a second whatever the robot's rate.
@@ -191,8 +191,6 @@ class Row:
 
     def _begin_next_part(self, hand: Hand, look: Look) -> None:
         """Look at what the hand has left behind, and go on from there."""
-        passed = [target.memory for target in self.executor.plan]
-        self._altered |= {memory.anchor.place for memory in passed if memory.phase in ("open", "turn")}
         self._part += 1
         self._refer()
         logger.info("%r: part %d of %d", self.instruction, self._part + 1, len(self._parts))
@@ -206,7 +204,8 @@ class Row:
         if self._knowledge.tracking:
             # What should be in the hand is not, or what was to be met is not there: it may be anywhere.
             attempted = self.executor.plan[index : self.executor.index + 1]
-            self.tracker.doubt({pose.memory.anchor.place for pose in attempted}, hand.T_world_ee)
+            places = {pose.memory.anchor.place for pose in attempted}
+            self.tracker.doubt(places - self._altered, hand.T_world_ee)
             ahead = self._anchors(index)
             self._see(ahead, hand, look)
             self._update(ahead, hand)
@@ -302,19 +301,22 @@ class Row:
                 self.tracker.hold(passed.anchor.place, hand.T_world_ee)
             elif passed.phase in ("release", "push"):
                 self.tracker.release(self.tracker.held, hand.T_world_ee)
+            elif passed.phase in ("open", "turn"):
+                self._altered.add(passed.anchor.place)
         if self.status is Status.DONE:
             self.tracker.release(self.tracker.held, hand.T_world_ee)
 
     def _anchors(self, index: int) -> list[str]:
-        """Objects of the key poses from one on."""
+        """Objects of the key poses from one on that look as they did in the demonstrations."""
         ahead = self.ranked[0].entry.key_poses[index:]
-        return list(dict.fromkeys(name for pose in ahead for name in pose.anchor.objects))
+        names = dict.fromkeys(name for pose in ahead for name in pose.anchor.objects)
+        return [name for name in names if name not in self._altered]
 
     def _untouched(self) -> list[str]:
         """Objects of the key poses to come that still are where they were seen."""
         index = self.executor.index
         touched = {pose.memory.anchor.place for pose in self.executor.plan[:index] if _touches(pose)}
-        return [name for name in self._anchors(index) if name not in touched | self._altered]
+        return [name for name in self._anchors(index) if name not in touched]
 
     def _now_needed(self) -> list[str]:
         """Objects that the present key pose is relative to, unless the hand has touched them."""
