@@ -1,45 +1,20 @@
-import hashlib
-import json
-import os
 import re
-from dataclasses import replace
 
 import numpy as np
 import pytest
-from safetensors.numpy import load, save
-from tests.memory.builders import entry, robot
+from tests.memory.builders import robot
 from tests.memory.experiences import experience, same
+from tests.memory.memory_files import edit_arrays, edit_entries, edit_header, name_of, names, vouch_for, write_texts
 from tests.perception.builders import model
 
 from lerobot_openspm.errors import MemoryFormatError, OpenSPMError
-from lerobot_openspm.experience import FILES, VERSION, load_experience, save_experience
-from lerobot_openspm.memory.store import KEY_POSE_ARRAY, LAYOUT_ARRAY
+from lerobot_openspm.experience import VERSION, load_experience, save_experience
 
 
 @pytest.fixture
 def saved(tmp_path):
     save_experience(experience(), tmp_path)
     return tmp_path
-
-
-def edit_json(directory, change):
-    path = directory / "memory.json"
-    memory = json.loads(path.read_text())
-    change(memory)
-    path.write_text(json.dumps(memory))
-
-
-def edit_arrays(directory, change):
-    """Change the arrays and vouch for them again, as somebody would who means it."""
-    path = directory / "memory.safetensors"
-    arrays = load(path.read_bytes())
-    change(arrays)
-    vouch_for(directory, save(arrays))
-
-
-def vouch_for(directory, blob):
-    (directory / "memory.safetensors").write_bytes(blob)
-    edit_json(directory, lambda m: m["arrays"].update(sha256=hashlib.sha256(blob).hexdigest()))
 
 
 def test_what_is_saved_is_loaded_to_the_last_bit(saved):
