@@ -7,7 +7,7 @@ from typing import Any
 
 from lerobot_openspm.errors import MemoryFormatError
 from lerobot_openspm.experience_files import FORMAT, VERSION, Fields
-from lerobot_openspm.geometry.layout import VectorLayout, parse_layout
+from lerobot_openspm.geometry.layout import ROTATION_KINDS, VectorLayout, parse_layout
 from lerobot_openspm.memory.fields import MALFORMED, integer, known, text, texts
 from lerobot_openspm.memory.robot import RobotModel
 from lerobot_openspm.memory.store import robot_from_dict, robot_to_dict
@@ -111,9 +111,8 @@ def header_from_fields(fields: Fields, where: str) -> Header:
     except MemoryFormatError:
         raise
     except MALFORMED as error:
-        raise MemoryFormatError(
-            f"{where}: field {error} is missing or malformed; train or pull it again"
-        ) from error
+        reason = f"field {error} is missing" if isinstance(error, KeyError) else f"malformed: {error}"
+        raise MemoryFormatError(f"{where}: {reason}; train or pull it again") from error
 
 
 def _choice(fields: Fields, name: str, choices: tuple[str, ...], where: str) -> str:
@@ -131,7 +130,10 @@ def _layouts(fields: Any) -> Layouts | None:
 
 def _layout(fields: Any, what: str) -> VectorLayout:
     fields = known(fields, frozenset(("names", "rotation")), f"the {what}'s layout")
-    return parse_layout(texts(fields, "names"), what, text(fields, "rotation"))  # pyright: ignore[reportArgumentType]
+    kind = text(fields, "rotation")
+    if kind not in ROTATION_KINDS:
+        raise ValueError(f"the {what}'s rotation is {kind!r}, expected one of {', '.join(ROTATION_KINDS)}")
+    return parse_layout(texts(fields, "names"), what, kind)
 
 
 def check_layouts(ours: Layouts | None, theirs: Layouts | None, whose: str, where: str) -> None:

@@ -3,6 +3,7 @@
 import hashlib
 import json
 
+import numpy as np
 from safetensors.numpy import load, save
 
 from lerobot_openspm.experience_files import lines_to_arrays, read_header, sealed
@@ -23,7 +24,10 @@ def edit_header(directory, change):
     path = directory / "memory.json"
     header = json.loads(path.read_text())
     change(header)
-    path.write_text(json.dumps(sealed(header)))
+    try:
+        path.write_text(json.dumps(sealed(header)))
+    except ValueError:  # NaN has no canonical form; it is refused before the checksum is looked at
+        path.write_text(json.dumps(header))
 
 
 def edit_arrays(directory, change):
@@ -49,8 +53,6 @@ def edit_entries(directory, change):
 
 def write_texts(directory, texts):
     """Put texts in the place of the entries, each on its line."""
-    import numpy as np
-
     ends, position = [], len(HEAD)
     for text in texts:
         position += len(text) + 2 * bool(ends)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import sys
 from collections.abc import Collection, Mapping
 from typing import Any, cast
 
@@ -13,6 +14,8 @@ from numpy.typing import NDArray
 MALFORMED = (KeyError, TypeError, ValueError, IndexError, AttributeError, OverflowError)
 
 Fields = Mapping[str, Any]
+
+MAX = sys.float_info.max
 
 
 def known(fields: Any, names: Collection[str], what: str) -> Fields:
@@ -63,7 +66,8 @@ def number(fields: Fields, name: str, low: float = -math.inf, high: float = math
     """A finite number from `low` to `high`. Raises ValueError for anything else."""
     value = fields[name]
     # bool is an int to Python but no number in a file.
-    if type(value) not in (float, int) or not (math.isfinite(value) and low <= value <= high):
+    # An int may be beyond floats, which math.isfinite cannot be asked about.
+    if type(value) not in (float, int) or not (abs(value) <= MAX and low <= value <= high):
         within = "" if math.isinf(low) else f" from {low:g} to {high:g}"
         raise ValueError(f"{name!r} is {value!r}, expected a number{within}")
     return float(value)
