@@ -22,7 +22,7 @@ from safetensors.numpy import save as save_arrays
 
 from lerobot_openspm.errors import CalibrationError, MemoryFormatError
 from lerobot_openspm.files import locked, rename, write_beside, written
-from lerobot_openspm.geometry.camera import Camera, cameras_to_dict, load_cameras
+from lerobot_openspm.geometry.camera import Camera, cameras_from_dict, cameras_to_dict, load_cameras
 from lerobot_openspm.memory.bank import Lines, write_entries
 from lerobot_openspm.memory.entry import MemoryEntry
 from lerobot_openspm.memory.strict_json import loads
@@ -75,7 +75,7 @@ def write_files(
         arrays_file = _write_named(directory, ARRAYS, blob)
         calibration = _json(cameras_to_dict(cameras))
         pending = None
-        if not _holds(directory / CAMERAS_JSON, calibration):
+        if _read_if_there(directory / CAMERAS_JSON) != calibration:
             pending = _write_named(directory, CAMERAS, calibration)
         files = {
             "entries": {"file": entries_file},
@@ -202,8 +202,8 @@ def read_cameras(directory: Path, header: Mapping[str, Any]) -> dict[str, Camera
     # An interrupted save left it here, after the header was renamed into place.
     pending = directory / CAMERAS.format(str(sha256)[:16])
     for file in (path, pending):
-        if file.is_file() and _sha256(file.read_bytes()) == sha256:
-            return load_cameras(file)
+        if (blob := _read_if_there(file)) is not None and _sha256(blob) == sha256:
+            return cameras_from_dict(loads(blob, str(file)), str(file))
     cameras = load_cameras(path)
     raise CalibrationError(
         f"{path}: its checksum is not the one in {MEMORY_JSON}: changed, or from another checkpoint. To use "
@@ -246,8 +246,11 @@ def _contiguous(arrays: Mapping[str, NDArray[Any]]) -> Arrays:
     return {key: np.ascontiguousarray(value) for key, value in arrays.items()}
 
 
-def _holds(path: Path, blob: bytes) -> bool:
-    return path.is_file() and path.read_bytes() == blob
+def _read_if_there(path: Path) -> bytes | None:
+    try:
+        return path.read_bytes()
+    except FileNotFoundError:
+        return None
 
 
 def _sha256(blob: bytes) -> str:
