@@ -123,7 +123,7 @@ def test_the_memory_survives_kill_9_at_any_moment(tmp_path):
     assert visible(tmp_path) == sorted(names(tmp_path))
     # It was cut off after the one and after the other, and in the middle.
     assert {is_old for is_old, _ in seen} == {True, False}
-    assert {n_files for _, n_files in seen} > {4}
+    assert len({n_files for _, n_files in seen}) > 1
 
 
 def test_two_processes_that_add_at_once_lose_nothing_of_each_other(tmp_path):
