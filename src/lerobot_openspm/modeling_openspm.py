@@ -24,7 +24,6 @@ from lerobot_openspm.control.row import Row
 from lerobot_openspm.errors import DatasetError, MemoryFormatError
 from lerobot_openspm.experience import (
     CAMERAS_JSON,
-    FILES,
     MEMORY_JSON,
     Experience,
     check_anchors,
@@ -32,10 +31,12 @@ from lerobot_openspm.experience import (
     load_experience,
     save_experience,
 )  # fmt: skip
+from lerobot_openspm.experience_files import data_files
+from lerobot_openspm.experience_header import check_layouts
 from lerobot_openspm.flow.condition import CONDITION_DIM, Query, encode, to_world_frame
 from lerobot_openspm.flow.network import VelocityField
 from lerobot_openspm.flow.training_set import TrainingSet
-from lerobot_openspm.geometry.camera import check_sizes, load_cameras
+from lerobot_openspm.geometry.camera import check_sizes
 from lerobot_openspm.observation import Observation, split_batch
 from lerobot_openspm.perceive import Eyes
 from lerobot_openspm.perception.tracker import TrackerSettings
@@ -252,24 +253,27 @@ class OpenSPMPolicy(PreTrainedPolicy):
         """
         directory = Path(pretrained_name_or_path)
         if not directory.is_dir():
-            files = [CONFIG_NAME, SAFETENSORS_SINGLE_FILE, *FILES]
+            download = partial(
+                snapshot_download, str(pretrained_name_or_path), force_download=force_download,
+                token=token, cache_dir=cache_dir, local_files_only=local_files_only,
+            )  # fmt: skip
+            files = [CONFIG_NAME, SAFETENSORS_SINGLE_FILE, MEMORY_JSON, CAMERAS_JSON]
             try:
-                snapshot = snapshot_download(
-                    str(pretrained_name_or_path), allow_patterns=files, force_download=force_download,
-                    token=token, cache_dir=cache_dir, local_files_only=local_files_only, revision=revision,
-                )  # fmt: skip
+                directory = Path(download(allow_patterns=files, revision=revision))
             except HFValidationError as error:
                 raise FileNotFoundError(
                     f"no checkpoint folder at {pretrained_name_or_path}, and no name on the Hub (user/name)"
                 ) from error
-            directory = Path(snapshot)
+            # What else it needs is named there. Pushes before may have left other files of this kind.
+            download(allow_patterns=data_files(directory), revision=directory.name)
         policy = super().from_pretrained(directory, config=config, strict=strict, **kwargs)
         policy._attach(directory, dataset_meta)
         return policy
 
     def _attach(self, directory: Path, dataset_meta: Any | None) -> None:
         """Give a freshly loaded policy its memory, and its training set when training goes on."""
-        self.experience = load_experience(directory)
+        cameras = None if self.config.cameras is None else Path(self.config.cameras)
+        self.experience = load_experience(directory, cameras)
         if not self.experience.entries:
             raise MemoryFormatError(
                 f"the memory in {directory} holds no entries, so nothing can be done with it; train again"
@@ -282,11 +286,11 @@ class OpenSPMPolicy(PreTrainedPolicy):
                     f"--policy.{name}={asked}; the two cannot be mixed, train with the one you evaluate"
                 )
         if self.config.memory_update == "keep" or dataset_meta is None:
+            where = str(directory / MEMORY_JSON)
+            check_layouts(self.experience.layouts, self.config.layouts(), "the configuration's", where)
             check_anchors(self.experience, str(directory / MEMORY_JSON))
             check_labels(self.experience, self.config.mask_labels, str(directory / CONFIG_NAME))
         _ = self.segmenter  # what cannot be used is an error now, not at the first observation
-        if self.config.cameras is not None:
-            self.experience = replace(self.experience, cameras=load_cameras(Path(self.config.cameras)))
         where = self.config.cameras or str(directory / CAMERAS_JSON)
         check_sizes(self.experience.cameras, self.config.image_sizes, where)
         if dataset_meta is not None:

@@ -127,8 +127,9 @@ def mine_experience(
         len(entries), len(mined.mined), len(mined.skipped), ", ".join(sorted(objects.models)),
     )  # fmt: skip
     experience = Experience(
-        entries, objects.models, robot, cameras, config.perception, names, config.segmentation, config.shape
-    )
+        entries, objects.models, robot, cameras, config.perception, names, config.segmentation, config.shape,
+        config.layouts(),
+    )  # fmt: skip
     return known.appended(experience) if known else experience
 
 
