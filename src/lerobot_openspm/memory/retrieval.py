@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 from lerobot_openspm.errors import InstructionError
 from lerobot_openspm.memory.entry import MemoryEntry, SubTask
+from lerobot_openspm.memory.indexed_entries import near
 from lerobot_openspm.memory.instruction import parse_instruction
 
 # Below this semantic score an entry is about something else.
@@ -40,6 +41,7 @@ def semantic_candidates(instruction: str, entries: Sequence[MemoryEntry]) -> lis
         InstructionError: No entry is. The error lists the instructions the memory knows.
     """
     sub_tasks = parse_instruction(instruction)
+    entries = near(sub_tasks, entries, semantic_score)
     scored = [(entry, semantic_score(sub_tasks, entry.key.sub_tasks)) for entry in entries]
     close = [(entry, score) for entry, score in scored if score >= MIN_SEMANTIC]
     if not close:
