@@ -6,17 +6,19 @@ keys, they are scored exactly, and of the best keys the best entries are handed 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+import logging
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Protocol, overload, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
 
-from lerobot_openspm.errors import MemoryFormatError
 from lerobot_openspm.geometry.se3 import Array
 from lerobot_openspm.memory.entry import MemoryEntry, SubTask
 from lerobot_openspm.memory.index import Indices, make_index
 from lerobot_openspm.memory.key_vector import Vectors, key_vectors
+
+logger = logging.getLogger(__name__)
 
 # Banks of more entries are indexed; to score fewer takes no longer than a look at the scene.
 INDEX_FROM = 1000
@@ -32,7 +34,11 @@ Score = Callable[[Sequence[SubTask], Sequence[SubTask]], float]
 
 @runtime_checkable
 class HasColumns(Protocol):
-    """A bank that keeps vectors and qualities as columns, so that its entries need not be read for them."""
+    """A bank that keeps vectors and qualities as columns, so that its entries need not be read for them.
+
+    The vectors only tell which entries have equal keys; one of each is read and compared with its vector, and
+    vectors of another release or another bank are not used.
+    """
 
     def key_vectors(self) -> Vectors:
         """:func:`lerobot_openspm.memory.key_vector.key_vector` of every entry, ``(n, 64)``."""
@@ -51,7 +57,7 @@ class IndexedEntries(Sequence[MemoryEntry]):
         where: Names the bank in errors.
 
     Raises:
-        MemoryFormatError: The bank's columns are not those of its entries.
+        MemoryFormatError: An entry cannot be read.
     """
 
     def __init__(self, entries: Sequence[MemoryEntry], where: str = "the memory"):
@@ -82,8 +88,8 @@ class IndexedEntries(Sequence[MemoryEntry]):
         """The entries of the keys nearest to what is asked, and to every part of it; the best key first.
 
         For each part these are entries whose whole key is near, and entries of which one sub-task is: of
-        either at most :data:`ENTRIES_IN_ALL`, and of one key at most the :data:`ENTRIES_PER_KEY` best by
-        quality.
+        either about :data:`ENTRIES_IN_ALL` at most, and of one key the best by quality, at least one and at
+        most :data:`ENTRIES_PER_KEY`.
 
         Args:
             asked: The sub-tasks of an instruction.
@@ -102,12 +108,13 @@ class IndexedEntries(Sequence[MemoryEntry]):
         return [self._entries[i] for i in entries]
 
     def _best_entries(self, ranked: Sequence[int]) -> Iterator[int]:
-        left = ENTRIES_IN_ALL
+        """The best entry of each key, and as many more as there is room for, of the first keys first."""
+        left = max(0, ENTRIES_IN_ALL - len(ranked))
         for number in ranked:
             begin, end = self._ends[number], self._ends[number + 1]
-            own = self._order[begin : min(end, begin + ENTRIES_PER_KEY)][:left]
-            left -= len(own)
-            yield from (int(i) for i in own)
+            more = min(end - begin, ENTRIES_PER_KEY, 1 + left) - 1
+            left -= more
+            yield from (int(i) for i in self._order[begin : begin + 1 + more])
 
 
 def indexed(entries: Sequence[MemoryEntry], where: str = "the memory") -> Sequence[MemoryEntry]:
@@ -133,16 +140,29 @@ def _columns(
 ) -> tuple[list[Key], NDArray[np.int64], NDArray[np.float64]]:
     """The different keys, which of them each entry has ``(n,)``, and the entries' qualities ``(n,)``."""
     if not isinstance(entries, HasColumns):
-        table: dict[Key, int] = {}
-        numbers = [table.setdefault(entry.key.sub_tasks, len(table)) for entry in entries]
-        return list(table), np.array(numbers, int), np.array([entry.quality for entry in entries], float)
+        return _read_columns(entries)
     vectors, qualities = entries.key_vectors(), np.asarray(entries.qualities(), float)
     numbers, firsts = equal_rows(vectors)
     keys = [entries[int(i)].key.sub_tasks for i in firsts]
-    # Equal keys have equal vectors and the reverse, up to the rounding of another machine's linear algebra.
-    if not np.allclose(key_vectors(keys), vectors[firsts], atol=1e-5):
-        raise MemoryFormatError(f"{where}: the key vectors are not those of the entries' keys")
-    return keys, numbers, qualities
+    # Up to the rounding of another machine's arithmetic.
+    if np.allclose(key_vectors(keys), vectors[firsts], atol=1e-5):
+        return keys, numbers, qualities
+    logger.warning(
+        "%s: its key vectors are not those of its entries, so all %d are read; write it again with this "
+        "release to load it quicker",
+        where,
+        len(entries),
+    )
+    return _read_columns(entries)
+
+
+def _read_columns(
+    entries: Iterable[MemoryEntry],
+) -> tuple[list[Key], NDArray[np.int64], NDArray[np.float64]]:
+    table: dict[Key, int] = {}
+    rows = [(table.setdefault(entry.key.sub_tasks, len(table)), entry.quality) for entry in entries]
+    numbers, qualities = np.array(rows, float).reshape(-1, 2).T
+    return list(table), numbers.astype(np.int64), qualities
 
 
 def equal_rows(vectors: Vectors) -> tuple[Indices, Indices]:
