@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from lerobot_openspm.control.executor import ControlSettings, Executor, Hand, Status
-from lerobot_openspm.control.transfer import Target, TransferLimits, check_transfer, shape_deviation, transfer
+from lerobot_openspm.control.transfer import Target, TransferLimits, check_transfer, geometric_score, transfer
 from lerobot_openspm.flow.condition import Query
 from lerobot_openspm.geometry import se3
 from lerobot_openspm.geometry.se3 import Array
@@ -33,11 +33,6 @@ BLIND_S, GIVE_UP_S = 0.5, 2.0
 
 # An object that is this far from where the key poses took it to be takes them along; less is noise.
 MOVED_M, MOVED_RAD = 0.002, 0.05
-
-# An entry whose key poses lie this much differently to one another here counts as 1/e alike.
-SHAPE_SCALE_M = 0.1
-# An entry that can be executed at all scores at least this.
-MIN_USABLE_SCORE = 1e-3
 
 
 @dataclass(frozen=True)
@@ -329,11 +324,8 @@ class Row:
         return changed
 
     def _geometric_score(self, entry: MemoryEntry, T_world_ee: Array) -> float:
-        """``S_geo``: 0 if an entry cannot be executed here, else how like its demonstration it would be."""
-        if any(name not in self.layout for name in entry.objects) or self._problems(entry, T_world_ee):
-            return 0.0
-        deviation = shape_deviation(entry, self._transfer(entry, T_world_ee))
-        return max(float(np.exp(-deviation / SHAPE_SCALE_M)), MIN_USABLE_SCORE)
+        known = self._knowledge
+        return geometric_score(entry, self.layout, known.yaw_periods, T_world_ee, known.robot, known.limits)
 
     def _transfer(self, entry: MemoryEntry, T_world_ee: Array) -> tuple[Target, ...]:
         return transfer(entry, self.layout, self._knowledge.yaw_periods, T_world_ee)
