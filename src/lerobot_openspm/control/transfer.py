@@ -214,8 +214,8 @@ def geometric_score(
     """``S_geo`` in 0..1: whether an entry can be executed here, and how like its demonstration it would be.
 
     0 where an object of its key poses was not found or the transferred key poses fail the checks. Else what
-    :func:`shape_deviation` makes of the arrangement: where the objects lie to one another as in the entry's own
-    layout, wherever that is, it is 1. Objects that no key pose is relative to make no difference.
+    :func:`shape_deviation` makes of the arrangement: where the objects lie to one another as in the entry's
+    own layout, wherever that is, it is 1. Objects that no key pose is relative to make no difference.
 
     Args:
         entry: The entry.
