@@ -20,11 +20,11 @@ logger = logging.getLogger(__name__)
 
 # Up to so many vectors all are compared.
 EXACT_LIMIT = 200_000
-# Vectors per list, and lists that a query looks into: these, or one in as many if that is more. Of a million
-# vectors 32,000 are compared.
-_VECTORS_PER_LIST, _PROBES = 1000, 32
+# The number of lists grows with the root of that of vectors; a query looks into so many of them. Of a million
+# vectors in 1500 lists 32,000 are compared.
+_LISTS_PER_ROOT, _PROBES = 1.5, 48
 # Samples and rounds that the lists' centres are found with.
-_SAMPLES_PER_LIST, _ROUNDS = 64, 10
+_SAMPLES_PER_LIST, _ROUNDS = 40, 5
 
 Indices = NDArray[np.int64]
 
@@ -87,7 +87,7 @@ class FaissIndex:
     def __init__(self, vectors: Vectors):
         import faiss
 
-        n_lists = max(1, round(len(vectors) / _VECTORS_PER_LIST))
+        n_lists = max(1, min(round(_LISTS_PER_ROOT * len(vectors) ** 0.5), len(vectors)))
         index: Any = faiss.IndexIVFScalarQuantizer(
             faiss.IndexFlatIP(DIMENSIONS), DIMENSIONS, n_lists,
             faiss.ScalarQuantizer.QT_fp16, faiss.METRIC_INNER_PRODUCT,
@@ -99,7 +99,7 @@ class FaissIndex:
         if len(vectors):
             index.train(vectors)
             index.add(vectors)
-        index.nprobe = max(_PROBES, n_lists // _PROBES)
+        index.nprobe = _PROBES
         self._index = index
 
     def __len__(self) -> int:
