@@ -37,6 +37,8 @@ from lerobot_openspm.flow.condition import CONDITION_DIM, Query, encode, to_worl
 from lerobot_openspm.flow.network import VelocityField
 from lerobot_openspm.flow.training_set import TrainingSet
 from lerobot_openspm.geometry.camera import check_sizes
+from lerobot_openspm.memory.entry import MemoryEntry
+from lerobot_openspm.memory.indexed_entries import indexed
 from lerobot_openspm.observation import Observation, split_batch
 from lerobot_openspm.perceive import Eyes
 from lerobot_openspm.perception.tracker import TrackerSettings
@@ -77,6 +79,7 @@ class OpenSPMPolicy(PreTrainedPolicy):
         self.flow = VelocityField(CONDITION_DIM[config.conditioning], config.chunk_size, 7, config.hidden_dim)
         self.experience: Experience | None = None
         self._training_set: TrainingSet | None = None
+        self._entries: tuple[Sequence[MemoryEntry], Sequence[MemoryEntry]] | None = None
         if dataset_meta is not None:
             config.control_hz = config.control_hz or float(dataset_meta.fps)
             self.experience = mine_experience(dataset_meta, config, segmenter=self.segmenter)
@@ -152,8 +155,11 @@ class OpenSPMPolicy(PreTrainedPolicy):
     def _new_row(self, observation: Observation) -> Row:
         experience = self.require_experience()
         config = self.config
+        # Rows share the index, which is made anew when the memory was replaced.
+        if self._entries is None or self._entries[0] is not experience.entries:
+            self._entries = experience.entries, indexed(experience.entries)
         knowledge = Knowledge(
-            experience.entries, experience.yaw_periods, experience.robot, config.score_weights,
+            self._entries[1], experience.yaw_periods, experience.robot, config.score_weights,
             config.transfer_limits, config.control_settings, TrackerSettings(), config.tracking,
             self.step_s,
         )  # fmt: skip

@@ -185,6 +185,7 @@ MEASURES: dict[str, Callable[[BenchConfig], dict[str, Any]]] = {
 # returns what is printed. Imported when it is asked for.
 ON_THEIR_OWN: dict[str, str] = {
     "language": "lerobot_openspm.bench.language",
+    "memory": "lerobot_openspm.bench.memory",
 }
 
 

@@ -10,6 +10,7 @@ from lerobot_openspm.errors import OpenSPMError
 COMMANDS = {
     "list": ("lerobot_openspm.cli.memory_show", "list_entries", "a line for every entry or task"),
     "show": ("lerobot_openspm.cli.memory_show", "show", "entries with all their numbers"),
+    "search": ("lerobot_openspm.cli.memory_search", "search", "what an instruction finds, with its scores"),
 }
 
 

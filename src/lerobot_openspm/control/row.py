@@ -149,7 +149,7 @@ class Row:
     def _plan(self, hand: Hand, look: Look) -> None:
         """Plan the part that is to be carried out now, once its objects are found."""
         if not self._parts:
-            self._parts = plan_parts(self.instruction, self._knowledge.entries)
+            self._parts = plan_parts(self.instruction, self._knowledge.entries, self._knowledge.names)
             self._refer()
             self._start_height = float(hand.T_world_ee[2, 3])
         self._see(self._sought(), hand, look)

@@ -11,8 +11,11 @@ from dataclasses import dataclass, replace
 
 from lerobot_openspm.errors import InstructionError
 from lerobot_openspm.memory.entry import MemoryEntry, MemoryKeyPose, RetrievalKey, SubTask
+from lerobot_openspm.memory.indexed_entries import near
 from lerobot_openspm.memory.instruction import parse_instruction
-from lerobot_openspm.memory.retrieval import MIN_SEMANTIC, semantic_candidates, semantic_score
+from lerobot_openspm.memory.meaning import semantic_score
+from lerobot_openspm.memory.names import TABLE_NAMES, NameSimilarity
+from lerobot_openspm.memory.retrieval import MIN_SEMANTIC, semantic_candidates
 
 # A sub-task takes hold of something and lets it go again.
 TRANSITIONS_PER_SUB_TASK = 2
@@ -98,22 +101,30 @@ def _sub_tasks_of(entry: MemoryEntry) -> list[int]:
     return served
 
 
-def plan_parts(instruction: str, entries: Sequence[MemoryEntry]) -> tuple[tuple[Candidate, ...], ...]:
+def plan_parts(
+    instruction: str, entries: Sequence[MemoryEntry], names: NameSimilarity = TABLE_NAMES
+) -> tuple[tuple[Candidate, ...], ...]:
     """What an instruction can be carried out by: for each part, in order, the entries that are about it.
 
     An entry that was demonstrated as a whole wins; then it is one part. Else the parts are the longest runs
     of sub-tasks that were demonstrated together, a single one also as a part of something else.
+
+    Args:
+        instruction: What is asked.
+        entries: The memory.
+        names: Says which names mean the same thing.
 
     Raises:
         InstructionError: The instruction cannot be read, or there is no experience of one of its sub-tasks;
             the error names the sub-task and lists what the memory knows.
     """
     asked = parse_instruction(instruction)
+    entries = near(asked, entries, semantic_score)
     try:
-        whole = semantic_candidates(instruction, entries)
+        whole = semantic_candidates(instruction, entries, names)
     except InstructionError:
         singles = [Candidate(part, 0.0, entry) for entry in entries for part in parts(entry)]
-        if len(asked) == 1 and not _about(asked, singles):
+        if len(asked) == 1 and not _about(asked, singles, names):
             raise
     else:
         return (tuple(Candidate(entry, score, entry, asked) for entry, score in whole),)
@@ -122,7 +133,7 @@ def plan_parts(instruction: str, entries: Sequence[MemoryEntry]) -> tuple[tuple[
     i = 0
     while i < len(asked):
         for end in range(len(asked), i, -1):
-            if found := _about(asked[i:end], runs if end > i + 1 else singles):
+            if found := _about(asked[i:end], runs if end > i + 1 else singles, names):
                 break
         else:
             raise _no_experience(instruction, asked[i], singles)
@@ -131,10 +142,12 @@ def plan_parts(instruction: str, entries: Sequence[MemoryEntry]) -> tuple[tuple[
     return tuple(chain)
 
 
-def _about(asked: Sequence[SubTask], candidates: Sequence[Candidate]) -> tuple[Candidate, ...]:
+def _about(
+    asked: Sequence[SubTask], candidates: Sequence[Candidate], names: NameSimilarity
+) -> tuple[Candidate, ...]:
     """Those of some candidates that are about what is asked, with their score."""
     scored = [
-        replace(one, semantic=semantic_score(asked, one.entry.key.sub_tasks), asked=tuple(asked))
+        replace(one, semantic=semantic_score(asked, one.entry.key.sub_tasks, names), asked=tuple(asked))
         for one in candidates
     ]
     return tuple(one for one in scored if one.semantic >= MIN_SEMANTIC)

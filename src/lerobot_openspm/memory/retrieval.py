@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 from lerobot_openspm.errors import InstructionError
 from lerobot_openspm.memory.entry import MemoryEntry, SubTask
+from lerobot_openspm.memory.indexed_entries import near
 from lerobot_openspm.memory.instruction import parse_instruction
 from lerobot_openspm.memory.meaning import semantic_score
 from lerobot_openspm.memory.names import TABLE_NAMES, NameSimilarity
@@ -54,6 +55,7 @@ def semantic_candidates(
             well. The error names the instructions that the memory knows, or those that may be meant.
     """
     sub_tasks = parse_instruction(instruction)
+    entries = near(sub_tasks, entries, semantic_score)
     # Demonstrations of one task share their key, so there are far fewer keys than entries.
     scores = {key: semantic_score(sub_tasks, key, names) for key in {e.key.sub_tasks for e in entries}}
     best = max(scores, key=lambda key: scores[key], default=())
