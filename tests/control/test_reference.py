@@ -5,6 +5,7 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
 from lerobot_openspm.control.reference import MARGIN_M, OPPOSITE_THE_ROBOT, choose
+from lerobot_openspm.errors import InstructionError
 from lerobot_openspm.geometry import se3
 from lerobot_openspm.memory.entry import Reference
 
@@ -98,7 +99,7 @@ def test_one_place_for_two_is_ambiguous_and_a_missing_landmark_decides_nothing(r
 
 def test_a_relation_that_cannot_be_told_is_an_error():
     for reference in (Reference("around", ("plate",)), Reference("between", ("plate",)), Reference("on")):
-        with pytest.raises(ValueError, match="expected one of back"):
+        with pytest.raises(InstructionError, match="expected one of back"):
             choose(reference, *scene([(0, 0), (1, 1)]))
 
 

@@ -12,6 +12,7 @@ from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 
+from lerobot_openspm.errors import InstructionError
 from lerobot_openspm.geometry.se3 import Array
 from lerobot_openspm.memory.entry import Reference
 
@@ -58,15 +59,15 @@ def choose(
         there, another one is there as well up to :data:`MARGIN_M`, or a landmark was not found.
 
     Raises:
-        ValueError: The relation is none of those that can be told.
+        InstructionError: The relation is none of those that can be told.
     """
     relation = _ALIASES.get(reference.relation, reference.relation)
     cost = _costs(np.asarray(looking, float)).get((relation, len(reference.landmarks)))
     if cost is None:
         known = sorted(f"{name} ({count} landmarks)" for name, count in _costs(OPPOSITE_THE_ROBOT))
-        raise ValueError(
+        raise InstructionError(
             f"cannot tell which object is {reference.relation!r} of {len(reference.landmarks)} landmarks; "
-            f"expected one of {', '.join(known)}"
+            f"expected one of {', '.join(known)}; say it by one of these"
         )
     if len(candidates) == 1:
         return 0

@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 from lerobot_openspm.errors import InstructionError
-from lerobot_openspm.memory.entry import MemoryEntry, MemoryKeyPose, RetrievalKey, SubTask
+from lerobot_openspm.memory.entry import MemoryEntry, MemoryKeyPose, Reference, RetrievalKey, SubTask
 from lerobot_openspm.memory.indexed_entries import near
 from lerobot_openspm.memory.instruction import parse_instruction
 from lerobot_openspm.memory.meaning import semantic_score
@@ -23,7 +23,7 @@ TRANSITIONS_PER_SUB_TASK = 2
 FREE_PHASES = ("approach", "lift", "pre-place", "retreat")
 # Relations that are not the preposition that one says.
 _PREPOSITIONS = {"front of": "to the front of", "left of": "to the left of", "right of": "to the right of",
-                 "at": "to"}  # fmt: skip
+                 "at": "to", "center": "in the center of"}  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -165,11 +165,18 @@ def _no_experience(instruction: str, sub_task: SubTask, known: Sequence[Candidat
 def phrase(sub_task: SubTask) -> str:
     """A sub-task in words, as an instruction: "put the bowl in the top drawer of the cabinet"."""
     if not sub_task.landmark:
-        return f"{sub_task.operation} {_noun(sub_task.target, sub_task.part)}"
+        return f"{sub_task.operation} {_noun(sub_task.target, sub_task.part, sub_task.target_where)}"
     preposition = _PREPOSITIONS.get(sub_task.relation, sub_task.relation)
-    landmark = _noun(sub_task.landmark, sub_task.part)
-    return f"{sub_task.operation} the {sub_task.target} {preposition} {landmark}"
+    target = _noun(sub_task.target, "", sub_task.target_where)
+    landmark = _noun(sub_task.landmark, sub_task.part, sub_task.landmark_where)
+    return f"{sub_task.operation} {target} {preposition} {landmark}"
 
 
-def _noun(name: str, part: str) -> str:
-    return f"the {part} of the {name}" if part else f"the {name}"
+def _noun(name: str, part: str, where: Reference | None) -> str:
+    told = f"the {name}"
+    if where is not None and not where.landmarks:
+        told = f"the {where.relation} {name}"
+    elif where is not None:
+        preposition = _PREPOSITIONS.get(where.relation, where.relation)
+        told = f"the {name} {preposition} {' and '.join(f'the {landmark}' for landmark in where.landmarks)}"
+    return f"the {part} of {told}" if part else told
