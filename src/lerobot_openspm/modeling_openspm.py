@@ -35,6 +35,7 @@ from lerobot_openspm.flow.condition import CONDITION_DIM, Query, encode, to_worl
 from lerobot_openspm.flow.network import VelocityField
 from lerobot_openspm.flow.training_set import TrainingSet
 from lerobot_openspm.geometry.camera import check_sizes, load_cameras
+from lerobot_openspm.memory.names import TABLE_NAMES, Model2VecNames, NameSimilarity
 from lerobot_openspm.observation import Observation, split_batch
 from lerobot_openspm.perceive import Eyes
 from lerobot_openspm.perception.tracker import TrackerSettings
@@ -76,6 +77,7 @@ class OpenSPMPolicy(PreTrainedPolicy):
         self.experience: Experience | None = None
         self._training_set: TrainingSet | None = None
         if dataset_meta is not None:
+            _ = self.names  # what cannot be used is an error now, not at the first observation
             config.control_hz = config.control_hz or float(dataset_meta.fps)
             self.experience = mine_experience(dataset_meta, config, segmenter=self.segmenter)
             self._training_set = training_set(dataset_meta, config, self.experience.robot)
@@ -153,7 +155,7 @@ class OpenSPMPolicy(PreTrainedPolicy):
         knowledge = Knowledge(
             experience.entries, experience.yaw_periods, experience.robot, config.score_weights,
             config.transfer_limits, config.control_settings, TrackerSettings(), config.tracking,
-            self.step_s,
+            self.step_s, self.names,
         )  # fmt: skip
         return Row(knowledge, observation.instruction, observation.fingerprint(), config.noise_seed)
 
@@ -169,6 +171,12 @@ class OpenSPMPolicy(PreTrainedPolicy):
     def segmenter(self) -> Segmenter | None:
         """What finds the objects' masks, made when it is first needed; None where their colours do."""
         return segmenter_of(self.config)
+
+    @cached_property
+    def names(self) -> NameSimilarity:
+        """What says which names mean the same thing: the table of words, or with embeddings beside it."""
+        weights = self.config.name_embeddings
+        return TABLE_NAMES if weights is None else Model2VecNames(weights)
 
     def _chunk(self, row: Row, query: Query) -> np.ndarray:
         """Generate one chunk ``(chunk_size, 7)`` in the world. Rows go one by one, so batches act alike."""
@@ -220,9 +228,10 @@ class OpenSPMPolicy(PreTrainedPolicy):
         experience = self.require_experience()  # before anything is written
         super()._save_pretrained(save_directory, state_dict=state_dict)
         # What exists on one machine alone stays there; the calibration travels as a file of the checkpoint.
-        replace(self.config, cameras=None, sam3d_python=None, sam3d_checkout=None)._save_pretrained(
-            Path(save_directory)
-        )
+        here = {"cameras": None, "sam3d_python": None, "sam3d_checkout": None}
+        if self.config.name_embeddings and Path(self.config.name_embeddings).is_dir():
+            here["name_embeddings"] = None
+        replace(self.config, **here)._save_pretrained(Path(save_directory))
         save_experience(experience, Path(save_directory))
 
     @classmethod
@@ -283,7 +292,7 @@ class OpenSPMPolicy(PreTrainedPolicy):
         if self.config.memory_update == "keep" or dataset_meta is None:
             check_anchors(self.experience, str(directory / MEMORY_JSON))
             check_labels(self.experience, self.config.mask_labels, str(directory / CONFIG_NAME))
-        _ = self.segmenter  # what cannot be used is an error now, not at the first observation
+        _ = self.segmenter, self.names  # what cannot be used is an error now, not at the first observation
         if self.config.cameras is not None:
             self.experience = replace(self.experience, cameras=load_cameras(Path(self.config.cameras)))
         where = self.config.cameras or str(directory / CAMERAS_JSON)

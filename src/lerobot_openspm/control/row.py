@@ -15,6 +15,7 @@ from lerobot_openspm.flow.condition import Query
 from lerobot_openspm.geometry import se3
 from lerobot_openspm.geometry.se3 import Array
 from lerobot_openspm.memory.entry import MemoryEntry
+from lerobot_openspm.memory.names import TABLE_NAMES, NameSimilarity
 from lerobot_openspm.memory.retrieval import Scored, ScoreWeights, retrieve, semantic_candidates
 from lerobot_openspm.memory.robot import RobotModel
 from lerobot_openspm.perception.camera_watch import Fault
@@ -71,6 +72,7 @@ class Knowledge:
         tracker: When poses are believed.
         tracking: Whether objects are looked for again once a plan is made.
         step_s: Seconds that a control step takes.
+        names: Says which names mean the same thing.
     """
 
     entries: Sequence[MemoryEntry]
@@ -82,6 +84,7 @@ class Knowledge:
     tracker: TrackerSettings = field(default_factory=TrackerSettings)
     tracking: bool = True
     step_s: float = 0.05
+    names: NameSimilarity = TABLE_NAMES
 
 
 class Row:
@@ -154,7 +157,7 @@ class Row:
     # Planning.
 
     def _plan(self, hand: Hand, look: Look) -> None:
-        candidates = semantic_candidates(self.instruction, self._knowledge.entries)
+        candidates = semantic_candidates(self.instruction, self._knowledge.entries, self._knowledge.names)
         names = list(dict.fromkeys(name for entry, _ in candidates for name in entry.objects))
         self._see(names, hand, look)
         if self.status is Status.CAMERA_FAULT:
