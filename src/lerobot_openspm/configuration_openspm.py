@@ -79,6 +79,8 @@ class OpenSPMConfig(PreTrainedConfig):
         passing_rad: ... and this angle.
         max_corrections: Corrective chunks per key pose before it counts as not met.
         max_attempts: How often a missed grasp or an unmet key pose is tried again in an episode.
+        name_embeddings: Folder, or name on the Hub, of a model2vec model that recognises names of objects
+            which the table of words does not know; needs the extra ``[text]``. None: the table alone.
         weight_semantic: The paper's lambda_s, weight of the instruction in retrieval.
         weight_geometric: The paper's lambda_g, weight of the scene.
         weight_quality: The paper's lambda_r, weight of the entry's quality.
@@ -113,6 +115,7 @@ class OpenSPMConfig(PreTrainedConfig):
     mask_labels: dict[str, int] | None = None
     memory_episodes: list[int] | None = None
     memory_update: MemoryUpdate = "keep"
+    name_embeddings: str | None = None
     weight_semantic: float = 1.0
     weight_geometric: float = 0.5
     weight_quality: float = 0.5

@@ -39,6 +39,7 @@ from lerobot_openspm.flow.training_set import TrainingSet
 from lerobot_openspm.geometry.camera import check_sizes
 from lerobot_openspm.memory.entry import MemoryEntry
 from lerobot_openspm.memory.indexed_entries import indexed
+from lerobot_openspm.memory.names import TABLE_NAMES, Model2VecNames, NameSimilarity
 from lerobot_openspm.observation import Observation, split_batch
 from lerobot_openspm.perceive import Eyes
 from lerobot_openspm.perception.tracker import TrackerSettings
@@ -81,6 +82,7 @@ class OpenSPMPolicy(PreTrainedPolicy):
         self._training_set: TrainingSet | None = None
         self._entries: tuple[Sequence[MemoryEntry], Sequence[MemoryEntry]] | None = None
         if dataset_meta is not None:
+            _ = self.names  # what cannot be used is an error now, not at the first observation
             config.control_hz = config.control_hz or float(dataset_meta.fps)
             self.experience = mine_experience(dataset_meta, config, segmenter=self.segmenter)
             self._training_set = training_set(dataset_meta, config, self.experience.robot)
@@ -161,7 +163,7 @@ class OpenSPMPolicy(PreTrainedPolicy):
         knowledge = Knowledge(
             self._entries[1], experience.yaw_periods, experience.robot, config.score_weights,
             config.transfer_limits, config.control_settings, TrackerSettings(), config.tracking,
-            self.step_s,
+            self.step_s, self.names,
         )  # fmt: skip
         return Row(knowledge, observation.instruction, observation.fingerprint(), config.noise_seed)
 
@@ -177,6 +179,12 @@ class OpenSPMPolicy(PreTrainedPolicy):
     def segmenter(self) -> Segmenter | None:
         """What finds the objects' masks, made when it is first needed; None where their colours do."""
         return segmenter_of(self.config)
+
+    @cached_property
+    def names(self) -> NameSimilarity:
+        """What says which names mean the same thing: the table of words, or with embeddings beside it."""
+        weights = self.config.name_embeddings
+        return TABLE_NAMES if weights is None else Model2VecNames(weights)
 
     def _chunk(self, row: Row, query: Query) -> np.ndarray:
         """Generate one chunk ``(chunk_size, 7)`` in the world. Rows go one by one, so batches act alike."""
@@ -228,9 +236,10 @@ class OpenSPMPolicy(PreTrainedPolicy):
         experience = self.require_experience()  # before anything is written
         super()._save_pretrained(save_directory, state_dict=state_dict)
         # What exists on one machine alone stays there; the calibration travels as a file of the checkpoint.
-        replace(self.config, cameras=None, sam3d_python=None, sam3d_checkout=None)._save_pretrained(
-            Path(save_directory)
-        )
+        here = {"cameras": None, "sam3d_python": None, "sam3d_checkout": None}
+        if self.config.name_embeddings and Path(self.config.name_embeddings).is_dir():
+            here["name_embeddings"] = None
+        replace(self.config, **here)._save_pretrained(Path(save_directory))
         save_experience(experience, Path(save_directory))
 
     @classmethod
@@ -296,7 +305,7 @@ class OpenSPMPolicy(PreTrainedPolicy):
             check_layouts(self.experience.layouts, self.config.layouts(), "the configuration's", where)
             check_anchors(self.experience, str(directory / MEMORY_JSON))
             check_labels(self.experience, self.config.mask_labels, str(directory / CONFIG_NAME))
-        _ = self.segmenter  # what cannot be used is an error now, not at the first observation
+        _ = self.segmenter, self.names  # what cannot be used is an error now, not at the first observation
         where = self.config.cameras or str(directory / CAMERAS_JSON)
         check_sizes(self.experience.cameras, self.config.image_sizes, where)
         if dataset_meta is not None:

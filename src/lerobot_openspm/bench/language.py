@@ -146,7 +146,7 @@ def measure(options: Options) -> dict[str, Any]:
         split: _measure_split(split, options.folder, names, failures) for split in _splits(options.folder)
     }
     headline = splits.get(HELD_OUT) or next(iter(splits.values()))
-    of_libero = [known for known in known_instructions() if known.suites != {"tabletop"}]
+    of_libero = [known for known in known_instructions() if known.suites - {"tabletop"}]
     read = [known for known in of_libero if _is_read(known)]
     result = {
         "libero_parsed": _wordings(read) / _wordings(of_libero),
@@ -182,10 +182,10 @@ def _measure_split(
     of_demonstrated = {entry.language for entry in demonstrated}
     to_find = [row for row in paraphrases if row["of"] in of_demonstrated]
 
-    def rate(what: str, rows: list[Row], passes: Callable[[Row], bool]) -> float:
+    def rate(what: str, rows: list[Row], passes: Callable[[Row], bool]) -> float | None:
         failed = [row for row in rows if not passes(row)]
         failures[f"{split}_{what}"] = [row.get("paraphrase") or row["instruction"] for row in failed]
-        return 1 - len(failed) / len(rows) if rows else float("nan")
+        return 1 - len(failed) / len(rows) if rows else None
 
     return {
         "paraphrases_parsed": rate("paraphrases_parsed", paraphrases, is_parsed),

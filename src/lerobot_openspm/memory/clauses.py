@@ -75,6 +75,10 @@ def _verb_first(words: Words) -> Words:
     if match_preposition(words, 0) is None:
         return words
     for i in range(2, len(words)):
+        if words[i] in _GOES:  # "onto the plate goes the bowl"
+            return (*words[i + 1 :], words[i], *words[:i])
+        if words[i] in ("is", "are") and words[i + 1 : i + 2] in (("a",), ("the",)):
+            return (*words[i + 1 :], *words[:i])  # "on the stove is a bowl"
         at_verb = v.match_verb(words, i) is not None and words[i + 1 : i + 2] != ()
         if words[i] == "," or (at_verb and _has_determiner(words, i)):
             return (*words[i + (words[i] == ",") :], *words[:i])
@@ -90,7 +94,7 @@ def _has_determiner(words: Words, verb_at: int) -> bool:
 
 def _is_statement(words: Words) -> bool:
     """Whether words may say what the next clause is about: "the bowl is on the plate", or a thing alone."""
-    return words[0] in v.DETERMINERS
+    return words[0] in v.DETERMINERS or len(words) == 1
 
 
 def _topic(words: Words) -> Said:
@@ -116,15 +120,19 @@ def _without_verb(clause: Clause, words: Words, before: Said | None) -> Said | N
     at = next((i for i, word in enumerate(words) if i and word in PREDICATES), 0)
     if at:
         end = at
-        while end < len(words) and words[end] in _AUXILIARIES:
+        while end < len(words) and words[end] in _AUXILIARIES and words[end + 1 : end + 2] != ("the",):
             end += 1
+        while at > 1 and words[at - 1] in _AUXILIARIES:
+            at -= 1
         is_told = bool(set(words[at:end]) & _MODALS) or clause.is_done or clause.is_wanted
         subject, rest = words[:at], words[end:]
         if rest[:1] and rest[0] in _GOES:
             return _read("put", subject, rest[1:])
         return _state(subject, rest) if is_told and rest else None
-    for i in range(1, len(words)):  # "the pudding set down on the plate", of something wanted
-        if clause.is_wanted and v.match_verb(words, i, "participle"):
+    for i in range(1, len(words)):  # "the pudding set down on the plate", "and the bowl placed inside"
+        if (clause.is_wanted or before is not None) and _is_participle(words, i):
+            return _state(words[:i], words[i:])
+        if clause.is_wanted and words[i] in v.STANDS | _GOES:
             return _state(words[:i], words[i:])
     if clause.is_wanted and words[-1] in ("on", "off", "open", "shut", "closed"):
         return _state(words[:-1], words[-1:])
@@ -135,9 +143,30 @@ def _without_verb(clause: Clause, words: Words, before: Said | None) -> Said | N
     first = match_preposition(words, relations[-1])
     is_directed = first is not None and first.is_goal and (words[0] in v.DETERMINERS or relations[0] == 1)
     if clause.is_wanted or is_elided or (is_directed and not _has_inner_determiner(words[: relations[0]])):
-        operation = before.operation if is_elided and before is not None else "put"
-        return _read(operation, words, ())
+        if not is_elided or before is None:
+            return _read("put", words, ())
+        return _of_other_place(_read(before.operation, words, ()), before)
     return None
+
+
+def _is_participle(words: Words, at: int) -> bool:
+    """Whether a word says what is done to the noun before it: "placed", but not "left" in "the left mug"."""
+    verb = v.match_verb(words, at, "participle")
+    if verb is None or words[at - 1] in v.DETERMINERS:
+        return False
+    end = at + verb.length
+    return end == len(words) or match_preposition(words, end) is not None
+
+
+def _of_other_place(said: Said, before: Said) -> Said:
+    """Complete "and the other mug on the right", after "the mug on the left plate"."""
+    where = said.targets[-1].where
+    if said.landmark is not None or before.landmark is None or where is None or where.landmarks:
+        return said
+    targets = (*said.targets[:-1], replace(said.targets[-1], where=None))
+    return replace(
+        said, targets=targets, relation=before.relation, landmark=replace(before.landmark, where=where)
+    )
 
 
 def _has_inner_determiner(words: Words) -> bool:
@@ -146,12 +175,14 @@ def _has_inner_determiner(words: Words) -> bool:
 
 def _state(subject: Words, rest: Words) -> Said | None:
     """What is to be done so that a subject is as said: "open", "on", "placed on it", "on the plate"."""
-    if verb := v.match_verb(rest, 0, "participle"):
+    at = next((i for i, word in enumerate(rest[:-1]) if word not in v.STANDS | _GOES), len(rest) - 1)
+    rest = rest[at:]
+    if verb := v.match_verb(rest, 0, "participle") or v.match_verb(rest, 0, "gerund"):
         return _read_verb(verb, (*subject, *rest[verb.length :]))
     if rest in (("on",), ("off",)):
         return _read(f"turn {rest[0]}", subject, ())
-    if rest[0] in v.RESULTS and len(rest) == 1:
-        return _read(v.RESULTS[rest[0]], subject, ())
+    if " ".join(rest) in v.RESULTS:
+        return _read(v.RESULTS[" ".join(rest)], subject, ())
     return _read("put", subject, rest) if match_preposition(rest, 0) else None
 
 
@@ -163,8 +194,9 @@ def _read_verb(verb: v.Verb, rest: Words) -> Said:
     if verb.word in v.MOTIONS and verb.length == 1:
         if end in v.RESULTS:
             return _read(v.RESULTS[end], rest[:-1], ())
-        if end in v.DRAWER_RESULTS and read_noun(rest[:-1]).part:
-            return _read(v.DRAWER_RESULTS[end], rest[:-1], ())
+        thing = rest[:-2] if rest[-2:-1] == ("back",) else rest[:-1]
+        if end in v.DRAWER_RESULTS and read_noun(thing).part:
+            return _read(v.DRAWER_RESULTS[end], thing, ())
         if verb.word in ("pull", "draw") and _is_drawer_alone(rest):
             return _read("open", rest, ())
     if verb.operation == v.HALF_A_VERB:
@@ -193,7 +225,9 @@ def _read(operation: str, words: Words, more: Words) -> Said:
     relation = "on" if relation == "center" else relation
     if relation == "at" and read_noun(goal.words).part:
         relation = "in"  # "to the right compartment"
-    landmark = _which(read_noun(goal.words), landmark_where)
+    noun = read_noun(goal.words)
+    noun = replace(noun, pronoun="there") if not goal.words else noun
+    landmark = _which(noun, landmark_where)
     return Said(operation, targets, relation, landmark)
 
 

@@ -56,6 +56,12 @@ def _parse(instruction: str) -> tuple[SubTask, ...]:
     said: list[Said] = []
     for clause in clauses:
         said.append(read_clause(clause, said[-1] if said else None))
+    if len(said) == 1 and said[0].operation == PICK and clauses[0].words[0] == "get":
+        said = [
+            read_clause(replace(clauses[0], words=("put", *clauses[0].words[1:])), None)
+        ]  # "get it on the plate"
+    if len(said) > 1 and not said[-1].operation and said[-2].landmark:  # "... and then the tomato sauce"
+        said[-1] = replace(said[-2], targets=said[-1].targets)
     if not any(one.operation for one in said):
         raise InstructionError("states something; say what to do")
     meant = _resolve_all(clauses, said)
@@ -121,13 +127,15 @@ class _Resolver:
         )
 
     def _targets(self, noun: Noun, operation: str) -> list[Noun]:
+        last = self.before[-1] if self.before else None
+        if last and noun.count > 1 and noun.name == last.target == last.landmark:  # "the two bowls", stacked
+            noun = Noun(pronoun="them")
         if noun.pronoun not in ("it", "them", "there"):
             return [self._named(noun, operation)]
         if self.topic is not None:
             return [self.topic]
-        if not self.before:
+        if last is None:
             raise InstructionError(f"names no object after {operation!r}")
-        last = self.before[-1]
         landmark = Noun(last.landmark, last.part, last.landmark_where)
         target = Noun(last.target, "" if last.landmark else last.part, last.target_where)
         if operation in ("open", "close") and last.relation == "in":
@@ -135,7 +143,7 @@ class _Resolver:
         if operation in ("turn on", "turn off") and last.landmark:
             return [landmark]
         if noun.pronoun == "them":
-            if last.operation == "put" and last.relation == "on" and len(self._together()) == 1:
+            if last.operation == "put" and last.relation in ("on", "in") and len(self._together()) == 1:
                 return [landmark]  # of two that are stacked, the lower one carries the other
             return self._together()
         return [target]
@@ -148,6 +156,9 @@ class _Resolver:
 
     def _landmark(self, noun: Noun, relation: str, target: Noun) -> Noun:
         if noun.pronoun == "one":
+            last = self.before[-1] if self.before else None
+            if last and last.landmark and not noun.name:  # "... on the left plate, ... on the right one"
+                return replace(noun, name=last.landmark, pronoun="")
             return self._named(noun, "put", target)
         if noun.pronoun not in ("it", "them", "there"):
             return self._named(noun, "put")
@@ -166,6 +177,11 @@ class _Resolver:
             return self._whole(noun)
         if noun.pronoun == "one":
             name = target.name if target else self.before[-1].target
+            if (
+                noun.name in v.HEIGHTS and self.before and self.before[-1].part
+            ):  # "the bottom one", of drawers
+                part = f"{v.HEIGHTS[noun.name]} {self.before[-1].part.split()[-1]}"
+                return Noun(self.before[-1].landmark or name, part)
             return replace(noun, name=f"{noun.name} {name.split()[-1]}" if noun.name else name, pronoun="")
         last = self.before[-1] if self.before else None
         if last is None:

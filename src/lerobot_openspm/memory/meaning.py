@@ -54,8 +54,8 @@ def _canonical_relation(relation: str, landmark: str, part: str) -> str:
 
 
 def _canonical_where(where: Reference | None) -> Reference | None:
-    if where is None:
-        return None
+    if where is None or (where.relation == "on" and set(where.landmarks) <= v.SURFACES and where.landmarks):
+        return None  # everything stands on the table
     return Reference(where.relation, tuple(sorted(canonical_name(name) for name in where.landmarks)))
 
 

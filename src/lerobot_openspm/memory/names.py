@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -69,6 +70,29 @@ def colours_differ(a: str, b: str) -> bool:
 
 
 TABLE_NAMES = TableNames()
+
+
+class TableFirst:
+    """Another similarity, but only for names that the table finds nowhere in the memory.
+
+    Who asks for the milk, which the memory knows, does not mean the butter, however alike the two are.
+
+    Args:
+        names: The other similarity.
+        known: All names in the memory.
+    """
+
+    def __init__(self, names: NameSimilarity, known: Collection[str]):
+        self._names = names
+        self._known = known
+        self._in_table: dict[str, bool] = {}
+
+    def similarity(self, asked: str, known: str) -> float:
+        """See :class:`NameSimilarity`."""
+        if asked not in self._in_table:
+            self._in_table[asked] = any(TABLE_NAMES.similarity(asked, name) > 0 for name in self._known)
+        names = TABLE_NAMES if self._in_table[asked] else self._names
+        return names.similarity(asked, known)
 
 
 class Model2VecNames:

@@ -67,10 +67,13 @@ def read_noun(words: Words) -> Noun:
     Raises:
         InstructionError: A second noun phrase begins within the words.
     """
+    words = tuple(word for word in words if word not in v.FILLERS and word != ",")
     for before, word in pairwise(words):
         if word in v.DETERMINERS and before not in ("of", "'s", "both", "all", "each", ","):
             raise InstructionError(f"has words I cannot read: {' '.join(words)!r}")
-    words, count = _split_count(tuple(word for word in words if word not in v.FILLERS and word != ","))
+    words, count = _split_count(words)
+    bare = tuple(word for word in words if word not in ("the", "whole"))
+    words = bare if " ".join(bare) in v.PRONOUNS else words
     if " ".join(words) in v.PRONOUNS or not words:
         pronoun = v.PRONOUNS.get(" ".join(words), "them" if count > 1 else "it")
         return Noun(pronoun="them" if count > 1 else pronoun, count=1)
@@ -92,6 +95,9 @@ def _split_count(words: Words) -> tuple[Words, int]:
     rest, count = list(words), 1
     while rest:
         one, two = rest[0], " ".join(rest[:2])
+        if one == "one" and len(rest) > 1 and rest[1] not in v.NUMBERS:
+            rest = rest[1:]
+            continue
         if two in v.NUMBERS or one in v.NUMBERS:
             used = 2 if two in v.NUMBERS else 1
             count, rest = v.NUMBERS[two if used == 2 else one], rest[used:]
@@ -138,8 +144,9 @@ def _read_whole(words: Words, owner: str = "") -> Noun:
     head = v.singular(words[-1])
     count = 2 if head != words[-1] else 1
     rest = words[:-1]
-    if head in v.PLACES and rest:  # "table center"
-        return Noun(_name(rest), v.PLACES[head])
+    if head in v.PLACES and rest:  # "table center", "the bowl furthest back"
+        place = v.PLACES[head]
+        return Noun(_name(rest), place) if rest[-1] in v.SURFACES else Noun(_name(rest), "", Reference(place))
     if head == "one":
         places, rest = _places(rest)
         return Noun(_colours_in_order(rest), "", places, 1, "one")

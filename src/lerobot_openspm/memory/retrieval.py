@@ -10,7 +10,7 @@ from lerobot_openspm.memory.entry import MemoryEntry, SubTask
 from lerobot_openspm.memory.indexed_entries import near
 from lerobot_openspm.memory.instruction import parse_instruction
 from lerobot_openspm.memory.meaning import semantic_score
-from lerobot_openspm.memory.names import TABLE_NAMES, NameSimilarity
+from lerobot_openspm.memory.names import TABLE_NAMES, NameSimilarity, TableFirst
 
 # Below this semantic score an entry is about something else.
 MIN_SEMANTIC = 0.75
@@ -57,7 +57,9 @@ def semantic_candidates(
     sub_tasks = parse_instruction(instruction)
     entries = near(sub_tasks, entries, semantic_score)
     # Demonstrations of one task share their key, so there are far fewer keys than entries.
-    scores = {key: semantic_score(sub_tasks, key, names) for key in {e.key.sub_tasks for e in entries}}
+    keys = {entry.key.sub_tasks for entry in entries}
+    names = TableFirst(names, {name for key in keys for sub_task in key for name in sub_task.objects})
+    scores = {key: semantic_score(sub_tasks, key, names) for key in keys}
     best = max(scores, key=lambda key: scores[key], default=())
     if scores.get(best, 0.0) < MIN_SEMANTIC:
         raise InstructionError(_unknown(instruction, entries, scores))

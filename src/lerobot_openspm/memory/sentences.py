@@ -21,6 +21,7 @@ _REFUSED = (
      "depends on a condition, which is not judged here; say what to do"),
     ("or|either", "leaves a choice; name one thing"),
     (r"\w+ times|twice|every|forever", "says how often; give one instruction at a time"),
+    ("seconds|minutes?|hours?|days?|tomorrow|tonight", "says when; give it when it is to be done"),
 )  # fmt: skip
 _QUESTION = v.word_set(
     "what which who whose where when why how is are was were am do does did has have had should "
@@ -28,7 +29,7 @@ _QUESTION = v.word_set(
 )
 # Words between clauses, and those among them that always part two.
 _JOINTS = v.word_set(
-    "and then but also next finally afterwards afterward subsequently later lastly first firstly "
+    "and then so but also next finally afterwards afterward subsequently later lastly first firstly "
     "second secondly third thirdly thereafter , ; followed by"
 )
 _PARTING = v.word_set(
@@ -79,6 +80,9 @@ def read_clauses(instruction: str) -> list[Clause]:
     for sentence in text.split(";"):
         if words := tuple(sentence.split()):
             found += _read_sentence(words, len(found))
+    polite = re.search(r"\bplease\b|\bkindly\b", instruction.lower())
+    if polite and not any(v.match_verb(clause.words, 0) for clause in found):  # "soup in the basket, please"
+        found = [replace(clause, is_wanted=True) for clause in found]
     return found
 
 
@@ -122,6 +126,8 @@ def _split(words: Words) -> list[tuple[str, Words]]:
     marker, i = "", 0
     while i < len(words):
         end, next_marker = _joint(words, i)
+        if current and end >= len(words) and next_marker == "first":  # "but open it first"
+            return [*pieces, ("first", tuple(current))]
         if end > i and (not current or _is_boundary(words, i, end, next_marker, tuple(current))):
             if current:
                 pieces.append((marker, tuple(current)))
@@ -146,6 +152,8 @@ def _joint(words: Words, at: int) -> tuple[int, str]:
             return end + len(phrase.split()), "after"
         elif words[end] == "before":
             return end + 1, "before"
+        elif words[end] == "to" and _has_object(words, end + 1):  # "open the drawer to put the bowl in"
+            marker, end = "then", end + 1
         elif words[end] in _JOINTS:
             marker = "then" if words[end] in _PARTING and marker != "first" else marker
             end += 1
@@ -154,11 +162,20 @@ def _joint(words: Words, at: int) -> tuple[int, str]:
     return end, marker
 
 
+def _has_object(words: Words, at: int) -> bool:
+    """Whether a verb begins at a word, and something that it is done to follows."""
+    verb = v.match_verb(words, at)
+    after = words[at + verb.length] if verb and at + verb.length < len(words) else ""
+    return after in v.DETERMINERS or after in v.PRONOUNS or after in v.NUMBERS
+
+
 def _is_boundary(words: Words, at: int, end: int, marker: str, current: Words) -> bool:
     if end >= len(words):
         return True
     if marker in ("after", "before"):
         return True
+    if words[at] == "and" and {words[at - 1], words[end]} <= v.COLOURS:
+        return False  # "the yellow and white mug"
     if words[at] == "," and end == at + 1 and _is_fronted(current):
         return False  # "on the plate, put the bowl"
     if words[at] == "first" and end == at + 1 and marker == "first":  # "open the drawer first, then ..."
@@ -175,8 +192,11 @@ def _is_fronted(words: Words) -> bool:
 
 
 def _begins_clause(words: Words, at: int, current: Words) -> bool:
-    if v.match_verb(words, at) or words[at] in (WANTED, SEEN):
+    if v.match_verb(words, at) or v.match_verb(words, at, "gerund") or words[at] in (WANTED, SEEN):
         return True
+    pairs = "between" in current[-4:] and "and" not in current[-4:]
+    if pairs or not _is_complete(current):
+        return False
     rest = words[at:]
     end = next((i for i, word in enumerate(rest) if (i and word == ",") or v.match_verb(rest, i)), len(rest))
     if any(word in PREDICATES for word in rest[1:end]):
@@ -184,9 +204,14 @@ def _begins_clause(words: Words, at: int, current: Words) -> bool:
     if match_preposition(words, at) is not None:
         return False
     # "put the bowl on the plate and the bottle on the rack"
-    has_relation = any(match_preposition(current, i) for i in range(1, len(current)))
-    pairs = "between" in current[-4:] and "and" not in current[-4:]
-    return has_relation and not pairs and _relation_at(rest[:end]) > 0
+    is_said = _relation_at(current) > 0 or bool(PREDICATES & set(current))
+    tells = _relation_at(rest[:end]) > 0 or any(v.match_verb(rest, i, "participle") for i in range(1, end))
+    return is_said and tells
+
+
+def _is_complete(words: Words) -> bool:
+    """Whether words can be a clause: not the first half of "the yellow and white mug"."""
+    return v.match_verb(words, 0) is not None or _relation_at(words) > 0 or bool(PREDICATES & set(words))
 
 
 def _relation_at(words: Sequence[str]) -> int:

@@ -45,7 +45,9 @@ RESULTS = {"open": "open", "shut": "close", "closed": "close"}
 DRAWER_RESULTS = {"out": "open", "in": "close"}
 # What "turn" means without "on" or "off".
 HALF_A_VERB = "half a verb"
-SWITCHES = ("turn", "switch", "power", "flip", "click")
+SWITCHES = ("turn", "shut", "switch", "power", "flip", "click")
+# What a thing does that is to be somewhere: "the bowl should sit on the plate".
+STANDS = word_set("sit rest stand stay lie end ends up sits rests gets land be")
 # Verbs that say to change nothing, unless what they are said of is in the hand.
 OF_WHAT_IS_HELD = ("leave", "keep")
 # "slide the pan under the shelf": where the way does not lead along the table, sliding is putting.
@@ -90,12 +92,14 @@ GOALS = ("onto", "on to", "into", "in to", "to", "down into", "towards", "toward
 # The latter with the relation that they undo, where they say it.
 SOURCES = {"from": "", "off of": "on", "off": "on", "out of": "in", "out from": "in"}
 # Words before a preposition that add nothing to it: "over onto the plate", "right next to".
-PARTICLES = word_set("over down up back away right just directly straight out along there immediately safely")
+PARTICLES = word_set(
+    "forward over down up back away right just directly straight out along immediately safely"
+)
 
 # Places in the scene, among several things of one name, and in a thing's part.
 PLACES = {
     "left": "left", "leftmost": "left", "lefthand": "left", "right": "right", "rightmost": "right",
-    "righthand": "right", "front": "front", "frontmost": "front", "foremost": "front", "forward": "front",
+    "righthand": "right", "front": "front", "frontmost": "front", "foremost": "front",
     "back": "back", "rear": "back", "backmost": "back", "rearmost": "back", "hindmost": "back",
     "middle": "middle", "centre": "middle", "center": "middle", "central": "middle", "middlemost": "middle",
 }  # fmt: skip
@@ -160,6 +164,7 @@ CONTAINERS = word_set(
 NAMED_WITH_CONTAINER = ("wine bottle", "cream cheese box", "cookie box")
 # Things that hold what is put on them: "on the bowl" and "in the bowl" are one.
 HOLLOW = word_set("bowl basket tray mug drawer compartment microwave caddy")
+SURFACES = word_set("table desk counter floor")
 # Things that nothing is put into: "in the rack" is on it.
 OPEN_SUPPORTS = word_set("rack plate stove shelf")
 # Words that say little of which thing is meant.
@@ -170,11 +175,16 @@ DESCRIPTIONS = word_set(
 
 COLOURS = word_set("black white red yellow green blue brown grey gray orange purple pink golden silver beige")
 DETERMINERS = word_set("the a an some this that these those my your our its")
-FILLERS = word_set("other same entire whole single little said very")
+FILLERS = word_set("also furthest farthest far other same entire whole single little said very")
 NUMBERS = {"both": 2, "two": 2, "pair of": 2, "couple of": 2, "three": 3, "four": 4}
 PRONOUNS = {
-    "it": "it", "this": "it", "that": "it", "there": "it", "itself": "it", "them": "them", "these": "them",
-    "those": "them", "both": "them", "each": "them", "the two": "them", "all": "them", "they": "them",
+    **dict.fromkeys(("it", "this", "that", "itself"), "it"),
+    "there": "there",
+    **dict.fromkeys(
+        ("them", "these", "those", "both", "they", "each", "all", "the two", "the two of them", "them both",
+         "both of them", "all of them", "them all", "stack", "pile"),
+        "them",
+    ),
 }  # fmt: skip
 
 Form = Literal["base", "gerund", "participle", "third"]
@@ -232,7 +242,8 @@ VERB_PHRASES = tuple(
 def match_verb(words: tuple[str, ...], at: int, form: Form = "base") -> Verb | None:
     """The longest verb phrase in a form that begins at a word."""
     for length in range(_LONGEST, 0, -1):
-        if verb := _LEXICON[form].get(words[at : at + length]):
+        verb = _LEXICON[form].get(words[at : at + length])
+        if verb and words[at + length - 1 : at + length + 1] != ("in", "front"):
             return verb
     return None
 
@@ -241,6 +252,8 @@ def replace_ending(name: str, table: dict[str, str]) -> str:
     """Replace the longest ending of a name that a table knows: "red cup" -> "red mug"."""
     words = name.split()
     for start in range(len(words)):
+        if " ".join(words[start:]) in table.values():
+            return name
         if other := table.get(" ".join(words[start:])):
             return " ".join([*words[:start], other])
     return name

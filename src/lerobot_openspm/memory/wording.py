@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 
-from lerobot_openspm.memory.vocabulary import SYNONYMS
+from lerobot_openspm.memory.vocabulary import COLOURS, SYNONYMS
 
 # Marks for what a rewritten phrase meant. "I'd like the soup in the basket" needs no verb; "you see the bowl
 # by the plate?" says what is spoken of; "that is on the stove" belongs to the noun before it; "do the same
@@ -14,6 +14,8 @@ WANTED, SEEN, WHICH, SAME = "@wanted", "@seen", "@which", "@same"
 _YOU = r"(?:you|the robot|robot|someone|somebody)"
 # A few words of one clause.
 _THING = r"(?:(?!\b(?:and|then)\b)[^,;])+?"
+_COLOUR = "|".join(sorted(COLOURS))
+_THINGS = r"[^,;]+?"
 _END = r"(?=\s*(?:[,;]|$))"
 
 _SPELLING = (
@@ -35,6 +37,7 @@ _SPELLING = (
     (r"[,:]+", " , "),
     (r"&", " and "),
     (r"[^a-z0-9,;' ]+", " "),
+    (r"\bstep (?:one|two|three|\d)\b|\b\d\b", " ; "),
     (r"'(?!s\b)", " "),
     (r"\s+", " "),
 )
@@ -52,32 +55,56 @@ _COURTESIES = (
     rf"(?:could|can|would|will|might) {_YOU}"
     r"(?: (?:be so (?:kind|good) as to|be able to|mind|go ahead and|go and|help me))?",
     rf"i (?:would|want|need)(?: really)?(?: like| love| prefer)?(?: for)? {_YOU} to",
-    r"i (?:would|will) (?:really )?(?:appreciate|be (?:grateful|happy|glad)) (?:it )?if",
+    r"i (?:would|will) (?:really )?(?:appreciate|love|like|be (?:grateful|happy|glad)) (?:it )?if(?: you)?",
     r"it would be (?:great|nice|good|helpful|lovely|wonderful) (?:if you (?:could|would)|to)",
     rf"i am going to need {_YOU} to|i will need {_YOU} to|help me(?: out)?(?: to| by)?",
+    r"(?:would|is) it (?:be )?(?:possible|ok(?:ay)?)(?: for you)? to|i (?:think|guess|believe|suppose)",
+    r"(?:start|begin|finish|end)(?: off| up)? (?:by|with)|in order(?= to)",
     r"(?:you|we|the robot|robot) (?:should|must|need to|have to|ought to|are to|can|may|shall)",
     r"(?:your|the|my|our)(?: (?:next|first))? (?:task|job|goal|mission|aim)(?: now)? is to",
     r"go ahead and|go and|let us|why do not you|be so (?:kind|good) as to|it is time to|time to",
 )
 # What may be left out where a sentence begins.
-_GREETINGS = r"(?:hey|hi|hello|ok|okay|alright|all right|so|well|robot|assistant|yes|right|there|excuse me)"
+_GREETINGS = r"(?:hey|hi|hello|ok|okay|alright|all right|so|well|robot|assistant|yes|right|excuse me)"
 
 # Other constructions of what an imperative says.
 _CONSTRUCTIONS = (
     (rf"\b({_THING}) is where (?:i|we) (?:want|need|would like) ({_THING}){_END}", r"put \2 to \1"),
     (r"\b(?:i|we) (?:would|want|need|wish)(?: really)?(?: like| love| prefer)?(?: to (?:have|see|get))?\b",
      WANTED),
+    # "have the bowl placed on the plate", "make sure the drawer is open", "could we have the milk here"
+    (r"\b(?:make sure|ensure|see to it|make certain)(?: that)?\b"
+     r"|(?:^|(?<=[;,]) )(?:have|let|make)\b(?= (?:the|that|a)\b)"
+     r"|\b(?:could|can|may) (?:i|we) (?:have|get)\b", WANTED),
+    (rf"\b({_THING}) (?:gets|receives|(?:should|must|needs to|has to) (?:hold|have|contain|get|receive))"
+     rf" ((?:the|a|both) {_THINGS})(?: (?:on|in) it)?{_END}", r"put \2 to \1"),
+    (rf"\bfill ({_THING}) with ({_THINGS}){_END}", r"put \2 in \1"),
+    (rf"\bwith ({_THING}) (open|on|off|closed|shut) ,", r"once \1 is \2 ,"),
+    (rf"\bmove ({_THING}) by (push|slid)ing it\b", r"push \1"),
+    (rf"\bget ({_THING}) (?:going|started|running|lit)\b", r"turn on \1"),
+    (rf"\breach (?:in|into|inside) ({_THING})(?: (?:and|,))+ (grab|get|take|pick up|fetch|retrieve|remove)"
+     r" ((?:the|that|a) \w+(?: \w+)??)(?= (?:and|then|from)\b| ?[,;]|$)", r"\2 \3 from \1"),
+    (r"\b(grab|get|bring|fetch|hand|find) me\b", r"\1"),
+    (r"\b(?:to|on|at) its (left|right|front|back)(?: hand)?(?: side)?\b", r"to the \1 of it"),
+    (r"\b(?:on|onto|to) the (?:very )?top (?:surface |side |part )?of\b", "on top of"),
     (rf"\bgive ({_THING}) an? (?:(?:little|gentle|small|light|good) )?(push|nudge|shove)\b", r"\2 \1"),
     (r"\b(?:so that|so|until) (?:it|they) (?:ends? up|is|are|sits?|lands?|comes? to rest|stands?|rests?)\b",
      ""),
     (r"\b(?:do|does|did) the same (?:with|for|to)\b|\b(?:and )?so (?:does|do|should|must)\b", f", {SAME}"),
-    (rf"\band ({_THING})(?: ,)? (?:too|as well|also|likewise){_END}", rf", {SAME} \1"),
+    (rf"\band (?:then )?the other(?: one)?(?: too| as well)?{_END}", f", {SAME} the other"),
+    (rf"\band ((?:the|that|a) {_THING})(?: ,)? (?:too|as well|also|likewise){_END}", rf", {SAME} \1"),
+    (rf" (?:too|as well|also|likewise){_END}", ""),
+    (r"\b(?:along with|together with|as well as|plus|and also|and then)"
+     rf" ((?:the|that) \w+(?: (?!in\b|on\b|into\b|onto\b|to\b|is\b|goes\b)\w+){{0,3}}){_END}",
+     rf", {SAME} \1"),
     (r"\b(?:as well as|along with|together with|plus)\b", "and"),
-    (r"\b(?:do )?you (?:can )?see\b|\bthere (?:is|are)\b|\bnotice\b", SEEN),
+    (r"\b(?:do )?you (?:can |will )?(?:see|find)\b|\bthere (?:is|are)\b|\bnotice\b|\bas for\b"
+     r"|(?:^|(?<=; ))(?:see|look at|i (?:can )?see)\b", SEEN),
     # "the bowl that is standing on ...", "the bowl you see on ...", "the bowl lying on ..."
     (rf"(?:\b(?:that|which)\b|{SEEN})(?: (?:is|are|was|were|currently|sitting|standing|lying|resting|located"
      r"|placed|found|positioned|kept|sits?|stands?|lies?|rests?))+\b"
      r"|(?<!and )\b(?:currently|sitting|standing|lying|resting|located|positioned)\b", WHICH),
+    (rf"(\w+) {WHICH} ((?:{_COLOUR})(?: and (?:{_COLOUR}))*)\b", r"\2 \1"),
     (r"\bfrom (?:its|their) (?:usual |current )?(?:place|spot|position)\b(?= \w)", "from"),
     (r"\b(?:in|to|into|at) (?:its|their) (?:usual |right )?(?:place|spot|position|home)\b(?= \w)", ""),
     # "to the stove's front side", "from the wooden cabinet's left"
