@@ -120,6 +120,11 @@ class Row:
         """What the execution is up to."""
         return self.executor.status
 
+    @property
+    def used_entries(self) -> tuple[MemoryEntry, ...]:
+        """The entries that the episode was acted by; none before there is a plan."""
+        return (self.ranked[0].entry,) if self.ranked and self.executor.plan else ()
+
     def observe(self, hand: Hand, look: Look) -> None:
         """Take in a new observation: plan, advance, look around, go where things are now, try again."""
         self._step += 1
