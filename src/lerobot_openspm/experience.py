@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import defaultdict
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import chain
 from pathlib import Path
 
 import numpy as np
@@ -27,7 +28,7 @@ from lerobot_openspm.experience_files import (
 from lerobot_openspm.experience_header import Header, check_layouts, header_from_fields, header_to_fields
 from lerobot_openspm.geometry.camera import Camera, load_cameras
 from lerobot_openspm.geometry.layout import VectorLayout
-from lerobot_openspm.memory.bank import EntryBank, anchored_objects
+from lerobot_openspm.memory.bank import EntryBank, anchored_objects, texts_of
 from lerobot_openspm.memory.entry import MemoryEntry
 from lerobot_openspm.memory.old_versions import entries_from_parts
 from lerobot_openspm.memory.quality import with_outcome
@@ -139,7 +140,8 @@ def save_experience(experience: Experience, directory: Path) -> None:
         objects.append(fields)
         arrays |= {f"objects.{model.name}.{key}": value for key, value in own.items()}
     header = header_to_fields(header_of(experience, objects))
-    write_files(directory, header, (experience.entries, experience.superseded), arrays, experience.cameras)
+    texts = chain(texts_of(experience.entries), texts_of(experience.superseded))
+    write_files(directory, header, texts, arrays, experience.cameras)
 
 
 def header_of(experience: Experience, objects: list[Fields]) -> Header:

@@ -94,8 +94,8 @@ class OpenSPMPolicy(PreTrainedPolicy):
     def report_outcomes(self, successes: Sequence[bool | None]) -> None:
         """Tell how the running episodes ended, before the next :meth:`reset`; the memory learns from it.
 
-        The quality of the entries that each episode was acted by follows, for the episodes to come and in what
-        is saved from now on. An episode counts once, however often it is reported.
+        The quality of the entries that each episode was acted by follows, for the episodes to come and in
+        what is saved from now on. An episode counts once, however often it is reported.
 
         Args:
             successes: For every environment, in the order of the observations, whether its episode succeeded;
