@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import chain
 from pathlib import Path
 
 import numpy as np
@@ -27,9 +28,10 @@ from lerobot_openspm.experience_files import (
 from lerobot_openspm.experience_header import Header, check_layouts, header_from_fields, header_to_fields
 from lerobot_openspm.geometry.camera import Camera, load_cameras
 from lerobot_openspm.geometry.layout import VectorLayout
-from lerobot_openspm.memory.bank import EntryBank, anchored_objects
+from lerobot_openspm.memory.bank import EntryBank, anchored_objects, texts_of
 from lerobot_openspm.memory.entry import MemoryEntry
 from lerobot_openspm.memory.old_versions import entries_from_parts
+from lerobot_openspm.memory.quality import with_outcome
 from lerobot_openspm.memory.robot import RobotModel
 from lerobot_openspm.perception.model import KnownObject
 from lerobot_openspm.perception.store import from_parts as object_from_parts
@@ -106,6 +108,19 @@ class Experience:
             superseded=(*self.superseded, *replaced),
         )
 
+    def with_outcomes(self, outcomes: Iterable[tuple[MemoryEntry, bool]]) -> Experience:
+        """This experience after some of its entries were acted by, each with whether it succeeded."""
+        entries = list(self.entries)
+        by_source: dict[str, list[int]] = defaultdict(list)
+        for i, entry in enumerate(entries):
+            by_source[entry.source].append(i)
+        for used, success in outcomes:
+            for i in by_source[used.source]:
+                if entries[i].version == used.version and _same_demonstration(entries[i], used):
+                    entries[i] = with_outcome(entries[i], success)
+                    break
+        return replace(self, entries=tuple(entries))
+
 
 def _same_demonstration(a: MemoryEntry, b: MemoryEntry) -> bool:
     """Whether two entries were mined from the same episode; datasets of one name may hold different ones."""
@@ -124,13 +139,19 @@ def save_experience(experience: Experience, directory: Path) -> None:
         fields, own = object_to_parts(model)
         objects.append(fields)
         arrays |= {f"objects.{model.name}.{key}": value for key, value in own.items()}
+    header = header_to_fields(header_of(experience, objects))
+    texts = chain(texts_of(experience.entries), texts_of(experience.superseded))
+    write_files(directory, header, texts, arrays, experience.cameras)
+
+
+def header_of(experience: Experience, objects: list[Fields]) -> Header:
+    """What the header of a memory says, given the fields of the objects' models."""
     groups = (experience.entries, experience.superseded)
     anchored = tuple(sorted(frozenset[str]().union(*map(anchored_objects, groups))))
-    header = Header(
+    return Header(
         experience.perception, experience.segmentation, experience.shape, experience.simulator_objects,
         experience.layouts, experience.robot, objects, len(experience.entries), anchored,
     )  # fmt: skip
-    write_files(directory, header_to_fields(header), groups, arrays, experience.cameras)
 
 
 def load_experience(directory: Path, cameras: Path | None = None) -> Experience:

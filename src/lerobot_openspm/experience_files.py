@@ -9,7 +9,7 @@ from __future__ import annotations
 import hashlib
 import json
 import re
-from collections.abc import Generator, Iterable, Mapping, Sequence
+from collections.abc import Generator, Iterable, Mapping
 from contextlib import contextmanager, nullcontext, suppress
 from pathlib import Path
 from typing import Any
@@ -23,8 +23,7 @@ from safetensors.numpy import save as save_arrays
 from lerobot_openspm.errors import CalibrationError, MemoryFormatError
 from lerobot_openspm.files import locked, rename, write_beside, written
 from lerobot_openspm.geometry.camera import Camera, cameras_from_dict, cameras_to_dict, load_cameras
-from lerobot_openspm.memory.bank import Lines, write_entries
-from lerobot_openspm.memory.entry import MemoryEntry
+from lerobot_openspm.memory.bank import Lines, write_texts
 from lerobot_openspm.memory.strict_json import loads
 
 # Version 2: objects known by patches. Version 3: key poses with the axis of their constraint. Version 4:
@@ -55,7 +54,7 @@ def changing(directory: Path) -> Generator[None]:
 def write_files(
     directory: Path,
     header: Fields,
-    entries: Sequence[Iterable[MemoryEntry]],
+    texts: Iterable[bytes],
     arrays: Mapping[str, NDArray[Any]],
     cameras: Mapping[str, Camera],
 ) -> None:
@@ -64,13 +63,13 @@ def write_files(
     Args:
         directory: Where to.
         header: What it says besides the names and checksums of the files.
-        entries: Groups of entries, each written after the one before.
+        texts: The entries' JSON, as :func:`~lerobot_openspm.memory.bank.texts_of` gives it.
         arrays: Arrays by name.
         cameras: The calibration.
     """
     directory.mkdir(parents=True, exist_ok=True)
     with changing(directory):
-        entries_file, lines = _write_lines(directory, entries)
+        entries_file, lines = _write_lines(directory, texts)
         blob = save_arrays({**_contiguous(arrays), **lines_to_arrays(lines)})
         arrays_file = _write_named(directory, ARRAYS, blob)
         calibration = _json(cameras_to_dict(cameras))
@@ -88,10 +87,10 @@ def write_files(
         _tidy(directory, keep={entries_file, arrays_file})
 
 
-def _write_lines(directory: Path, groups: Sequence[Iterable[MemoryEntry]]) -> tuple[str, Lines]:
+def _write_lines(directory: Path, texts: Iterable[bytes]) -> tuple[str, Lines]:
     beside = directory / ".memory.entries.json.partial"
     with written(beside) as file:
-        lines, sha256 = write_entries(file, *groups)
+        lines, sha256 = write_texts(file, texts)
     name = ENTRIES.format(sha256[:16])
     rename(beside, directory / name)
     return name, lines

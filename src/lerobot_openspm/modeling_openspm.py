@@ -21,7 +21,7 @@ from torch import Tensor
 from lerobot_openspm.configuration_openspm import OpenSPMConfig
 from lerobot_openspm.control.knowledge import Knowledge
 from lerobot_openspm.control.row import Row
-from lerobot_openspm.errors import DatasetError, MemoryFormatError
+from lerobot_openspm.errors import DatasetError, MemoryFormatError, OpenSPMError
 from lerobot_openspm.experience import (
     CAMERAS_JSON,
     MEMORY_JSON,
@@ -95,6 +95,33 @@ class OpenSPMPolicy(PreTrainedPolicy):
         """Forget the running episodes."""
         self.rows: list[Row] = []
         self._eyes: list[Eyes] = []
+        self._rated: list[Row] = []
+
+    def report_outcomes(self, successes: Sequence[bool | None]) -> None:
+        """Tell how the running episodes ended, before the next :meth:`reset`; the memory learns from it.
+
+        The quality of the entries that each episode was acted by follows, for the episodes to come and in
+        what is saved from now on. An episode counts once, however often it is reported.
+
+        Args:
+            successes: For every environment, in the order of the observations, whether its episode succeeded;
+                None where that is not known.
+
+        Raises:
+            OpenSPMError: There are more or fewer environments.
+        """
+        if len(successes) != len(self.rows):
+            raise OpenSPMError(
+                f"got {len(successes)} outcomes, but {len(self.rows)} episodes are running; report one for "
+                "every environment, after acting and before reset()"
+            )
+        outcomes = []
+        for row, success in zip(self.rows, successes, strict=True):
+            if success is not None and not any(row is rated for rated in self._rated):
+                self._rated.append(row)
+                outcomes += [(entry, success) for entry in row.used_entries]
+        if outcomes:
+            self.experience = self.require_experience().with_outcomes(outcomes)
 
     @torch.no_grad()
     def select_action(self, batch: dict[str, Tensor], **kwargs: Any) -> Tensor:

@@ -124,6 +124,9 @@ def test_a_truncated_memory_is_refused(load: Callable[..., OpenSPMPolicy], copy:
         load(copy)
 
 
+SHORT_LAYOUT = {"names": ["x", "y", "z", "gripper"], "rotation": "none"}
+
+
 @pytest.mark.parametrize(
     ("change", "message"),
     [

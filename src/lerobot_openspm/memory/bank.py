@@ -12,7 +12,6 @@ import mmap
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
-from itertools import chain
 from pathlib import Path
 from typing import BinaryIO, overload
 
@@ -50,7 +49,7 @@ class Lines:
         return (int(self.ends[-1]) if len(self.ends) else len(HEAD)) + len(TAIL)
 
     def check(self, where: str) -> None:
-        """Raise MemoryFormatError unless the arrays are such as :func:`write_entries` returns."""
+        """Raise MemoryFormatError unless the arrays are such as :func:`write_texts` returns."""
         n = len(self.ends)
         if self.ends.dtype != np.int64 or self.ends.shape != (n,):
             raise MemoryFormatError(
@@ -159,13 +158,13 @@ def entry_to_json(entry: MemoryEntry) -> bytes:
     return json.dumps(entry_to_fields(entry), allow_nan=False, ensure_ascii=False).encode()
 
 
-def texts_of(entries: Iterable[MemoryEntry]) -> Iterator[bytes]:
-    """The JSON of every entry; what lies in a file already is taken from there as it is."""
+def texts_of(entries: Sequence[MemoryEntry]) -> Iterator[bytes]:
+    """The JSON of every entry, a line each; what lies in a file already is taken from there as it is."""
     return entries.texts() if isinstance(entries, EntryBank) else map(entry_to_json, entries)
 
 
-def write_entries(file: BinaryIO, *parts: Iterable[MemoryEntry]) -> tuple[Lines, str]:
-    """Write the entries of all parts, one a line.
+def write_texts(file: BinaryIO, texts: Iterable[bytes]) -> tuple[Lines, str]:
+    """Write entries, given as :func:`texts_of` gives them, as one JSON list.
 
     Returns:
         Where the lines are, and the SHA-256 of the file in hexadecimal.
@@ -180,7 +179,7 @@ def write_entries(file: BinaryIO, *parts: Iterable[MemoryEntry]) -> tuple[Lines,
         return position + len(blob)
 
     position = write(HEAD)
-    for text in chain.from_iterable(map(texts_of, parts)):
+    for text in texts:
         position = write(BETWEEN + text if ends else text)
         ends.append(position)
         digests.append(_digest(text))

@@ -108,12 +108,15 @@ def entry_from_fields(fields: Any) -> MemoryEntry:
     key_poses = tuple(_key_pose(row, T, len(sub_tasks)) for row, T in zip(rows, poses, strict=True))
     if unknown := {name for pose in key_poses for name in pose.anchor.objects} - set(layout):
         raise ValueError(f"anchors {sorted(unknown)} are not in its layout {sorted(layout)}")
+    phases = texts(key, "phases")
+    if phases != tuple(pose.phase for pose in key_poses):
+        raise ValueError(f"'phases' are {phases}, but its key poses have others")
     trials = integer(fields, "trials")
     successes = integer(fields, "successes")
     if successes > trials:
         raise ValueError(f"'successes' is {successes}, more than the {trials} 'trials'")
     return MemoryEntry(
-        RetrievalKey(sub_tasks, texts(key, "phases")), text(fields, "language"), key_poses,
+        RetrievalKey(sub_tasks, phases), text(fields, "language"), key_poses,
         number(fields, "quality", 0, 1), integer(fields, "version", 1), text(fields, "source"), layout,
         trials, successes,
     )  # fmt: skip
