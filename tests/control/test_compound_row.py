@@ -108,6 +108,17 @@ def test_the_whole_is_preferred_where_it_was_demonstrated():
     assert len(one.executor.plan) == len(whole.key_poses)
 
 
+def test_a_part_of_an_entry_is_used_in_the_name_of_the_entry():
+    both = "open the top drawer and put the bowl inside"
+    whole = entry(both, opening().key_poses, {"cabinet": np.eye(4), "bowl": LAYOUT["bowl"]})
+    one = row(whole, instruction="open the top drawer")
+    one.observe(HAND, Eyes({"cabinet": LAYOUT["plate"]}))
+    assert one.status is Status.RUNNING
+    assert one.ranked[0].entry.language == "open the top drawer of the cabinet"
+    assert len(one.used_entries) == 1
+    assert one.used_entries[0] is whole
+
+
 def test_an_opened_drawer_looks_different_and_is_not_looked_for_again():
     cabinet = se3.from_yaw([0.2, 0.2, 0.0], 0.3)
     eyes = Eyes({**LAYOUT, "cabinet": cabinet})
