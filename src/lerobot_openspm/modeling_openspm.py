@@ -43,6 +43,11 @@ from lerobot_openspm.training import mine_experience, segmenter_of, training_set
 
 logger = logging.getLogger(__name__)
 
+# Options that mean nothing on another machine; a checkpoint is saved without them.
+ON_ONE_MACHINE = (
+    "cameras", "sam3d_python", "sam3d_checkout", "phase_judge_api_base", "phase_judge_cache",
+)  # fmt: skip
+
 # Of checkpoints that do not say how often their robot acts.
 DEFAULT_CONTROL_HZ = 20.0
 
@@ -220,9 +225,7 @@ class OpenSPMPolicy(PreTrainedPolicy):
         experience = self.require_experience()  # before anything is written
         super()._save_pretrained(save_directory, state_dict=state_dict)
         # What exists on one machine alone stays there; the calibration travels as a file of the checkpoint.
-        replace(self.config, cameras=None, sam3d_python=None, sam3d_checkout=None)._save_pretrained(
-            Path(save_directory)
-        )
+        replace(self.config, **dict.fromkeys(ON_ONE_MACHINE))._save_pretrained(Path(save_directory))
         save_experience(experience, Path(save_directory))
 
     @classmethod

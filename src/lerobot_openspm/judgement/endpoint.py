@@ -57,8 +57,8 @@ class ChatEndpoint:
         patience: How long and how often to ask.
         sleep: Waits, in seconds.
 
-    An API key is taken from the environment variable :data:`API_KEY_VARIABLE` alone, and goes nowhere but into
-    the request's header. Redirects are not followed, so it reaches no other server.
+    An API key is taken from the environment variable :data:`API_KEY_VARIABLE` alone, and goes nowhere but
+    into the request's header. Redirects are not followed, so it reaches no other server.
     """
 
     def __init__(
@@ -97,7 +97,7 @@ class ChatEndpoint:
         if self._with_schema and status in NO_SCHEMA:
             self._with_schema = False
             status, body = self._post(self._request(prompt), deadline)
-        if status != httpx.codes.OK:
+        if status != 200:
             kind = _TryAgainError if status in BUSY else JudgementError
             raise kind(f"{self._url} answered with code {status}: {self._shown(body)}")
         try:

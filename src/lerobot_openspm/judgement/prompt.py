@@ -6,7 +6,7 @@ import json
 import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, cast
 
 from lerobot_openspm.errors import JudgementError
 from lerobot_openspm.judgement.types import Answers, PhaseAnswer, PhaseQuestion, Picture
@@ -35,9 +35,9 @@ The trajectory as JSON (seconds; metres and rotation vectors in the world, z up;
 Which phase ends at each candidate moment? The phases are:
 {phases}
 """
-AS_JSON = """Answer with JSON alone: {{"phases": [{{"candidate": 1, "phase": "approach", "confidence": 0.9}}, \
-...]}}, one item for each of the {n} candidates, in order. The confidence is the probability, 0 to 1, that \
-your phase is right."""
+AS_JSON = """Answer with JSON alone, one item for each of the {n} candidates, in order: \
+{{"phases": [{{"candidate": 1, "phase": "approach", "confidence": 0.9}}, ...]}}. \
+The confidence is the probability, 0 to 1, that your phase is right."""
 AS_LINES = "Answer with one line for each of the {n} candidates, in order: its number, a colon and its phase."
 
 # What may be written next, given the pieces written so far; nothing: the end.
@@ -124,8 +124,8 @@ def read_phases(text: str, n: int) -> Answers:
         raise JudgementError(f"the answer's 'phases' is {_short(items)}, expected a list")
     answers: dict[int, PhaseAnswer | None] = {}
     for item in items:
-        number = item.get("candidate") if isinstance(item, dict) else None
-        if type(number) is int and 1 <= number <= n:
+        number = cast(dict[str, Any], item).get("candidate") if isinstance(item, dict) else None
+        if isinstance(number, int) and not isinstance(number, bool) and 1 <= number <= n:
             answers[number] = None if number in answers else _answer(item)
     read = tuple(answers.get(number) for number in range(1, n + 1))
     if not any(read):
@@ -135,7 +135,7 @@ def read_phases(text: str, n: int) -> Answers:
 
 def _answer(item: Mapping[str, Any]) -> PhaseAnswer | None:
     phase, confidence = item.get("phase"), item.get("confidence")
-    if not isinstance(phase, str) or type(confidence) not in (int, float):
+    if not isinstance(phase, str) or not isinstance(confidence, int | float) or isinstance(confidence, bool):
         return None
     try:
         return PhaseAnswer(phase, float(confidence))

@@ -80,21 +80,15 @@ class Qwen3VL:
         return speller.pieces(output[0, n_prompt:].tolist(), measured.steps)
 
     def _inputs(self, prompt: Prompt) -> Any:
-        from PIL import Image
-
-        content: list[dict[str, Any]] = []
-        for caption, picture in prompt.pictures:
-            content.append({"type": "text", "text": caption})
-            content.append({"type": "image", "image": Image.fromarray(picture)})
+        content: list[dict[str, str]] = []
+        for caption, _ in prompt.pictures:
+            content += [{"type": "text", "text": caption}, {"type": "image"}]
         content.append({"type": "text", "text": prompt.text})
-        inputs = self._processor.apply_chat_template(
-            [{"role": "user", "content": content}],
-            add_generation_prompt=True,
-            tokenize=True,
-            return_dict=True,
-            return_tensors="pt",
+        chat = self._processor.apply_chat_template(
+            [{"role": "user", "content": content}], add_generation_prompt=True, tokenize=False
         )
-        return inputs.to(self._model.device)
+        pictures = [picture for _, picture in prompt.pictures] or None
+        return self._processor(text=[chat], images=pictures, return_tensors="pt").to(self._model.device)
 
 
 class _Measured:

@@ -125,7 +125,7 @@ class Demonstrations:
                 pictures.setdefault(key, []).append(image)
         return pictures
 
-    def subtask_rows(self, episode: Episode) -> list[tuple[float, str]]:
+    def subtask_rows(self, index: int) -> list[tuple[float, str]]:
         """What lerobot-annotate wrote of an episode: second at which each sub-task begins, and its words.
 
         Raises:
@@ -138,8 +138,9 @@ class Demonstrations:
                 "--policy.phase_judge out"
             )
         # An episode's rows stand beside each of its frames.
+        meta: Any = self._dataset.meta.episodes
         column: Any = self._dataset.hf_dataset.select_columns([LANGUAGE_PERSISTENT])
-        rows = column[episode.from_index][LANGUAGE_PERSISTENT] or []
+        rows = column[int(meta["dataset_from_index"][index])][LANGUAGE_PERSISTENT] or []
         found = [(row["timestamp"], row["content"]) for row in rows if row["style"] == "subtask"]
         return sorted((float(begin), str(words or "")) for begin, words in found)
 
