@@ -110,11 +110,13 @@ class _Speller:
     def __init__(self, tokenizer: Any, grammar: Grammar) -> None:
         self._tokenizer, self._grammar = tokenizer, grammar
         self._spelled: dict[str, tuple[int, ...]] = {}
+        self._pieces: list[str] = []
+        self._at = 0
 
     def allowed(self, written: list[int]) -> list[int]:
         """The tokens that may come next."""
-        pieces, alternatives = self._read(written)
-        begun = tuple(written[sum(len(self._spell(piece)) for piece in pieces) :])
+        _, alternatives = self._read(written)
+        begun = tuple(written[self._at :])
         following = {
             tokens[len(begun)]
             for tokens in map(self._spell, alternatives)
@@ -140,16 +142,21 @@ class _Speller:
         return found
 
     def _read(self, written: list[int]) -> tuple[tuple[str, ...], tuple[str, ...]]:
-        """The whole pieces in what was written, and the alternatives for the next one."""
-        pieces: tuple[str, ...] = ()
-        at = 0
-        while alternatives := self._grammar(pieces):
-            ahead = tuple(written[at:])
-            piece = next((a for a in alternatives if ahead[: len(self._spell(a))] == self._spell(a)), None)
+        """The whole pieces in what was written, and the alternatives for the next one.
+
+        Goes on where it was last time: what is written only grows.
+        """
+        while alternatives := self._grammar(tuple(self._pieces)):
+            piece = next((a for a in alternatives if self._comes(a, written)), None)
             if piece is None:
                 break
-            pieces, at = (*pieces, piece), at + len(self._spell(piece))
-        return pieces, alternatives
+            self._pieces.append(piece)
+            self._at += len(self._spell(piece))
+        return tuple(self._pieces), alternatives
+
+    def _comes(self, piece: str, written: list[int]) -> bool:
+        tokens = self._spell(piece)
+        return tuple(written[self._at : self._at + len(tokens)]) == tokens
 
     def _spell(self, text: str) -> tuple[int, ...]:
         if text not in self._spelled:
