@@ -52,8 +52,8 @@ class Mined:
             for item in mine_key_poses(self.demonstrations, self.robot).mined
         )
 
-    def judged(self, **options) -> tuple[MinedEpisode, ...]:
-        return judged(self.demonstrations, self.episodes, self.robot, config(**options))
+    def judged(self, first: int = 6, **options) -> tuple[MinedEpisode, ...]:
+        return judged(self.demonstrations, self.episodes[:first], self.robot, config(**options))
 
 
 @pytest.fixture(scope="module")
@@ -179,6 +179,7 @@ def test_a_server_that_fails_now_and_then_is_asked_on(mined: Mined, asked, caplo
 
 def test_qwen3vl_judges_in_this_process(mined: Mined, tiny_qwen3vl_folder: Path, tmp_path: Path):
     found = mined.judged(
+        first=1,
         phase_judge="qwen3vl",
         phase_judge_model_id=str(tiny_qwen3vl_folder),
         phase_judge_confidence=0.0,
@@ -186,8 +187,9 @@ def test_qwen3vl_judges_in_this_process(mined: Mined, tiny_qwen3vl_folder: Path,
     )
     for names in phases(found):
         check_sequence(names)
-    assert len(list(tmp_path.rglob("*.json"))) == 6
+    assert len(list(tmp_path.rglob("*.json"))) == len(found) == 1
     assert all(0 <= c <= 1 for c in confidences(found))
+    assert confidences(found) != confidences(mined.episodes[:1])
 
 
 def test_weights_that_are_not_there_are_an_error(mined: Mined, tmp_path: Path):

@@ -8,6 +8,7 @@ import pytest
 from tests.judgement.loopback_chat import LoopbackChat, Reply, completion, question_of
 
 from lerobot_openspm.errors import JudgementError
+from lerobot_openspm.judgement import zero_shot
 from lerobot_openspm.judgement.endpoint import ChatEndpoint
 from lerobot_openspm.judgement.qwen3vl import Qwen3VL
 from lerobot_openspm.judgement.zero_shot import (
@@ -133,7 +134,8 @@ def test_whatever_the_grammar_allows_is_taken(seed: int):
     assert len(read_key_poses("".join(written))) >= 2
 
 
-def test_qwen3vl_makes_up_key_poses_that_can_be_followed(tiny_qwen3vl_parts):
+def test_qwen3vl_makes_up_key_poses_that_can_be_followed(tiny_qwen3vl_parts, monkeypatch):
+    monkeypatch.setattr(zero_shot, "_ENOUGH", 2)  # it knows no end of its own
     guessed = Qwen3VLKeyPoses(Qwen3VL(*tiny_qwen3vl_parts, "tiny")).guess(QUESTION)
     assert guessed[0].phase == "approach"
     assert all(np.isfinite(g.position).all() for g in guessed)
