@@ -48,6 +48,11 @@ from lerobot_openspm.training import mine_experience, segmenter_of, training_set
 
 logger = logging.getLogger(__name__)
 
+# Options that mean nothing on another machine; a checkpoint is saved without them.
+ON_ONE_MACHINE = (
+    "cameras", "sam3d_python", "sam3d_checkout", "phase_judge_api_base", "phase_judge_cache",
+)  # fmt: skip
+
 # Of checkpoints that do not say how often their robot acts.
 DEFAULT_CONTROL_HZ = 20.0
 
@@ -263,7 +268,7 @@ class OpenSPMPolicy(PreTrainedPolicy):
         experience = self.require_experience()  # before anything is written
         super()._save_pretrained(save_directory, state_dict=state_dict)
         # What exists on one machine alone stays there; the calibration travels as a file of the checkpoint.
-        here = {"cameras": None, "sam3d_python": None, "sam3d_checkout": None}
+        here = dict.fromkeys(ON_ONE_MACHINE)
         if self.config.name_embeddings and Path(self.config.name_embeddings).is_dir():
             here["name_embeddings"] = None
         replace(self.config, **here)._save_pretrained(Path(save_directory))

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import logging
 from contextlib import AbstractContextManager, nullcontext
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from lerobot.datasets import LeRobotDataset
+from lerobot.utils.constants import HF_LEROBOT_HOME
 
 from lerobot_openspm.configuration_openspm import OpenSPMConfig
 from lerobot_openspm.errors import CalibrationError, DatasetError, PerceptionError
@@ -16,9 +18,13 @@ from lerobot_openspm.experience import Experience
 from lerobot_openspm.flow.samples import perturbed, segment_frames
 from lerobot_openspm.flow.training_set import TrainingSet
 from lerobot_openspm.geometry.camera import Camera, check_sizes, load_cameras
+from lerobot_openspm.judgement.cache import AnswerCache
+from lerobot_openspm.judgement.judging import judge_episodes
+from lerobot_openspm.judgement.make import make_judge
 from lerobot_openspm.memory.robot import RobotModel
 from lerobot_openspm.mining.dataset import Demonstrations
 from lerobot_openspm.mining.mine import (
+    MinedEpisode,
     build_entries,
     layouts_in_scenes,
     learn_scenes,
@@ -76,6 +82,27 @@ def shapes_of(config: OpenSPMConfig) -> AbstractContextManager[ShapeBackend | No
     return Sam3dShape(worker_command(Path(config.sam3d_python), Path(config.sam3d_checkout)))
 
 
+def judged(
+    demonstrations: Demonstrations, mined: tuple[MinedEpisode, ...], robot: RobotModel, config: OpenSPMConfig
+) -> tuple[MinedEpisode, ...]:
+    """Episodes with what the configuration's judge of phases says of their key poses; unchanged without one.
+
+    Raises:
+        JudgementError: There is nothing to ask.
+        PerceptionError: A model's package or weights are missing.
+        DatasetError: The dataset was never annotated, and its annotations are the judge.
+    """
+    if config.phase_judge == "none":
+        return mined
+    judge = make_judge(
+        config.phase_judge, demonstrations, config.phase_judge_model_id, config.phase_judge_api_base,
+        config.phase_judge_timeout_s, str(config.device),
+    )  # fmt: skip
+    folder = config.phase_judge_cache or HF_LEROBOT_HOME / "openspm" / "phase_judgements"
+    cache = AnswerCache(Path(folder))
+    return judge_episodes(demonstrations, mined, robot, judge, config.phase_judge_confidence, cache)
+
+
 def mine_experience(
     dataset_meta: Any,
     config: OpenSPMConfig,
@@ -104,6 +131,7 @@ def mine_experience(
     episodes = demonstrations.episodes(config.memory_episodes)
     robot = observe_robot(episodes, known.robot if known else None)
     mined = mine_key_poses(demonstrations, robot, config.memory_episodes)
+    mined = replace(mined, mined=judged(demonstrations, mined.mined, robot, config))
     scenes = learn_scenes(demonstrations, mined.mined, cameras)
     models = known.objects if known else {}
     with shapes_of(config) as shapes:
