@@ -83,6 +83,23 @@ def mine_experience(
     cameras: dict[str, Camera] | None = None,
     segmenter: Segmenter | None = None,
 ) -> Experience:
+    """Mine a dataset, and append what was mined to what is known already, as :func:`mine` does each.
+
+    Raises:
+        CalibrationError, DatasetError: See :func:`mine`.
+        MemoryFormatError: What is known comes from another robot.
+    """
+    mined = mine(dataset_meta, config, known, cameras, segmenter)
+    return known.appended(mined) if known else mined
+
+
+def mine(
+    dataset_meta: Any,
+    config: OpenSPMConfig,
+    known: Experience | None = None,
+    cameras: dict[str, Camera] | None = None,
+    segmenter: Segmenter | None = None,
+) -> Experience:
     """Mine a dataset's key poses, learn its objects, and make memory entries of it.
 
     Deterministic: every process of a distributed run mines the same.
@@ -90,7 +107,7 @@ def mine_experience(
     Args:
         dataset_meta: LeRobot's metadata of the dataset.
         config: The policy's configuration.
-        known: An experience to append to. Its objects are recognised by what is known of them.
+        known: An experience whose objects are recognised by what is known of them.
         cameras: Calibration to use where the configuration names no file.
         segmenter: Finds the objects' masks, where the configuration's segmentation is not "demonstrations".
 
@@ -126,10 +143,9 @@ def mine_experience(
         "mined %d entries from %d episodes (%d skipped); objects: %s",
         len(entries), len(mined.mined), len(mined.skipped), ", ".join(sorted(objects.models)),
     )  # fmt: skip
-    experience = Experience(
+    return Experience(
         entries, objects.models, robot, cameras, config.perception, names, config.segmentation, config.shape
     )
-    return known.appended(experience) if known else experience
 
 
 def _calibration(
