@@ -8,9 +8,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from lerobot.datasets import LeRobotDataset
 
 from lerobot_openspm.configuration_openspm import OpenSPMConfig
+from lerobot_openspm.datasets import open_dataset
 from lerobot_openspm.errors import CalibrationError, DatasetError, PerceptionError
 from lerobot_openspm.experience import Experience
 from lerobot_openspm.flow.samples import perturbed, segment_frames
@@ -39,9 +39,7 @@ PERTURBED_COPIES = 3
 
 def open_demonstrations(dataset_meta: Any, config: OpenSPMConfig) -> Demonstrations:
     """The dataset behind LeRobot's metadata, read as mining reads it."""
-    dataset = LeRobotDataset(
-        dataset_meta.repo_id, root=dataset_meta.root, revision=dataset_meta.revision, video_backend="pyav"
-    )
+    dataset = open_dataset(dataset_meta)
     if config.state_layout is None or config.action_layout is None:
         config.set_dataset_feature_metadata(dataset_meta.features)
     return Demonstrations(dataset, *config.layouts())

@@ -9,8 +9,8 @@ from pathlib import Path
 
 import draccus
 
-from lerobot_openspm.cli.datasets import dataset_metadata
 from lerobot_openspm.configuration_openspm import OpenSPMConfig
+from lerobot_openspm.datasets import dataset_metadata
 from lerobot_openspm.experience import save_experience
 from lerobot_openspm.training import mine_experience, segmenter_of
 

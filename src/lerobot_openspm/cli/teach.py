@@ -11,7 +11,7 @@ from pathlib import Path
 
 import draccus
 
-from lerobot_openspm.cli.datasets import dataset_metadata
+from lerobot_openspm.datasets import dataset_metadata
 from lerobot_openspm.errors import OpenSPMError
 from lerobot_openspm.experience import FILES, Experience, save_experience
 from lerobot_openspm.teaching import Lesson
