@@ -266,8 +266,8 @@ class OpenSPMConfig(PreTrainedConfig):
 
     def set_dataset_feature_metadata(self, features: Mapping[str, Any]) -> None:
         """Take the layouts from the dataset's feature names where they were not given. Called by LeRobot."""
-        self.state_layout = self.state_layout or _flat_names(features.get(OBS_STATE, {}).get("names"))
-        self.action_layout = self.action_layout or _flat_names(features.get(ACTION, {}).get("names"))
+        self.state_layout = self.state_layout or feature_names(features.get(OBS_STATE, {}).get("names"))
+        self.action_layout = self.action_layout or feature_names(features.get(ACTION, {}).get("names"))
 
     def layouts(self) -> tuple[VectorLayout, VectorLayout]:
         """Layouts of state and action. Raises LayoutError when names are missing or make no sense."""
@@ -349,7 +349,7 @@ def _require_choice(name: str, got: str, expected: tuple[str, ...]) -> None:
         raise ValueError(f"{name} is {got!r}, expected one of {', '.join(expected)}")
 
 
-def _flat_names(names: Any) -> list[str] | None:
+def feature_names(names: Any) -> list[str] | None:
     """Feature names as a list; LeRobot datasets also write them as ``{"motors": [...]}``."""
     if isinstance(names, Mapping):
         names = [name for group in names.values() for name in group]

@@ -44,6 +44,7 @@ from lerobot_openspm.observation import Observation, split_batch
 from lerobot_openspm.perceive import Eyes
 from lerobot_openspm.perception.tracker import TrackerSettings
 from lerobot_openspm.perception.types import Segmenter
+from lerobot_openspm.teaching import Lesson, teach
 from lerobot_openspm.training import mine_experience, segmenter_of, training_set
 
 logger = logging.getLogger(__name__)
@@ -261,6 +262,15 @@ class OpenSPMPolicy(PreTrainedPolicy):
     def get_optim_params(self) -> Any:
         """The flow model's parameters."""
         return self.parameters()
+
+    def teach(self, dataset_meta: Any, episodes: Sequence[int] | None = None) -> Lesson:
+        """Append demonstrations to the memory; no weight changes. Running episodes go on with what they know.
+
+        Args and errors are those of :func:`lerobot_openspm.teaching.teach`; after one nothing has changed.
+        """
+        known = self.require_experience()
+        self.experience, lesson = teach(known, self.config, dataset_meta, episodes, self.segmenter)
+        return lesson
 
     # Persistence: the memory travels with the weights.
 

@@ -9,10 +9,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from lerobot.datasets import LeRobotDataset
 from lerobot.utils.constants import HF_LEROBOT_HOME
 
 from lerobot_openspm.configuration_openspm import OpenSPMConfig
+from lerobot_openspm.datasets import open_dataset
 from lerobot_openspm.errors import CalibrationError, DatasetError, PerceptionError
 from lerobot_openspm.experience import Experience
 from lerobot_openspm.flow.samples import perturbed, segment_frames
@@ -45,9 +45,7 @@ PERTURBED_COPIES = 3
 
 def open_demonstrations(dataset_meta: Any, config: OpenSPMConfig) -> Demonstrations:
     """The dataset behind LeRobot's metadata, read as mining reads it."""
-    dataset = LeRobotDataset(
-        dataset_meta.repo_id, root=dataset_meta.root, revision=dataset_meta.revision, video_backend="pyav"
-    )
+    dataset = open_dataset(dataset_meta)
     if config.state_layout is None or config.action_layout is None:
         config.set_dataset_feature_metadata(dataset_meta.features)
     return Demonstrations(dataset, *config.layouts())
@@ -110,6 +108,23 @@ def mine_experience(
     cameras: dict[str, Camera] | None = None,
     segmenter: Segmenter | None = None,
 ) -> Experience:
+    """Mine a dataset, and append what was mined to what is known already, as :func:`mine` does each.
+
+    Raises:
+        CalibrationError, DatasetError: See :func:`mine`.
+        MemoryFormatError: What is known comes from another robot.
+    """
+    mined = mine(dataset_meta, config, known, cameras, segmenter)
+    return known.appended(mined) if known else mined
+
+
+def mine(
+    dataset_meta: Any,
+    config: OpenSPMConfig,
+    known: Experience | None = None,
+    cameras: dict[str, Camera] | None = None,
+    segmenter: Segmenter | None = None,
+) -> Experience:
     """Mine a dataset's key poses, learn its objects, and make memory entries of it.
 
     Deterministic: every process of a distributed run mines the same.
@@ -117,7 +132,7 @@ def mine_experience(
     Args:
         dataset_meta: LeRobot's metadata of the dataset.
         config: The policy's configuration.
-        known: An experience to append to. Its objects are recognised by what is known of them.
+        known: An experience whose objects are recognised by what is known of them.
         cameras: Calibration to use where the configuration names no file.
         segmenter: Finds the objects' masks, where the configuration's segmentation is not "demonstrations".
 
@@ -154,11 +169,10 @@ def mine_experience(
         "mined %d entries from %d episodes (%d skipped); objects: %s",
         len(entries), len(mined.mined), len(mined.skipped), ", ".join(sorted(objects.models)),
     )  # fmt: skip
-    experience = Experience(
+    return Experience(
         entries, objects.models, robot, cameras, config.perception, names, config.segmentation, config.shape,
         config.layouts(),
     )  # fmt: skip
-    return known.appended(experience) if known else experience
 
 
 def _calibration(
