@@ -5,6 +5,7 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
 from lerobot_openspm.control.reference import MARGIN_M, OPPOSITE_THE_ROBOT, choose
+from lerobot_openspm.errors import InstructionError
 from lerobot_openspm.geometry import se3
 from lerobot_openspm.memory.entry import Reference
 
@@ -12,7 +13,7 @@ PLACES = st.lists(st.tuples(st.floats(-0.5, 0.5), st.floats(-0.5, 0.5)), min_siz
 AMONG = ["left", "right", "front", "back"]
 RELATIONS = [
     Reference("between", ("plate", "cup")),
-    *(Reference(name, ("plate",)) for name in ("next to", "on", "in", "under", *AMONG)),
+    *(Reference(name, ("plate",)) for name in ("next to", "center", "on", "in", "under", *AMONG)),
     *(Reference(name) for name in ("middle", *AMONG)),
 ]
 MARKS = {"plate": (0.1, 0.2), "cup": (-0.1, -0.1)}
@@ -98,7 +99,7 @@ def test_one_place_for_two_is_ambiguous_and_a_missing_landmark_decides_nothing(r
 
 def test_a_relation_that_cannot_be_told_is_an_error():
     for reference in (Reference("around", ("plate",)), Reference("between", ("plate",)), Reference("on")):
-        with pytest.raises(ValueError, match="expected one of back"):
+        with pytest.raises(InstructionError, match="expected one of back"):
             choose(reference, *scene([(0, 0), (1, 1)]))
 
 

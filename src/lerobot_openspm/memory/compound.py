@@ -7,20 +7,25 @@ demonstration shows as a whole is carried out by entries of its parts, one after
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 
 from lerobot_openspm.errors import InstructionError
-from lerobot_openspm.memory.entry import MemoryEntry, MemoryKeyPose, RetrievalKey, SubTask
+from lerobot_openspm.memory.entry import MemoryEntry, MemoryKeyPose, Reference, RetrievalKey, SubTask
 from lerobot_openspm.memory.instruction import parse_instruction
-from lerobot_openspm.memory.retrieval import MIN_SEMANTIC, semantic_candidates, semantic_score
+from lerobot_openspm.memory.retrieval import candidates_for
 
 # A sub-task takes hold of something and lets it go again.
 TRANSITIONS_PER_SUB_TASK = 2
 # Ways through free space; without the objects they are relative to, the hand finds another way.
 FREE_PHASES = ("approach", "lift", "pre-place", "retreat")
 # Relations that are not the preposition that one says.
-_PREPOSITIONS = {"front of": "to the front of", "left of": "to the left of", "right of": "to the right of",
-                 "at": "to"}  # fmt: skip
+_PREPOSITIONS = {
+    "front of": "to the front of", "left of": "to the left of", "right of": "to the right of", "at": "to",
+    "front": "in front of", "back": "behind", "left": "to the left of", "right": "to the right of",
+    "center": "in the middle of",
+}  # fmt: skip
+_VERBS = {"pick": "pick up"}
 
 
 @dataclass(frozen=True)
@@ -107,51 +112,62 @@ def plan_parts(instruction: str, entries: Sequence[MemoryEntry]) -> tuple[tuple[
             the error names the sub-task and lists what the memory knows.
     """
     asked = parse_instruction(instruction)
-    try:
-        whole = semantic_candidates(instruction, entries)
-    except InstructionError:
-        singles = [Candidate(part, 0.0, entry) for entry in entries for part in parts(entry)]
-        if len(asked) == 1 and not _about(asked, singles):
-            raise
-    else:
-        return (tuple(Candidate(entry, score, entry) for entry, score in whole),)
-    runs = [Candidate(entry, 0.0, entry) for entry in entries]
     chain: list[tuple[Candidate, ...]] = []
-    i = 0
-    while i < len(asked):
-        for end in range(len(asked), i, -1):
-            if found := _about(asked[i:end], runs if end > i + 1 else singles):
-                break
-        else:
-            raise _no_experience(instruction, asked[i], singles)
+    left = asked
+    while left:
+        said = instruction if len(asked) == 1 else phrase(left[0])
+        try:
+            found, n_sub_tasks = _longest_run(left, said, entries)
+        except InstructionError as error:
+            if len(asked) == 1:
+                raise
+            raise InstructionError(
+                f"{said!r} is a part of the instruction {instruction!r} that cannot be done: {error}"
+            ) from error
         chain.append(found)
-        i = end
+        left = left[n_sub_tasks:]
     return tuple(chain)
 
 
-def _about(asked: Sequence[SubTask], candidates: Sequence[Candidate]) -> tuple[Candidate, ...]:
-    """Those of some candidates that are about what is asked, with their score."""
-    scored = [replace(one, semantic=semantic_score(asked, one.entry.key.sub_tasks)) for one in candidates]
-    return tuple(one for one in scored if one.semantic >= MIN_SEMANTIC)
+def _longest_run(
+    asked: Sequence[SubTask], said: str, entries: Sequence[MemoryEntry]
+) -> tuple[tuple[Candidate, ...], int]:
+    """Candidates for the first sub-tasks, as many as were demonstrated together, and how many these are.
+
+    Raises:
+        InstructionError: There are none for the first one, which is called as ``said``.
+    """
+    whole = [Candidate(entry, 0.0, entry) for entry in entries]
+    for n_sub_tasks in range(len(asked), 0, -1):
+        with suppress(InstructionError):
+            return _about(asked[:n_sub_tasks], said, whole), n_sub_tasks
+    singles = [Candidate(part, 0.0, entry) for entry in entries for part in parts(entry)]
+    return _about(asked[:1], said, singles), 1
 
 
-def _no_experience(instruction: str, sub_task: SubTask, known: Sequence[Candidate]) -> InstructionError:
-    languages = "; ".join(sorted({one.entry.language for one in known})) or "nothing yet"
-    return InstructionError(
-        f"the memory holds no experience of {phrase(sub_task)!r}, which is a part of the instruction "
-        f"{instruction!r}; it knows: {languages}. Record demonstrations of that part and train again, or say "
-        "it by these instructions"
-    )
+def _about(sub_tasks: Sequence[SubTask], said: str, candidates: Sequence[Candidate]) -> tuple[Candidate, ...]:
+    """Those of some candidates that are about sub-tasks, with their score; InstructionError if none is."""
+    by_entry = {id(one.entry): one for one in candidates}
+    found = candidates_for(sub_tasks, said, [one.entry for one in candidates])
+    return tuple(replace(by_entry[id(entry)], semantic=score) for entry, score in found)
 
 
 def phrase(sub_task: SubTask) -> str:
     """A sub-task in words, as an instruction: "put the bowl in the top drawer of the cabinet"."""
+    verb = _VERBS.get(sub_task.operation, sub_task.operation)
     if not sub_task.landmark:
-        return f"{sub_task.operation} {_noun(sub_task.target, sub_task.part)}"
+        return f"{verb} {_noun(sub_task.target, sub_task.part, sub_task.target_where)}"
     preposition = _PREPOSITIONS.get(sub_task.relation, sub_task.relation)
-    landmark = _noun(sub_task.landmark, sub_task.part)
-    return f"{sub_task.operation} the {sub_task.target} {preposition} {landmark}"
+    target = _noun(sub_task.target, "", sub_task.target_where)
+    return f"{verb} {target} {preposition} {_noun(sub_task.landmark, sub_task.part, sub_task.landmark_where)}"
 
 
-def _noun(name: str, part: str) -> str:
-    return f"the {part} of the {name}" if part else f"the {name}"
+def _noun(name: str, part: str, where: Reference | None) -> str:
+    """An object with its part and with which of several it is: "the bowl next to the plate"."""
+    if where is not None and not where.landmarks:
+        name = f"{where.relation} {name}"
+    words = f"the {part} of the {name}" if part else f"the {name}"
+    if where is None or not where.landmarks:
+        return words
+    preposition = _PREPOSITIONS.get(where.relation, where.relation)
+    return f"{words} {preposition} the {' and the '.join(where.landmarks)}"

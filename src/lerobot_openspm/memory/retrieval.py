@@ -39,7 +39,17 @@ def semantic_candidates(instruction: str, entries: Sequence[MemoryEntry]) -> lis
     Raises:
         InstructionError: No entry is. The error lists the instructions the memory knows.
     """
-    sub_tasks = parse_instruction(instruction)
+    return candidates_for(parse_instruction(instruction), instruction, entries)
+
+
+def candidates_for(
+    sub_tasks: Sequence[SubTask], instruction: str, entries: Sequence[MemoryEntry]
+) -> list[tuple[MemoryEntry, float]]:
+    """Entries that are about some sub-tasks, with their ``S_sem``; the instruction only names them in errors.
+
+    Raises:
+        InstructionError: No entry is. The error lists the instructions the memory knows.
+    """
     scored = [(entry, semantic_score(sub_tasks, entry.key.sub_tasks)) for entry in entries]
     close = [(entry, score) for entry, score in scored if score >= MIN_SEMANTIC]
     if not close:
