@@ -10,6 +10,7 @@ from lerobot_openspm.control.transfer import (
     RETREAT_M,
     TransferLimits,
     check_transfer,
+    geometric_score,
     shape_deviation,
     transfer,
     transfer_pose,
@@ -199,3 +200,44 @@ def test_what_is_not_to_be_put_anywhere_is_not_let_go():
     memory = entry("open the top drawer of the bowl", key_poses=poses)
     targets = transfer(memory, memory.layout, {}, HOME)
     assert "release" not in [target.memory.phase for target in targets]
+
+
+def score(layout, memory=None, **limits):
+    return geometric_score(memory or entry(), layout, {}, HOME, robot(), TransferLimits(**limits))
+
+
+@given(st.floats(-0.1, 0.1), st.floats(-0.1, 0.1), st.floats(-0.3, 0.3))
+def test_a_scene_arranged_like_the_entrys_own_scores_one_wherever_it_is(x, y, yaw):
+    G = se3.from_yaw([x, y, 0.0], yaw)
+    assert score({name: G @ T for name, T in entry().layout.items()}) == pytest.approx(1)
+
+
+def test_an_object_that_is_missing_or_out_of_reach_scores_nothing():
+    layout = entry().layout
+    assert score({"bowl": layout["bowl"]}) == 0
+    assert score(layout | {"plate": se3.from_yaw([3.0, 0, 0], 0.0)}) == 0
+    assert score(layout, max_jump_m=0.05) == 0
+
+
+def test_the_less_like_the_entrys_own_arrangement_the_less_it_scores():
+    layout = entry().layout
+    shifts = [0.0, 0.05, 0.15, 0.3]
+    scores = [score(layout | {"plate": se3.from_yaw([-d, 0, 0], 0.0) @ layout["plate"]}) for d in shifts]
+    assert scores == sorted(scores, reverse=True)
+    assert len(set(scores)) == 4
+    turned = score(layout | {"plate": layout["plate"] @ se3.from_yaw(np.zeros(3), 0.5)})
+    assert 0 < turned < 1
+
+
+def test_objects_that_no_key_pose_is_relative_to_make_no_difference():
+    layout = entry().layout
+    assert score(layout | {"mug": se3.from_yaw([0.3, 0.3, 0], 1.0)}) == score(layout)
+
+
+def test_what_can_be_done_at_all_scores_something():
+    # A drawer that opens another way round from where the hand comes from: far from alike, yet possible.
+    pull = key_pose("cabinet", hand_pose(0.3, 0.0, 0.1), "open", closed=True)
+    take = key_pose("handle", hand_pose(0.0, 0.0, 0.1), "grasp", closed=True)
+    memory = entry(key_poses=[take, pull], layout={"cabinet": np.eye(4), "handle": np.eye(4)})
+    here = {"cabinet": np.eye(4), "handle": se3.from_yaw([-0.4, 0.0, 0.0], 2.0)}
+    assert 0 < score(here, memory, max_jump_m=9, max_jump_rad=9) < 0.01

@@ -172,6 +172,16 @@ def test_a_single_instruction_without_experience_is_refused_as_ever(instruction)
         plan_parts("put the bowl on the plate and turn on the stove", [])
 
 
+def test_what_may_mean_different_things_is_asked_back_alone_and_as_a_part():
+    cabinet = {"cabinet": np.eye(4)}
+    top = entry("open the top drawer of the cabinet", opened(), cabinet)
+    middle = entry("open the middle drawer of the cabinet", opened(), cabinet)
+    for instruction in ("open the drawer", "open the drawer and turn on the stove"):
+        with pytest.raises(InstructionError, match="did you mean"):
+            plan_parts(instruction, [top, middle, STOVE])
+        assert plan_parts(instruction, [top, STOVE])[0][0].source is top
+
+
 def test_parts_can_be_carried_over_to_a_scene():
     from lerobot_openspm.control.transfer import transfer
 

@@ -67,7 +67,7 @@ def choose(
         known = sorted(f"{name} ({count} landmarks)" for name, count in _costs(OPPOSITE_THE_ROBOT))
         raise InstructionError(
             f"cannot tell which object is {reference.relation!r} of {len(reference.landmarks)} landmarks; "
-            f"expected one of {', '.join(known)}"
+            f"expected one of {', '.join(known)}; say it by one of these"
         )
     if len(candidates) == 1:
         return 0

@@ -15,6 +15,7 @@ import numpy as np
 
 from lerobot_openspm.control.executor import Executor, Hand, Status
 from lerobot_openspm.control.knowledge import Knowledge
+from lerobot_openspm.control.referents import Referents, references
 from lerobot_openspm.control.transfer import Target, rise
 from lerobot_openspm.flow.condition import Query
 from lerobot_openspm.geometry import se3
@@ -84,6 +85,7 @@ class Row:
         self._parts: tuple[tuple[Candidate, ...], ...] = ()
         self._part = 0
         self._used: list[MemoryEntry] = []
+        self._referents = Referents()
         self._altered: set[str] = set()  # opened or turned: looks different now, and stands still
         self._start_height = np.inf
         self._step = -1
@@ -147,7 +149,8 @@ class Row:
     def _plan(self, hand: Hand, look: Look) -> None:
         """Plan the part that is to be carried out now, once its objects are found."""
         if not self._parts:
-            self._parts = plan_parts(self.instruction, self._knowledge.entries)
+            self._parts = plan_parts(self.instruction, self._knowledge.entries, self._knowledge.names)
+            self._refer()
             self._start_height = float(hand.T_world_ee[2, 3])
         self._see(self._sought(), hand, look)
         if self.status is Status.CAMERA_FAULT:
@@ -173,8 +176,14 @@ class Row:
     def _sought(self) -> list[str]:
         """Objects of this part, and of those to come, which it may hide; not what looks different now."""
         entries = [one.entry for part in self._parts[self._part :] for one in part]
-        names = dict.fromkeys(name for entry in entries for name in entry.objects)
+        needed = [name for entry in entries for name in entry.objects]
+        names = dict.fromkeys([*needed, *self._referents.landmarks])
         return [name for name in names if name not in self._altered]
+
+    def _refer(self) -> None:
+        """Take in which of several like objects this part is about."""
+        said = {name: where for one in self._parts[self._part] for name, where in references(one).items()}
+        self.tracker.forget(self._referents.hear(said))
 
     def _is_to_go_on(self) -> bool:
         """Whether a part is done that others follow."""
@@ -183,6 +192,7 @@ class Row:
     def _begin_next_part(self, hand: Hand, look: Look) -> None:
         """Look at what the hand has left behind, and go on from there."""
         self._part += 1
+        self._refer()
         logger.info("%r: part %d of %d", self.instruction, self._part + 1, len(self._parts))
         self.executor.finish_part()
         self._plan(hand, look)
@@ -244,7 +254,8 @@ class Row:
             if fault.seconds >= GIVE_UP_S:
                 logger.warning("%r: stopping, camera %r: %s", self.instruction, camera, fault.reason)
                 self.executor.stop(Status.CAMERA_FAULT)
-        return self.tracker.look(self.seen.estimates, hand.T_world_ee, waited_s)
+        meant = self._referents.sort_out(self.seen.estimates, self.tracker.poses(hand.T_world_ee))
+        return self.tracker.look(meant, hand.T_world_ee, waited_s)
 
     def _look_around(self, hand: Hand, look: Look) -> None:
         """Look at what the remaining key poses need and what is in the hand; act on what has changed."""

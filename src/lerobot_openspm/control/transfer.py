@@ -23,6 +23,10 @@ RETREAT_M = 0.06
 LEVEL_M = 0.02
 # How much a different way through free space counts beside a different way in contact.
 FREE_SPACE_SHARE = 0.2
+# An entry whose key poses lie this much differently to one another here counts as 1/e alike.
+SHAPE_SCALE_M = 0.1
+# An entry that can be executed at all scores at least this.
+MIN_USABLE_SCORE = 1e-3
 
 
 @dataclass(frozen=True)
@@ -213,3 +217,33 @@ def check_transfer(
             problems.append(f"{where} is {metres:.2f} m and {radians:.2f} rad from the one before")
         before = target.T_world_ee
     return problems
+
+
+def geometric_score(
+    entry: MemoryEntry,
+    layout: Mapping[str, Array],
+    yaw_periods: Mapping[str, float],
+    T_world_ee: Array,
+    robot: RobotModel,
+    limits: TransferLimits,
+) -> float:
+    """``S_geo`` in 0..1: whether an entry can be executed here, and how like its demonstration it would be.
+
+    0 where an object of its key poses was not found or the transferred key poses fail the checks. Else what
+    :func:`shape_deviation` makes of the arrangement: where the objects lie to one another as in the entry's
+    own layout, wherever that is, it is 1. Objects that no key pose is relative to make no difference.
+
+    Args:
+        entry: The entry.
+        layout: Present poses ``T_world_obj`` ``(4, 4)`` of the objects that were found.
+        yaw_periods: Angle by object that turns it into itself, radians; 0 for a body of revolution.
+        T_world_ee: Present hand pose ``(4, 4)``.
+        robot: The robot.
+        limits: Bounds of the checks.
+    """
+    if any(name not in layout for name in entry.objects):
+        return 0.0
+    targets = transfer(entry, layout, yaw_periods, T_world_ee)
+    if check_transfer(targets, T_world_ee, robot, limits):
+        return 0.0
+    return max(float(np.exp(-shape_deviation(entry, targets) / SHAPE_SCALE_M)), MIN_USABLE_SCORE)

@@ -23,7 +23,10 @@ OBJECT_POSES_SIZE = 7 * len(OBJECT_NAMES)
 @EnvConfig.register_subclass(SUITE_NAME)
 @dataclass
 class TabletopEnvConfig(EnvConfig):
-    """The embedded tabletop: `task` is a task name, a comma list of them, "all" (the ten) or "compound"."""
+    """The embedded tabletop: `task` is a task name, a comma list of them, or a selection.
+
+    The selections are "all" (the ten), "compound" and "two_bowls", see `envs.tasks`.
+    """
 
     task: str | None = "all"
     fps: int = 20

@@ -9,7 +9,7 @@ from gymnasium import spaces
 from scipy.spatial.transform import Rotation
 
 from lerobot_openspm.envs import scene
-from lerobot_openspm.envs.layout import sample_layout
+from lerobot_openspm.envs.layout import sample_layout, sample_two_bowls
 from lerobot_openspm.envs.recording import pose_names, pose_vector
 from lerobot_openspm.envs.simulator import TabletopSimulator
 from lerobot_openspm.envs.tasks import ANY_TASK, select_tasks
@@ -116,14 +116,16 @@ class TabletopEnv(gym.Env):
     def simulator(self) -> TabletopSimulator:
         """The physics behind this environment; made on first use, in the process that uses it."""
         if self._simulator is None:
-            self._simulator = TabletopSimulator()
+            self._simulator = TabletopSimulator(second_bowl=ANY_TASK[self.task].is_clear is not None)
         return self._simulator
 
     def reset(self, *, seed: int | None = None, options: dict | None = None) -> tuple[dict, dict[str, Any]]:
         """Draw a new layout from the seed; the options are those of Gymnasium and are not used."""
         super().reset(seed=seed)
         self._seed = seed
-        self.simulator.reset(sample_layout(self.np_random))
+        is_clear = ANY_TASK[self.task].is_clear
+        rng = self.np_random
+        self.simulator.reset(sample_layout(rng) if is_clear is None else sample_two_bowls(rng, is_clear))
         self._steps = self._held = 0
         return self._observe(), self._info("running")
 

@@ -1,6 +1,7 @@
 """The ten tasks: their instructions, and the physical predicates that say when one is done.
 
-Beside them, five tasks that are made of the ten: their parts can be demonstrated and the whole never is.
+Beside them, five tasks that are made of the ten: their parts can be demonstrated and the whole never is. And
+five of the ten's goals with a second bowl on the table: the instruction says which of the two is meant.
 """
 
 import math
@@ -10,7 +11,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from lerobot_openspm.envs import scene
+from lerobot_openspm.envs import scene, two_bowls
 
 if TYPE_CHECKING:
     from lerobot_openspm.envs.simulator import TabletopSimulator
@@ -102,12 +103,15 @@ class Task:
         instruction: What to say.
         is_done: Whether the goal is reached now.
         parts: Names of the tasks that it is made of, in the order of the instruction; none for the ten.
+        is_clear: Whether a layout with a second bowl leaves no doubt that the first one is meant; None where
+            there is one bowl.
     """
 
     name: str
     instruction: str
     is_done: Callable[["TabletopSimulator"], bool]
     parts: tuple[str, ...] = ()
+    is_clear: Callable[[two_bowls.Layout], bool] | None = None
 
     @property
     def max_steps(self) -> int:
@@ -195,13 +199,52 @@ COMPOUND_TASKS: dict[str, Task] = {
     )
 }
 COMPOUND_TASK_NAMES = tuple(COMPOUND_TASKS)
+
+
+def _of_two_bowls(
+    name: str, instruction: str, like: str, is_clear: Callable[[two_bowls.Layout], bool]
+) -> Task:
+    """A task of the ten, done with the one of two bowls that the instruction tells."""
+    return Task(name, instruction, TASKS[like].is_done, (like,), is_clear)
+
+
+# Not among "all" either: no demonstration shows two bowls.
+TWO_BOWL_TASKS: dict[str, Task] = {
+    task.name: task
+    for task in (
+        _of_two_bowls(
+            "bowl_next_to_rack_on_plate",
+            "pick up the bowl next to the rack and put it on the plate",
+            "bowl_on_plate",
+            two_bowls.next_to("rack"),
+        ),
+        _of_two_bowls(
+            "bowl_between_plate_and_box_on_stove",
+            "put the bowl between the plate and the cream cheese box on the stove",
+            "bowl_on_stove",
+            two_bowls.between("plate", "box"),
+        ),
+        _of_two_bowls(
+            "bowl_next_to_box_on_cabinet",
+            "pick up the bowl next to the cream cheese box and place it on top of the cabinet",
+            "bowl_on_cabinet",
+            two_bowls.next_to("box"),
+        ),
+        _of_two_bowls(
+            "left_bowl_on_plate", "put the left bowl on the plate", "bowl_on_plate", two_bowls.left
+        ),
+        _of_two_bowls(
+            "right_bowl_on_stove", "put the right bowl on the stove", "bowl_on_stove", two_bowls.right
+        ),
+    )
+}
 # Every task that can be named; the place of a name here is the task's number.
-ANY_TASK = {**TASKS, **COMPOUND_TASKS}
-SELECTIONS = {"all": TASK_NAMES, "compound": COMPOUND_TASK_NAMES}
+ANY_TASK = {**TASKS, **COMPOUND_TASKS, **TWO_BOWL_TASKS}
+SELECTIONS = {"all": TASK_NAMES, "compound": COMPOUND_TASK_NAMES, "two_bowls": tuple(TWO_BOWL_TASKS)}
 
 
 def select_tasks(spec: str) -> list[str]:
-    """Expand a task name, a comma list, "all" (the ten) or "compound" into task names, in the order given.
+    """Expand a task name, a comma list or a selection ("all": the ten) into task names, in the order given.
 
     Raises:
         ValueError: A name is unknown, or there is none.
@@ -213,6 +256,6 @@ def select_tasks(spec: str) -> list[str]:
     if unknown or not names:
         raise ValueError(
             f"unknown openspm_tabletop task {', '.join(unknown) or repr(spec)}; "
-            f"expected 'all', 'compound' or a comma list of: {', '.join(ANY_TASK)}"
+            f"expected {', '.join(map(repr, SELECTIONS))} or a comma list of: {', '.join(ANY_TASK)}"
         )
     return names

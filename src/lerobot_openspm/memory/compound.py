@@ -12,7 +12,10 @@ from dataclasses import dataclass, replace
 
 from lerobot_openspm.errors import InstructionError
 from lerobot_openspm.memory.entry import MemoryEntry, MemoryKeyPose, Reference, RetrievalKey, SubTask
+from lerobot_openspm.memory.indexed_entries import near
 from lerobot_openspm.memory.instruction import parse_instruction
+from lerobot_openspm.memory.meaning import semantic_score
+from lerobot_openspm.memory.names import TABLE_NAMES, NameSimilarity
 from lerobot_openspm.memory.retrieval import candidates_for
 
 # A sub-task takes hold of something and lets it go again.
@@ -23,7 +26,7 @@ FREE_PHASES = ("approach", "lift", "pre-place", "retreat")
 _PREPOSITIONS = {
     "front of": "to the front of", "left of": "to the left of", "right of": "to the right of", "at": "to",
     "front": "in front of", "back": "behind", "left": "to the left of", "right": "to the right of",
-    "center": "in the middle of",
+    "center": "in the center of",
 }  # fmt: skip
 _VERBS = {"pick": "pick up"}
 
@@ -36,11 +39,13 @@ class Candidate:
         entry: What is executed: an entry of the bank, or one sub-task of it.
         semantic: Its ``S_sem``.
         source: The entry of the bank.
+        asked: What of the instruction it carries out, one for each of the entry's sub-tasks.
     """
 
     entry: MemoryEntry
     semantic: float
     source: MemoryEntry
+    asked: tuple[SubTask, ...] = ()
 
 
 def sub_task_index(contact: int, phase: str, count: int) -> int:
@@ -101,23 +106,31 @@ def _sub_tasks_of(entry: MemoryEntry) -> list[int]:
     return served
 
 
-def plan_parts(instruction: str, entries: Sequence[MemoryEntry]) -> tuple[tuple[Candidate, ...], ...]:
+def plan_parts(
+    instruction: str, entries: Sequence[MemoryEntry], names: NameSimilarity = TABLE_NAMES
+) -> tuple[tuple[Candidate, ...], ...]:
     """What an instruction can be carried out by: for each part, in order, the entries that are about it.
 
     An entry that was demonstrated as a whole wins; then it is one part. Else the parts are the longest runs
     of sub-tasks that were demonstrated together, a single one also as a part of something else.
+
+    Args:
+        instruction: What is asked.
+        entries: The memory.
+        names: Says which names mean the same thing.
 
     Raises:
         InstructionError: The instruction cannot be read, or there is no experience of one of its sub-tasks;
             the error names the sub-task and lists what the memory knows.
     """
     asked = parse_instruction(instruction)
+    entries = near(asked, entries, semantic_score)
     chain: list[tuple[Candidate, ...]] = []
     left = asked
     while left:
         said = instruction if len(asked) == 1 else phrase(left[0])
         try:
-            found, n_sub_tasks = _longest_run(left, said, entries)
+            found = _longest_run(left, said, entries, names)
         except InstructionError as error:
             if len(asked) == 1:
                 raise
@@ -125,31 +138,34 @@ def plan_parts(instruction: str, entries: Sequence[MemoryEntry]) -> tuple[tuple[
                 f"{said!r} is a part of the instruction {instruction!r} that cannot be done: {error}"
             ) from error
         chain.append(found)
-        left = left[n_sub_tasks:]
+        left = left[len(found[0].asked) :]
     return tuple(chain)
 
 
 def _longest_run(
-    asked: Sequence[SubTask], said: str, entries: Sequence[MemoryEntry]
-) -> tuple[tuple[Candidate, ...], int]:
-    """Candidates for the first sub-tasks, as many as were demonstrated together, and how many these are.
+    asked: Sequence[SubTask], said: str, entries: Sequence[MemoryEntry], names: NameSimilarity
+) -> tuple[Candidate, ...]:
+    """Candidates for the first sub-tasks, for as many as were demonstrated together.
 
     Raises:
-        InstructionError: There are none for the first one, which is called as ``said``.
+        InstructionError: There are none for the first one, which is called as ``said``, or entries about
+            different things fit it as well.
     """
     whole = [Candidate(entry, 0.0, entry) for entry in entries]
     for n_sub_tasks in range(len(asked), 0, -1):
         with suppress(InstructionError):
-            return _about(asked[:n_sub_tasks], said, whole), n_sub_tasks
+            return _about(asked[:n_sub_tasks], said, whole, names)
     singles = [Candidate(part, 0.0, entry) for entry in entries for part in parts(entry)]
-    return _about(asked[:1], said, singles), 1
+    return _about(asked[:1], said, singles, names)
 
 
-def _about(sub_tasks: Sequence[SubTask], said: str, candidates: Sequence[Candidate]) -> tuple[Candidate, ...]:
-    """Those of some candidates that are about sub-tasks, with their score; InstructionError if none is."""
+def _about(
+    asked: Sequence[SubTask], said: str, candidates: Sequence[Candidate], names: NameSimilarity
+) -> tuple[Candidate, ...]:
+    """Those of some candidates that are about what is asked, with their score; InstructionError if none."""
     by_entry = {id(one.entry): one for one in candidates}
-    found = candidates_for(sub_tasks, said, [one.entry for one in candidates])
-    return tuple(replace(by_entry[id(entry)], semantic=score) for entry, score in found)
+    found = candidates_for(asked, said, [one.entry for one in candidates], names)
+    return tuple(replace(by_entry[id(e)], semantic=score, asked=tuple(asked)) for e, score in found)
 
 
 def phrase(sub_task: SubTask) -> str:
@@ -159,15 +175,15 @@ def phrase(sub_task: SubTask) -> str:
         return f"{verb} {_noun(sub_task.target, sub_task.part, sub_task.target_where)}"
     preposition = _PREPOSITIONS.get(sub_task.relation, sub_task.relation)
     target = _noun(sub_task.target, "", sub_task.target_where)
-    return f"{verb} {target} {preposition} {_noun(sub_task.landmark, sub_task.part, sub_task.landmark_where)}"
+    landmark = _noun(sub_task.landmark, sub_task.part, sub_task.landmark_where)
+    return f"{verb} {target} {preposition} {landmark}"
 
 
 def _noun(name: str, part: str, where: Reference | None) -> str:
-    """An object with its part and with which of several it is: "the bowl next to the plate"."""
+    told = f"the {name}"
     if where is not None and not where.landmarks:
-        name = f"{where.relation} {name}"
-    words = f"the {part} of the {name}" if part else f"the {name}"
-    if where is None or not where.landmarks:
-        return words
-    preposition = _PREPOSITIONS.get(where.relation, where.relation)
-    return f"{words} {preposition} the {' and the '.join(where.landmarks)}"
+        told = f"the {where.relation} {name}"
+    elif where is not None:
+        preposition = _PREPOSITIONS.get(where.relation, where.relation)
+        told = f"the {name} {preposition} {' and '.join(f'the {landmark}' for landmark in where.landmarks)}"
+    return f"the {part} of {told}" if part else told

@@ -36,7 +36,7 @@ from lerobot_openspm.perception.learning import Shape, learn_objects
 from lerobot_openspm.perception.localise import localise_all
 from lerobot_openspm.perception.model import KnownObject
 from lerobot_openspm.perception.object_shape import ShapeBackend
-from lerobot_openspm.perception.types import Hint, Scene, Segmenter
+from lerobot_openspm.perception.types import Hint, PoseEstimate, Scene, Segmenter
 
 logger = logging.getLogger(__name__)
 
@@ -158,8 +158,20 @@ def layouts_in_scenes(
         wanted = dict.fromkeys(name for sub_task in item.sub_tasks for name in sub_task.objects)
         sought = {name: models[name] for name in wanted if name in models}
         estimates = localise_all(scene.views, sought, segmenter)
-        layouts.append({name: e.T_world_obj for name, e in estimates.items() if e.status == "found"})
+        places = {name: _place(name, estimate, scene.hints) for name, estimate in estimates.items()}
+        layouts.append({name: T for name, T in places.items() if T is not None})
     return LearnedObjects(models, layouts)
+
+
+def _place(name: str, estimate: PoseEstimate, touched: Sequence[Hint]) -> Array | None:
+    """Where an object is; of several that look alike, the one that the hand went to. None if unknown."""
+    points = [hint.point_world[:2] for hint in touched if hint.name == name]
+    if estimate.status == "not_found" or (estimate.status == "ambiguous" and not points):
+        return None
+    if not estimate.others or not points:
+        return estimate.T_world_obj
+    places = (estimate.T_world_obj, *estimate.others)
+    return min(places, key=lambda T: float(np.linalg.norm(np.asarray(points) - T[:2, 3], axis=1).min()))
 
 
 def oracle_layouts(

@@ -183,6 +183,11 @@ class Tracker:
             if name in self._tracks:
                 self._tracks[name].doubted = True
 
+    def forget(self, names: Iterable[str]) -> None:
+        """These names stand for other objects from now on."""
+        for name in names:
+            self._tracks.pop(name, None)
+
     @property
     def held(self) -> frozenset[str]:
         """Objects that the hand carries."""

@@ -1,0 +1,147 @@
+"""`openspm memory list | show`: a memory in words and numbers that a person can read."""
+
+from __future__ import annotations
+
+import json
+from collections import Counter
+from dataclasses import dataclass
+from itertools import islice
+from pathlib import Path
+
+import draccus
+import numpy as np
+
+from lerobot_openspm.errors import OpenSPMError
+from lerobot_openspm.experience import load_experience
+from lerobot_openspm.geometry import se3
+from lerobot_openspm.memory.entry import MemoryEntry, MemoryKeyPose
+
+
+@dataclass
+class ListConfig:
+    """List what a memory holds.
+
+    Args:
+        path: Folder of the checkpoint or of a mined memory.
+        instruction: List only entries whose instruction contains this.
+        tasks: List tasks, with the number and mean quality of their entries, instead of entries.
+        all: List superseded entries too: those that were replaced, merged or removed.
+        limit: List at most this many.
+    """
+
+    path: str = "outputs/memory"
+    instruction: str = ""
+    tasks: bool = False
+    all: bool = False
+    limit: int = 50
+
+
+@dataclass
+class ShowConfig:
+    """Show entries of a memory with all their numbers.
+
+    Args:
+        path: Folder of the checkpoint or of a mined memory.
+        source: Show only entries that come from this dataset and episode, as ``list`` names them.
+        instruction: Show only entries whose instruction contains this.
+        limit: Show at most this many entries.
+    """
+
+    path: str = "outputs/memory"
+    source: str = ""
+    instruction: str = ""
+    limit: int = 10
+
+
+def list_entries(args: list[str]) -> None:
+    """Print a line for every entry or task, then one JSON object."""
+    config = draccus.parse(ListConfig, args=args)
+    experience = load_experience(Path(config.path))
+    listed = [entry for entry in experience.entries if config.instruction in entry.language]
+    lines = _task_lines(listed) if config.tasks else [_line(entry) for entry in listed]
+    if config.all:
+        old = [entry for entry in experience.superseded if config.instruction in entry.language]
+        lines += [f"{_line(entry)}  superseded" for entry in old]
+    for line in lines[: config.limit]:
+        print(line)
+    if len(lines) > config.limit:
+        print(f"... {len(lines) - config.limit} more; --limit={len(lines)} lists all")
+    per_task = Counter(entry.language for entry in listed)
+    counts = {"entries": len(experience.entries), "superseded": len(experience.superseded)}
+    print(json.dumps({**counts, "listed": len(listed), "per_task": per_task}))
+
+
+def show(args: list[str]) -> None:
+    """Print entries with all their numbers, then one JSON object."""
+    config = draccus.parse(ShowConfig, args=args)
+    experience = load_experience(Path(config.path))
+    wanted = (
+        entry
+        for entry in experience.entries
+        if config.instruction in entry.language and config.source in ("", entry.source)
+    )
+    shown = list(islice(wanted, config.limit))
+    if config.source and not shown:
+        raise OpenSPMError(
+            f"the memory at {config.path} holds nothing from {config.source!r}; `openspm memory list "
+            f"--path={config.path}` lists what it holds"
+        )
+    for entry in shown:
+        print("\n".join(table(entry)), end="\n\n")
+    print(json.dumps({"entries": len(experience.entries), "shown": len(shown)}))
+
+
+def _line(entry: MemoryEntry) -> str:
+    outcomes = f"{entry.successes} of {entry.trials}" if entry.trials else "-"
+    return (
+        f"quality {entry.quality:.2f}  succeeded {outcomes:>9s}  version {entry.version}  "
+        f"{len(entry.key_poses):2d} key poses  {entry.source}  {entry.language!r}"
+    )
+
+
+def _task_lines(entries: list[MemoryEntry]) -> list[str]:
+    tasks: dict[str, list[MemoryEntry]] = {}
+    for entry in entries:
+        tasks.setdefault(entry.language, []).append(entry)
+    return [
+        f"{len(members):6d} entries  mean quality {np.mean([e.quality for e in members]):.2f}  {language!r}"
+        for language, members in tasks.items()
+    ]
+
+
+def table(entry: MemoryEntry) -> list[str]:
+    """An entry as lines: a head, then a row for every key pose."""
+    outcomes = f", succeeded {entry.successes} of {entry.trials} times" if entry.trials else ""
+    head = (
+        f"{entry.language!r} from {entry.source}, version {entry.version}, quality {entry.quality:.2f}"
+        f"{outcomes}"
+    )
+    names = f"{'phase':10s} {'place':18s} {'axes':18s}"
+    columns = f"  {names} {'hand in its frame, mm':>24s} {'turn, deg':>22s} gripper conf."
+    return [head, columns, *(_row(pose) for pose in entry.key_poses)]
+
+
+def _row(pose: MemoryKeyPose) -> str:
+    mm = " ".join(f"{1000 * x:7.1f}" for x in pose.T_obj_ee[:3, 3])
+    deg = " ".join(f"{np.rad2deg(x):6.1f}" for x in se3.log_so3(pose.T_obj_ee[:3, :3]))
+    gripper = "closed" if pose.closed else "open"
+    names = f"{pose.phase:10s} {pose.anchor.place:18s} {pose.anchor.axes:18s}"
+    notes = f"{_constraint(pose)}{_spread(pose)}"
+    return f"  {names} {mm:>24s} {deg:>22s} {gripper:7s} {pose.confidence:.2f}{notes}"
+
+
+def _constraint(pose: MemoryKeyPose) -> str:
+    if pose.axis is None:
+        return ""
+    along = " ".join(f"{x:.2f}" for x in pose.axis.direction)
+    if pose.axis.kind == "slide":
+        return f"  slides {1000 * pose.axis.amount:.0f} mm along {along}"
+    return f"  turns {np.rad2deg(pose.axis.amount):.0f} deg about {along}"
+
+
+def _spread(pose: MemoryKeyPose) -> str:
+    if pose.covariance is None:
+        return ""
+    std = np.sqrt(np.diag(pose.covariance))
+    mm, deg = (" ".join(f"{x:.1f}" for x in part) for part in (1000 * std[:3], np.rad2deg(std[3:])))
+    return f"  spread {mm} mm, {deg} deg"

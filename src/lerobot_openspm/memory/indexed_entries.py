@@ -1,0 +1,179 @@
+"""The entries of a large bank, of which a retrieval reads only those whose keys are near what is asked.
+
+Semantic candidates first, geometric feasibility after, as the paper outlines: the index finds the nearest
+keys, they are scored exactly, and of the best keys the best entries are handed on to be scored in the scene.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from typing import Protocol, overload, runtime_checkable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lerobot_openspm.geometry.se3 import Array
+from lerobot_openspm.memory.entry import MemoryEntry, SubTask
+from lerobot_openspm.memory.index import Indices, make_index
+from lerobot_openspm.memory.key_vector import Vectors, key_vectors
+
+logger = logging.getLogger(__name__)
+
+# Banks of more entries are indexed; to score fewer takes no longer than a look at the scene.
+INDEX_FROM = 1000
+# Keys that the index finds for each part of an instruction.
+NEAREST_KEYS = 64
+# Of the entries of one key, so many are handed on, the best by quality; and so many in all.
+ENTRIES_PER_KEY, ENTRIES_IN_ALL = 64, 256
+
+Key = tuple[SubTask, ...]
+# S_sem of what is asked and what is known.
+Score = Callable[[Sequence[SubTask], Sequence[SubTask]], float]
+
+
+@runtime_checkable
+class HasColumns(Protocol):
+    """A bank that keeps vectors and qualities as columns, so that its entries need not be read for them.
+
+    The vectors only tell which entries have equal keys; one of each is read and compared with its vector, and
+    vectors of another release or another bank are not used.
+    """
+
+    def key_vectors(self) -> Vectors:
+        """:func:`lerobot_openspm.memory.key_vector.key_vector` of every entry, ``(n, 64)``."""
+        ...
+
+    def qualities(self) -> Array:
+        """Quality of every entry ``(n,)``."""
+        ...
+
+
+class IndexedEntries(Sequence[MemoryEntry]):
+    """Entries with an index over their keys, and over the sub-tasks of keys that have several.
+
+    Args:
+        entries: The bank. If it :class:`HasColumns`, one entry of every different key is read, else all are.
+        where: Names the bank in errors.
+
+    Raises:
+        MemoryFormatError: An entry cannot be read.
+    """
+
+    def __init__(self, entries: Sequence[MemoryEntry], where: str = "the memory"):
+        self._entries = entries
+        keys, numbers, qualities = _columns(entries, where)
+        # Entries by key, the best of each first.
+        self._order = np.lexsort((np.arange(len(entries)), -qualities, numbers))
+        self._ends = np.searchsorted(numbers[self._order], np.arange(len(keys) + 1))
+        # The rows of the index: every key, and every sub-task of those that have several; whose it is.
+        self._rows: dict[Key, list[int]] = {key: [] for key in keys}
+        for number, key in enumerate(keys):
+            for row in dict.fromkeys([key, *((sub_task,) for sub_task in key if len(key) > 1)]):
+                self._rows.setdefault(row, []).append(number)
+        self._row_keys, self._keys = list(self._rows), keys
+        self._index = make_index(key_vectors(self._row_keys), where)
+
+    def __len__(self) -> int:
+        return len(self._entries)
+
+    @overload
+    def __getitem__(self, item: int) -> MemoryEntry: ...
+    @overload
+    def __getitem__(self, item: slice) -> Sequence[MemoryEntry]: ...
+    def __getitem__(self, item: int | slice) -> MemoryEntry | Sequence[MemoryEntry]:
+        return self._entries[item]
+
+    def near(self, asked: Sequence[SubTask], score: Score) -> list[MemoryEntry]:
+        """The entries of the keys nearest to what is asked, and to every part of it; the best key first.
+
+        For each part these are entries whose whole key is near, and entries of which one sub-task is: of
+        either about :data:`ENTRIES_IN_ALL` at most, and of one key the best by quality, at least one and at
+        most :data:`ENTRIES_PER_KEY`.
+
+        Args:
+            asked: The sub-tasks of an instruction.
+            score: ``S_sem``, by which the keys are ranked that the index finds.
+        """
+        runs = [tuple(asked[i:j]) for i in range(len(asked)) for j in range(len(asked), i, -1)]
+        _, found = self._index.search(key_vectors(runs), NEAREST_KEYS)
+        entries: dict[int, None] = {}
+        for run, rows in zip(runs, found, strict=True):
+            keys = [self._row_keys[int(row)] for row in rows[rows >= 0]]
+            keys = sorted(keys, key=lambda key: -score(run, key))
+            owners = [(key, number) for key in keys for number in self._rows[key][:NEAREST_KEYS]]
+            wholes = [number for key, number in owners if len(self._keys[number]) == len(key)]
+            parts = [number for key, number in owners if len(self._keys[number]) > len(key) == len(run)]
+            entries |= dict.fromkeys([*self._best_entries(wholes), *self._best_entries(parts)])
+        return [self._entries[i] for i in entries]
+
+    def _best_entries(self, ranked: Sequence[int]) -> Iterator[int]:
+        """The best entry of each key, and as many more as there is room for, of the first keys first."""
+        left = max(0, ENTRIES_IN_ALL - len(ranked))
+        for number in ranked:
+            begin, end = self._ends[number], self._ends[number + 1]
+            more = min(end - begin, ENTRIES_PER_KEY, 1 + left) - 1
+            left -= more
+            yield from (int(i) for i in self._order[begin : begin + 1 + more])
+
+
+def indexed(entries: Sequence[MemoryEntry], where: str = "the memory") -> Sequence[MemoryEntry]:
+    """The entries with an index, if there are many; else as they are."""
+    if len(entries) <= INDEX_FROM or isinstance(entries, IndexedEntries):
+        return entries
+    return IndexedEntries(entries, where)
+
+
+def near(asked: Sequence[SubTask], entries: Sequence[MemoryEntry], score: Score) -> Sequence[MemoryEntry]:
+    """The entries to be considered for what is asked: of indexed ones the nearest, else all.
+
+    Args:
+        asked: The sub-tasks of an instruction.
+        entries: A bank, as :func:`indexed` gave it.
+        score: ``S_sem``.
+    """
+    return entries.near(asked, score) if isinstance(entries, IndexedEntries) else entries
+
+
+def _columns(
+    entries: Sequence[MemoryEntry], where: str
+) -> tuple[list[Key], NDArray[np.int64], NDArray[np.float64]]:
+    """The different keys, which of them each entry has ``(n,)``, and the entries' qualities ``(n,)``."""
+    if not isinstance(entries, HasColumns):
+        return _read_columns(entries)
+    vectors, qualities = entries.key_vectors(), np.asarray(entries.qualities(), float)
+    numbers, firsts = equal_rows(vectors)
+    keys = [entries[int(i)].key.sub_tasks for i in firsts]
+    # Up to the rounding of another machine's arithmetic.
+    if np.allclose(key_vectors(keys), vectors[firsts], atol=1e-5):
+        return keys, numbers, qualities
+    logger.warning(
+        "%s: its key vectors are not those of its entries, so all %d are read; write it again with this "
+        "release to load it quicker",
+        where,
+        len(entries),
+    )
+    return _read_columns(entries)
+
+
+def _read_columns(
+    entries: Iterable[MemoryEntry],
+) -> tuple[list[Key], NDArray[np.int64], NDArray[np.float64]]:
+    table: dict[Key, int] = {}
+    rows = [(table.setdefault(entry.key.sub_tasks, len(table)), entry.quality) for entry in entries]
+    numbers, qualities = np.array(rows, float).reshape(-1, 2).T
+    return list(table), numbers.astype(np.int64), qualities
+
+
+def equal_rows(vectors: Vectors) -> tuple[Indices, Indices]:
+    """Number the different rows of ``(n, 64)`` by first appearance.
+
+    Returns:
+        Number of every row's value ``(n,)``, and the first row ``(u,)`` of every value.
+    """
+    blob, width = np.ascontiguousarray(vectors).tobytes(), vectors.shape[1] * vectors.itemsize
+    table: dict[bytes, int] = {}
+    rows = (blob[i * width : (i + 1) * width] for i in range(len(vectors)))
+    numbers = np.fromiter((table.setdefault(row, len(table)) for row in rows), np.int64, len(vectors))
+    firsts = np.unique(numbers, return_index=True)[1] if len(numbers) else np.zeros(0, np.int64)
+    return numbers, np.asarray(firsts, np.int64)

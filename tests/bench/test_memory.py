@@ -1,0 +1,66 @@
+"""`openspm bench memory` on few entries."""
+
+import json
+
+import numpy as np
+import pytest
+from tests.cli.conftest import openspm  # noqa: F401
+
+from lerobot_openspm.bench.synthetic_bank import synthetic_experience
+from lerobot_openspm.bench.synthetic_keys import distinct_keys, said_otherwise
+from lerobot_openspm.memory import index
+from lerobot_openspm.memory.key_vector import key_vector
+
+KEYS = ("entries", "query_ms_p50", "query_ms_p99", "recall", "load_s_100k", "exact_10k_ms_p50")
+
+
+def test_it_prints_what_it_measured(openspm, monkeypatch):  # noqa: F811
+    monkeypatch.setattr(index, "EXACT_LIMIT", 2000)
+    code, out, err = openspm(
+        "bench", "memory", "--entries=3000", "--queries=50", "--loaded=200", "--threads=1"
+    )
+    assert code == 0, err
+    measured = json.loads(out.splitlines()[-1])
+    assert tuple(measured)[: len(KEYS)] == KEYS
+    assert (measured["entries"], measured["queries"]) == (3000, 50)
+    assert measured["tasks"]["index"] == measured["uniform"]["index"] == "faiss"
+    assert 0 < measured["query_ms_p50"] <= measured["query_ms_p99"]
+    assert measured["recall"] > 0.9
+    assert measured["tasks"]["semantic_recall"] > 0.9
+    assert measured["load_s_100k"] > 0
+    assert measured["exact_10k_ms_p50"] > 0
+
+
+def test_options_are_checked(openspm):  # noqa: F811
+    code, _, err = openspm("bench", "memory", "--queries=0")
+    assert code == 2
+    assert "queries is 0, expected at least 1" in err
+
+
+def test_made_up_keys_are_different_and_repeatable():
+    keys = distinct_keys(500, np.random.default_rng(1))
+    assert len(set(keys)) == 500
+    assert keys == distinct_keys(500, np.random.default_rng(1))
+    assert {len(key) for key in keys} == {1, 2}
+
+
+def test_what_is_said_otherwise_is_near_but_not_always_the_same():
+    rng = np.random.default_rng(0)
+    keys = distinct_keys(300, rng)
+    asked = [said_otherwise(key, rng) for key in keys]
+    same = np.mean([a == b for a, b in zip(keys, asked, strict=True)])
+    cosines = [key_vector(a) @ key_vector(b) for a, b in zip(keys, asked, strict=True)]
+    assert 0.1 < same < 0.9
+    assert np.min(cosines) > 0.5
+    assert np.median(cosines) < 1
+
+
+def test_made_up_entries_are_like_mined_ones():
+    experience = synthetic_experience(250, np.random.default_rng(0))
+    assert len(experience.entries) == 250
+    assert len({entry.key.sub_tasks for entry in experience.entries}) == 3
+    assert len({entry.source for entry in experience.entries}) == 250
+    for entry in experience.entries:
+        assert set(entry.objects) == set(entry.layout)
+        assert len(entry.key_poses) == 8
+        assert entry.key_poses[0].T_obj_ee[3].tolist() == pytest.approx([0, 0, 0, 1])

@@ -1,0 +1,88 @@
+"""`openspm memory search`, typed as a user types it, on the tests' small checkpoint."""
+
+import json
+from pathlib import Path
+
+import pytest
+from tests.cli.conftest import Openspm
+
+BOWL = "put the bowl on the plate"
+
+
+def search(openspm: Openspm, *arguments: str) -> tuple[str, dict]:
+    code, out, _ = openspm("memory", "search", *arguments)
+    assert code == 0
+    *lines, last = out.splitlines()
+    return "\n".join(lines), json.loads(last)
+
+
+def test_without_a_scene_two_terms_are_shown(openspm: Openspm, checkpoint: Path):
+    text, found = search(openspm, "place the bowl onto the plate", f"--path={checkpoint}", "--limit=2")
+    assert "asked: operation: put, target: bowl, relation: on, landmark: plate" in text
+    assert text.count("'put the bowl on the plate' from local/openspm_tabletop#") == 2
+    assert "turn on the stove" not in text
+    assert (found["considered"], found["refusal"], found["status"], found["objects"]) == (3, None, None, {})
+    for hit in found["entries"]:
+        assert hit["geometric"] is None
+        assert hit["total"] == pytest.approx(hit["semantic"] + 0.5 * hit["quality"])
+    assert f"{found['entries'][0]['total']:.3f}  1.000      - " in text
+
+
+def test_in_a_scene_all_three_are_and_the_scenes_own_demonstration_fits_best(
+    openspm: Openspm, checkpoint: Path, tiny_dataset: Path
+):
+    scene = (f"--path={checkpoint}", f"--dataset.root={tiny_dataset}", "--episode=1")
+    text, found = search(openspm, BOWL, *scene)
+    assert found["objects"] == {"bowl": True, "plate": True}
+    assert "objects: bowl found, plate found" in text
+    assert found["status"] == "running"
+    considered = found["entries"][: found["considered"]]
+    assert len(considered) == 3
+    best = max(considered, key=lambda hit: hit["geometric"])
+    assert best["source"].endswith("#1")
+    assert 0.9 < best["geometric"] <= 1
+    for hit in considered:
+        terms = hit["semantic"] + 0.5 * hit["geometric"] + 0.5 * hit["quality"]
+        assert hit["total"] == pytest.approx(terms)
+        assert f"{hit['geometric']:.3f}" in text
+    assert [hit["geometric"] for hit in found["entries"][3:]] == [None]
+
+
+def test_what_the_policy_refuses_says_why_and_what_is_nearest(
+    openspm: Openspm, checkpoint: Path, tiny_dataset: Path
+):
+    for scene in ([], [f"--dataset.root={tiny_dataset}"]):
+        text, found = search(openspm, "put the bowl on the rack", f"--path={checkpoint}", *scene)
+        assert found["considered"] == 0
+        assert "holds no experience for the instruction 'put the bowl on the rack'" in found["refusal"]
+        assert f"refused: {found['refusal']}" in text
+        assert found["entries"][0]["language"] == BOWL
+        assert [hit["geometric"] for hit in found["entries"]] == [None, None]
+
+
+def test_a_mined_memory_can_be_searched_too(openspm: Openspm, checkpoint: Path, tmp_path: Path):
+    for file in ("memory.json", "memory.safetensors", "cameras.json"):
+        (tmp_path / file).write_bytes((checkpoint / file).read_bytes())
+    assert search(openspm, BOWL, f"--path={tmp_path}") == search(openspm, BOWL, f"--path={checkpoint}")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ((), "search for what? expected an instruction in quotes before the options"),
+        ((BOWL, "--path=nowhere"), "no memory at nowhere"),
+        (("sing a song",), "sing a song"),
+        ((BOWL, "--dataset.root=nowhere"), "no dataset at --dataset.root=nowhere"),
+        ((BOWL, "--dataset.root={dataset}", "--episode=6"), "has episodes 0 to 5, got --episode=6"),
+        ((BOWL, "--dataset.root={dataset}", "--frame=-1"), "got --frame=-1"),
+    ],
+)
+def test_mistakes_are_one_line(
+    openspm: Openspm, checkpoint: Path, tiny_dataset: Path, arguments: tuple[str, ...], message: str
+):
+    arguments = tuple(argument.format(dataset=tiny_dataset) for argument in arguments)
+    path = [] if any(argument.startswith("--path") for argument in arguments) else [f"--path={checkpoint}"]
+    code, out, err = openspm("memory", "search", *arguments, *path)
+    assert (code, out) == (2, "")
+    assert err.splitlines()[-1].startswith("openspm memory: ")
+    assert message in err.splitlines()[-1]

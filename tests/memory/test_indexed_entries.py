@@ -1,0 +1,175 @@
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from tests.memory.builders import entry
+
+from lerobot_openspm.bench.synthetic_keys import distinct_keys, said_otherwise
+from lerobot_openspm.errors import InstructionError
+from lerobot_openspm.memory import indexed_entries as module
+from lerobot_openspm.memory.entry import RetrievalKey
+from lerobot_openspm.memory.indexed_entries import (
+    ENTRIES_IN_ALL,
+    ENTRIES_PER_KEY,
+    INDEX_FROM,
+    IndexedEntries,
+    equal_rows,
+    indexed,
+    near,
+)
+from lerobot_openspm.memory.instruction import parse_instruction
+from lerobot_openspm.memory.key_vector import key_vectors
+from lerobot_openspm.memory.retrieval import MIN_SEMANTIC, semantic_candidates, semantic_score
+
+BOWL, STOVE = "put the bowl on the plate", "turn on the stove"
+DRAWER = "open the top drawer and put the bowl inside"
+
+
+def bank_of(keys, qualities=None):
+    """An entry for every key, numbered in its source."""
+    template = entry()
+    qualities = np.linspace(0, 1, len(keys)) if qualities is None else qualities
+    return [
+        replace(template, key=RetrievalKey(key, ("approach",)), quality=float(quality), source=f"bank#{i}")
+        for i, (key, quality) in enumerate(zip(keys, qualities, strict=True))
+    ]
+
+
+def sources(entries):
+    return [one.source for one in entries]
+
+
+@pytest.fixture(scope="module")
+def many():
+    return bank_of(distinct_keys(INDEX_FROM + 500, np.random.default_rng(0)))
+
+
+class Columns(list):
+    """A bank with columns, which remembers which entries were read."""
+
+    def __init__(self, entries):
+        super().__init__(entries)
+        self.read = []
+
+    def key_vectors(self):
+        return key_vectors([one.key.sub_tasks for one in self])
+
+    def qualities(self):
+        return np.array([one.quality for one in list.__iter__(self)])
+
+    def __getitem__(self, i):
+        self.read.append(i)
+        return list.__getitem__(self, i)
+
+
+def test_it_is_the_sequence_it_indexes(many):
+    bank = IndexedEntries(many)
+    assert len(bank) == len(many)
+    assert bank[3] is many[3]
+    assert bank[2:5] == many[2:5]
+    assert list(bank) == many
+
+
+def test_small_banks_are_left_as_they_are(many):
+    few = tuple(many[:INDEX_FROM])
+    assert indexed(few) is few
+    assert near(parse_instruction(BOWL), few, semantic_score) is few
+    bank = indexed(many)
+    assert isinstance(bank, IndexedEntries)
+    assert indexed(bank) is bank
+
+
+def test_the_best_by_meaning_is_near_however_it_is_said(many):
+    rng = np.random.default_rng(1)
+    bank, reached = IndexedEntries(many), []
+    for i in rng.integers(len(many), size=40):
+        asked = said_otherwise(many[i].key.sub_tasks, rng)
+        best = max(semantic_score(asked, one.key.sub_tasks) for one in many)
+        found = bank.near(asked, semantic_score)
+        reached.append(max(semantic_score(asked, one.key.sub_tasks) for one in found) == best)
+    assert np.mean(reached) >= 0.95
+
+
+def test_retrieval_is_that_of_all_entries(many):
+    known = [*many, entry(BOWL), entry(STOVE), entry("put the bowl next to the plate")]
+    expected, found = (semantic_candidates(BOWL, bank) for bank in (known, indexed(known)))
+    order = lambda pairs: sorted((one.source, one.language, score) for one, score in pairs)  # noqa: E731
+    assert order(found) == order(expected)
+    assert len(found) == 2
+
+
+def test_what_is_unknown_is_refused_with_what_is_nearest(many):
+    with pytest.raises(InstructionError, match="holds no experience"):
+        semantic_candidates("put the trombone on the xylophone", indexed(many))
+
+
+def test_a_bank_may_be_empty():
+    assert IndexedEntries([]).near(parse_instruction(BOWL), semantic_score) == []
+
+
+def test_of_equal_keys_the_best_are_handed_on(many):
+    rng = np.random.default_rng(2)
+    qualities = rng.random(5000)
+    same = [
+        replace(one, source=f"same#{i}")
+        for i, one in enumerate(bank_of([parse_instruction(BOWL)] * 5000, qualities))
+    ]
+    found = IndexedEntries([*many, *same]).near(parse_instruction(BOWL), semantic_score)
+    best = [f"same#{i}" for i in np.argsort(-qualities)[:ENTRIES_PER_KEY]]
+    assert sources(found)[:ENTRIES_PER_KEY] == best
+    assert not set(sources(found)[ENTRIES_PER_KEY:]) & {one.source for one in same}
+
+
+def test_no_more_than_so_many_in_all_but_one_of_every_key():
+    keys = [key for key in distinct_keys(40, np.random.default_rng(0)) if len(key) == 1]
+    found = IndexedEntries(bank_of(keys * 100)).near(keys[3], semantic_score)
+    assert len(found) == ENTRIES_IN_ALL
+    assert {one.key.sub_tasks for one in found} == set(keys)
+    assert [one.key.sub_tasks for one in found[:ENTRIES_PER_KEY]] == [keys[3]] * ENTRIES_PER_KEY
+
+
+def test_parts_are_found_in_either_direction():
+    filler = bank_of(distinct_keys(300, np.random.default_rng(0)))
+    whole, part = entry(DRAWER, source="whole"), entry("open the top drawer", source="part")
+    bank = IndexedEntries([*filler, whole, part])
+    inside = parse_instruction(DRAWER)[1]
+    assert sources(bank.near([inside], semantic_score))[:1] != ["part"]
+    assert "whole" in sources(bank.near([inside], semantic_score))
+    assert sources(bank.near(parse_instruction("open the top drawer"), semantic_score))[0] == "part"
+    chain = sources(bank.near(parse_instruction(DRAWER), semantic_score))
+    assert chain[0] == "whole"
+    assert "part" in chain
+
+
+def test_of_a_bank_with_columns_one_entry_of_each_key_is_read(many):
+    bank = Columns(many[:20] * 30)
+    made = IndexedEntries(bank)
+    assert sorted(bank.read) == list(range(20))
+    asked = many[7].key.sub_tasks
+    plain = IndexedEntries(many[:20] * 30)
+    assert sources(made.near(asked, semantic_score)) == sources(plain.near(asked, semantic_score))
+
+
+def test_columns_of_other_entries_are_not_believed(many, caplog):
+    bank = Columns(many[:20])
+    bank.key_vectors = lambda: key_vectors([one.key.sub_tasks for one in many[5:25]])
+    found = IndexedEntries(bank, "bank").near(many[2].key.sub_tasks, semantic_score)
+    assert found[0] is many[2]
+    assert caplog.text.count("bank: its key vectors are not those of its entries") == 1
+
+
+def test_equal_rows_are_numbered_by_first_appearance():
+    rows = np.array([[1, 2], [3, 4], [1, 2], [0, 0], [3, 4]], np.float32)
+    numbers, firsts = equal_rows(rows)
+    assert numbers.tolist() == [0, 1, 0, 2, 1]
+    assert firsts.tolist() == [0, 1, 3]
+    assert [part.tolist() for part in equal_rows(rows[:0])] == [[], []]
+
+
+def test_the_gate_of_retrieval_holds_for_what_is_near(many):
+    asked = many[11].key.sub_tasks
+    found = IndexedEntries(many).near(asked, semantic_score)
+    scores = [semantic_score(asked, one.key.sub_tasks) for one in found]
+    assert scores[0] == pytest.approx(1)
+    assert min(scores) < MIN_SEMANTIC
+    assert len(found) >= module.NEAREST_KEYS
