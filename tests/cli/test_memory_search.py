@@ -61,8 +61,8 @@ def test_what_the_policy_refuses_says_why_and_what_is_nearest(
 
 
 def test_a_mined_memory_can_be_searched_too(openspm: Openspm, checkpoint: Path, tmp_path: Path):
-    for file in ("memory.json", "memory.safetensors", "cameras.json"):
-        (tmp_path / file).write_bytes((checkpoint / file).read_bytes())
+    for file in (*checkpoint.glob("memory*"), checkpoint / "cameras.json"):
+        (tmp_path / file.name).write_bytes(file.read_bytes())
     assert search(openspm, BOWL, f"--path={tmp_path}") == search(openspm, BOWL, f"--path={checkpoint}")
 
 
@@ -83,6 +83,7 @@ def test_mistakes_are_one_line(
     arguments = tuple(argument.format(dataset=tiny_dataset) for argument in arguments)
     path = [] if any(argument.startswith("--path") for argument in arguments) else [f"--path={checkpoint}"]
     code, out, err = openspm("memory", "search", *arguments, *path)
-    assert (code, out) == (2, "")
+    assert code == 2
+    assert "{" not in out  # LeRobot says on stdout that it loads weights
     assert err.splitlines()[-1].startswith("openspm memory: ")
     assert message in err.splitlines()[-1]
