@@ -1,4 +1,4 @@
-"""What is kept of the entries of a large bank as columns, so that not all of them have to be read to find one."""
+"""What is kept of the entries of a large bank as columns, so that not all have to be read to find one."""
 
 from __future__ import annotations
 
