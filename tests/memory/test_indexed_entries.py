@@ -119,10 +119,18 @@ def test_of_equal_keys_the_best_are_handed_on(many):
 
 def test_no_more_than_so_many_in_all_but_one_of_every_key():
     keys = [key for key in distinct_keys(40, np.random.default_rng(0)) if len(key) == 1]
-    found = IndexedEntries(bank_of(keys * 100)).near(keys[3], semantic_score)
+    bank = IndexedEntries(bank_of(keys * 100))
+    found = bank.near(keys[3], lambda asked, known: 1.0 if asked == known else 0.5)
     assert len(found) == ENTRIES_IN_ALL
     assert {one.key.sub_tasks for one in found} == set(keys)
     assert [one.key.sub_tasks for one in found[:ENTRIES_PER_KEY]] == [keys[3]] * ENTRIES_PER_KEY
+
+
+def test_of_keys_about_something_else_one_entry_is_handed_on():
+    keys = [key for key in distinct_keys(40, np.random.default_rng(0)) if len(key) == 1]
+    found = IndexedEntries(bank_of(keys * 100)).near(keys[3], lambda asked, known: float(asked == known))
+    assert len(found) == ENTRIES_PER_KEY + len(keys) - 1
+    assert {one.key.sub_tasks for one in found} == set(keys)
 
 
 def test_parts_are_found_in_either_direction():

@@ -7,7 +7,7 @@ keys, they are scored exactly, and of the best keys the best entries are handed 
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import overload
 
 import numpy as np
@@ -70,8 +70,9 @@ class IndexedEntries(Sequence[MemoryEntry]):
         """The entries of the keys nearest to what is asked, and to every part of it; the best key first.
 
         For each part these are entries whose whole key is near, and entries of which one sub-task is: of
-        either about :data:`ENTRIES_IN_ALL` at most, and of one key the best by quality, at least one and at
-        most :data:`ENTRIES_PER_KEY`.
+        either about :data:`ENTRIES_IN_ALL` at most. Of a key these are the best by quality: of one that has a
+        score at most :data:`ENTRIES_PER_KEY`, of any other one, to be named where nothing is known of what is
+        asked.
 
         Args:
             asked: The sub-tasks of an instruction.
@@ -82,19 +83,23 @@ class IndexedEntries(Sequence[MemoryEntry]):
         entries: dict[int, None] = {}
         for run, rows in zip(runs, found, strict=True):
             keys = [self._row_keys[int(row)] for row in rows[rows >= 0]]
-            keys = sorted(keys, key=lambda key: -score(run, key))
-            owners = [(key, number) for key in keys for number in self._rows[key][:NEAREST_KEYS]]
-            wholes = [number for key, number in owners if len(self._keys[number]) == len(key)]
-            parts = [number for key, number in owners if len(self._keys[number]) > len(key) == len(run)]
+            scores = {key: score(run, key) for key in keys}
+            wholes: dict[int, float] = {}
+            parts: dict[int, float] = {}
+            for key in sorted(keys, key=lambda key: -scores[key]):
+                for number in self._rows[key][:NEAREST_KEYS]:
+                    is_whole = len(self._keys[number]) == len(key)
+                    if is_whole or len(key) == len(run):
+                        (wholes if is_whole else parts).setdefault(number, scores[key])
             entries |= dict.fromkeys([*self._best_entries(wholes), *self._best_entries(parts)])
         return [self._entries[i] for i in entries]
 
-    def _best_entries(self, ranked: Sequence[int]) -> Iterator[int]:
-        """The best entry of each key, and as many more as there is room for, of the first keys first."""
-        left = max(0, ENTRIES_IN_ALL - len(ranked))
-        for number in ranked:
+    def _best_entries(self, scores: Mapping[int, float]) -> Iterator[int]:
+        """The best entry of each key, and as many more of those with a score as there is room for."""
+        left = max(0, ENTRIES_IN_ALL - len(scores))
+        for number, score in scores.items():
             begin, end = self._ends[number], self._ends[number + 1]
-            more = min(end - begin, ENTRIES_PER_KEY, 1 + left) - 1
+            more = min(end - begin, ENTRIES_PER_KEY, 1 + left) - 1 if score > 0 else 0
             left -= more
             yield from (int(i) for i in self._order[begin : begin + 1 + more])
 
