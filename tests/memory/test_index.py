@@ -79,7 +79,7 @@ def test_faiss_finds_what_is_near_among_many_lists(forty_lists):
 def test_what_the_lists_looked_into_do_not_hold_is_marked(forty_lists):
     cosines, found = FaissIndex(forty_lists).search(forty_lists[:1], len(forty_lists))
     n = int((found >= 0).sum())
-    assert 10_000 < n < 40_000
+    assert 1_000 < n < 40_000
     assert len(set(found[0, :n].tolist())) == n
     assert (found[0, n:] == -1).all()
     assert np.isneginf(cosines[0, n:]).all()
