@@ -3,7 +3,7 @@
 import json
 import logging
 
-from benchmarks import conditioning, execution, oracle, perception, tables
+from benchmarks import compound, conditioning, execution, oracle, perception, tables
 
 
 def main() -> None:
@@ -11,6 +11,7 @@ def main() -> None:
     logging.basicConfig(level=logging.INFO, format="%(levelname)s %(message)s")
     followed, errors = execution.main(), perception.main()
     truth, _ = oracle.main(), conditioning.main()
+    chained = compound.main()["runs"]["compound"]
     tables.write_page()
     runs = followed["runs"]
     summary = {
@@ -23,6 +24,7 @@ def main() -> None:
         "expert_steps": followed["expert_steps"],
         **{name: errors[name] for name in ("position_mm_mean", "position_mm_p95", "yaw_deg_mean")},
         "n": runs["closed_loop_trc"]["n"],
+        "compound_success": chained["success"],
     }
     print(json.dumps(summary))
 

@@ -1,6 +1,8 @@
 """What each part is worth: how key poses are followed, whose object poses, where key poses come from.
 
 python -m benchmarks.libero.ablations --states=10
+
+With --source=openai or qwen3vl also the paper's own memory ablation, key poses made up by a multimodal model.
 """
 
 from __future__ import annotations
@@ -15,15 +17,25 @@ from typing import Any
 import draccus
 from benchmarks.common import write
 from benchmarks.libero.evaluate import summary
-from benchmarks.libero.geometric_guess import guessing_policy
+from benchmarks.libero.geometric_guess import GuessConfig, Source, guessing_policy, source_of
 from benchmarks.libero.stages import dataset, evaluation, policy, run_folder
 
 
 @dataclass
 class AblationConfig:
-    """On how many initial states a task."""
+    """On how many initial states a task, and with which model beside the geometric guess.
+
+    Args:
+        states: Initial states a task, from the first on.
+        source: The multimodal model to ask for key poses; see :class:`GuessConfig`, likewise the others.
+        model_id: Its name.
+        api_base: Where it is.
+    """
 
     states: int = 10
+    source: Source = "geometric"
+    model_id: str | None = None
+    api_base: str | None = None
 
 
 def main(config: AblationConfig) -> dict[str, Any]:
@@ -41,6 +53,11 @@ def main(config: AblationConfig) -> dict[str, Any]:
         "oracle": evaluation(folder / "ablation_oracle", oracle, config.states),
         "geometric_guess": evaluation(folder / "ablation_guess", guess, config.states),
     }
+    if config.source != "geometric":
+        place = folder / "train_zero_shot"
+        asked = GuessConfig(str(oracle), str(place), config.source, config.model_id, config.api_base)
+        model = guessing_policy(oracle, place, source_of(asked))
+        variants["zero_shot"] = evaluation(folder / "ablation_zero_shot", model, config.states)
     return write(
         "libero_ablations",
         {"states": config.states, "runs": {name: summary(found) for name, found in variants.items()}},

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, Literal, get_args
+from urllib.parse import urlsplit
 
 from lerobot.configs import NormalizationMode, PreTrainedConfig
 from lerobot.optim import AdamWConfig, CosineDecayWithWarmupSchedulerConfig
@@ -20,6 +21,7 @@ from lerobot_openspm.perception.learning import Shape
 PerceptionSource = Literal["demonstrations", "oracle"]
 Segmentation = Literal["demonstrations", "sam3", "grounded_sam2", "given"]
 MemoryUpdate = Literal["keep", "append", "rebuild"]
+Judge = Literal["none", "openai", "qwen3vl", "annotations"]
 
 
 @PreTrainedConfig.register_subclass("openspm")
@@ -62,6 +64,18 @@ class OpenSPMConfig(PreTrainedConfig):
             them when some are held out: the policy is shown the whole dataset otherwise.
         memory_update: What happens to a checkpoint's memory when training goes on from it: "keep" it,
             "append" the dataset's episodes, or "rebuild" it from them.
+        phase_judge: Who says, beside motion and gripper, which phase ends at a key pose; see
+            ``docs/judgement.md``. "none". "openai": a multimodal model behind an OpenAI-compatible endpoint.
+            "qwen3vl": Qwen3-VL in this process. "annotations": the sub-tasks that lerobot-annotate wrote.
+        phase_judge_api_base: Where the endpoint of "openai" is, up to and with ``/v1``; lerobot-annotate's
+            default, ``http://localhost:8000/v1``, if not given. Its key, if it wants one, is read from the
+            environment variable OPENSPM_JUDGE_API_KEY.
+        phase_judge_model_id: Which of the endpoint's models to ask. For "qwen3vl" a name on the Hub, or a
+            folder; ``Qwen/Qwen3-VL-2B-Instruct`` if not given.
+        phase_judge_confidence: What a judge says with less confidence changes nothing.
+        phase_judge_timeout_s: How long to wait for the endpoint's answer about one episode.
+        phase_judge_cache: Folder to keep answers in, so that nothing is asked twice;
+            ``openspm/phase_judgements`` in LeRobot's cache if not given.
         chunk_size: Actions per chunk, the paper's H.
         n_action_steps: Actions executed before the next chunk.
         conditioning: "equivariant" tells the flow model the relative pose in the frame of the target key
@@ -79,6 +93,8 @@ class OpenSPMConfig(PreTrainedConfig):
         passing_rad: ... and this angle.
         max_corrections: Corrective chunks per key pose before it counts as not met.
         max_attempts: How often a missed grasp or an unmet key pose is tried again in an episode.
+        name_embeddings: Folder, or name on the Hub, of a model2vec model that recognises names of objects
+            which the table of words does not know; needs the extra ``[text]``. None: the table alone.
         weight_semantic: The paper's lambda_s, weight of the instruction in retrieval.
         weight_geometric: The paper's lambda_g, weight of the scene.
         weight_quality: The paper's lambda_r, weight of the entry's quality.
@@ -113,6 +129,13 @@ class OpenSPMConfig(PreTrainedConfig):
     mask_labels: dict[str, int] | None = None
     memory_episodes: list[int] | None = None
     memory_update: MemoryUpdate = "keep"
+    name_embeddings: str | None = None
+    phase_judge: Judge = "none"
+    phase_judge_api_base: str | None = None
+    phase_judge_model_id: str | None = None
+    phase_judge_confidence: float = 0.6
+    phase_judge_timeout_s: float = 60.0
+    phase_judge_cache: str | None = None
     weight_semantic: float = 1.0
     weight_geometric: float = 0.5
     weight_quality: float = 0.5
@@ -153,6 +176,8 @@ class OpenSPMConfig(PreTrainedConfig):
         _require_choice("segmentation", self.segmentation, get_args(Segmentation))
         _require_choice("shape", self.shape, get_args(Shape))
         self._check_segmentation()
+        _require_choice("phase_judge", self.phase_judge, get_args(Judge))
+        self._check_judge()
         _require_choice("memory_update", self.memory_update, get_args(MemoryUpdate))
         _require_choice("conditioning", self.conditioning, get_args(Conditioning))
         _require_choice("execution", self.execution, get_args(Execution))
@@ -172,7 +197,7 @@ class OpenSPMConfig(PreTrainedConfig):
         positive = (
             "hidden_dim", "num_inference_steps", "samples_per_frame", "residual_m", "residual_rad",
             "passing_m", "passing_rad", "hand_radius_m", "max_jump_m", "max_jump_rad", "optimizer_lr",
-            "scheduler_decay_steps",
+            "scheduler_decay_steps", "phase_judge_timeout_s",
         )  # fmt: skip
         for name in positive:
             if not getattr(self, name) > 0:  # NaN is not either
@@ -214,10 +239,35 @@ class OpenSPMConfig(PreTrainedConfig):
             if type(number) is not int or number < 1:
                 raise ValueError(f"mask_labels[{phrase!r}] is {number!r}, expected a number from 1 on")
 
+    def _check_judge(self) -> None:
+        """An endpoint needs a plain address, a model's name and somebody who asks it."""
+        if not 0 <= self.phase_judge_confidence <= 1:
+            raise ValueError(f"phase_judge_confidence is {self.phase_judge_confidence}, expected 0 to 1")
+        if self.phase_judge == "openai" and not self.phase_judge_model_id:
+            raise ValueError(
+                "phase_judge is 'openai', but phase_judge_model_id is not given; pass "
+                "--policy.phase_judge_model_id=NAME, one of those that the endpoint's /models lists"
+            )
+        if self.phase_judge_api_base is None:
+            return
+        if self.phase_judge != "openai":
+            raise ValueError(
+                f"phase_judge_api_base is for phase_judge 'openai', got {self.phase_judge!r}; pass "
+                "--policy.phase_judge=openai too, or leave it out"
+            )
+        address = urlsplit(self.phase_judge_api_base)
+        plain = not (address.query or address.fragment or "@" in address.netloc)
+        if address.scheme not in ("http", "https") or not address.hostname or not plain:
+            raise ValueError(
+                "phase_judge_api_base is no plain http:// or https:// address (without user, password or "
+                "query, which would be logged); pass e.g. http://localhost:8000/v1, and a key in the "
+                "environment variable OPENSPM_JUDGE_API_KEY"
+            )
+
     def set_dataset_feature_metadata(self, features: Mapping[str, Any]) -> None:
         """Take the layouts from the dataset's feature names where they were not given. Called by LeRobot."""
-        self.state_layout = self.state_layout or _flat_names(features.get(OBS_STATE, {}).get("names"))
-        self.action_layout = self.action_layout or _flat_names(features.get(ACTION, {}).get("names"))
+        self.state_layout = self.state_layout or feature_names(features.get(OBS_STATE, {}).get("names"))
+        self.action_layout = self.action_layout or feature_names(features.get(ACTION, {}).get("names"))
 
     def layouts(self) -> tuple[VectorLayout, VectorLayout]:
         """Layouts of state and action. Raises LayoutError when names are missing or make no sense."""
@@ -299,7 +349,7 @@ def _require_choice(name: str, got: str, expected: tuple[str, ...]) -> None:
         raise ValueError(f"{name} is {got!r}, expected one of {', '.join(expected)}")
 
 
-def _flat_names(names: Any) -> list[str] | None:
+def feature_names(names: Any) -> list[str] | None:
     """Feature names as a list; LeRobot datasets also write them as ``{"motors": [...]}``."""
     if isinstance(names, Mapping):
         names = [name for group in names.values() for name in group]

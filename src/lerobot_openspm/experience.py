@@ -1,41 +1,46 @@
-"""Everything a policy has learned besides its weights: entries, objects, robot, cameras.
-
-Three files lie beside a checkpoint's weights: ``memory.json`` (what a person reads), ``memory.safetensors``
-(the arrays it refers to, by checksum) and ``cameras.json`` (the calibration).
-"""
+"""Everything a policy has learned besides its weights: entries, objects, robot, cameras."""
 
 from __future__ import annotations
 
-import hashlib
-import json
-from collections.abc import Mapping
+from collections import defaultdict
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import chain
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-from safetensors import SafetensorError
-from safetensors.numpy import load as load_arrays
-from safetensors.numpy import save as save_arrays
 
-from lerobot_openspm.errors import MemoryFormatError
-from lerobot_openspm.files import write_beside
-from lerobot_openspm.geometry.camera import Camera, cameras_to_dict, load_cameras
+from lerobot_openspm.errors import CalibrationError, MemoryFormatError
+from lerobot_openspm.experience_files import (
+    CAMERAS_JSON,
+    MEMORY_JSON,
+    OLD_ARRAYS,
+    VERSION,
+    Arrays,
+    Fields,
+    file_field,
+    lines_from_arrays,
+    read_arrays,
+    read_cameras,
+    read_header,
+    write_files,
+)
+from lerobot_openspm.experience_header import Header, check_layouts, header_from_fields, header_to_fields
+from lerobot_openspm.geometry.camera import Camera, load_cameras
+from lerobot_openspm.geometry.layout import VectorLayout
+from lerobot_openspm.memory.bank import EntryBank, anchored_objects, texts_of
 from lerobot_openspm.memory.entry import MemoryEntry
+from lerobot_openspm.memory.old_versions import entries_from_parts
+from lerobot_openspm.memory.quality import with_outcome
 from lerobot_openspm.memory.robot import RobotModel
-from lerobot_openspm.memory.store import entries_from_parts, entries_to_parts, robot_from_dict, robot_to_dict
-from lerobot_openspm.perception.learning import SHAPES
 from lerobot_openspm.perception.model import KnownObject
-from lerobot_openspm.perception.segmentation.make import SEGMENTERS
 from lerobot_openspm.perception.store import from_parts as object_from_parts
 from lerobot_openspm.perception.store import to_parts as object_to_parts
 
-# Version 2: objects known by patches. Version 3: key poses with the axis of their constraint. Version 4:
-# objects known by boxes, or by shapes whose pixels a segmenter finds.
-FORMAT, VERSION = "openspm-memory", 4
-MEMORY_JSON, MEMORY_ARRAYS, CAMERAS_JSON = "memory.json", "memory.safetensors", "cameras.json"
-FILES = (MEMORY_JSON, MEMORY_ARRAYS, CAMERAS_JSON)
-MAX_JSON_BYTES, MAX_ARRAY_BYTES = 512_000_000, 4_000_000_000
+__all__ = ["CAMERAS_JSON", "MEMORY_JSON", "VERSION", "Experience", "load_experience", "save_experience"]
+
+# So many entries are read when a memory is loaded; of a larger one, each when it is asked for.
+READ_AT_LOAD = 2000
 
 
 @dataclass(frozen=True)
@@ -51,9 +56,11 @@ class Experience:
         segmentation: What found the objects' pixels: "demonstrations", or a segmenter by name.
         shape: What was learned of the objects: "demonstrations", "box" or "sam3d".
         simulator_objects: Objects in the order of the simulator's pose vector (oracle ablation only).
+        layouts: How the robot's state and action vectors are laid out; None in memories of before version 5.
+        superseded: Entries that were replaced, merged or removed. They are kept to look at, never retrieved.
     """
 
-    entries: tuple[MemoryEntry, ...]
+    entries: Sequence[MemoryEntry]
     objects: dict[str, KnownObject]
     robot: RobotModel
     cameras: dict[str, Camera]
@@ -61,6 +68,8 @@ class Experience:
     simulator_objects: tuple[str, ...] = ()
     segmentation: str = "demonstrations"
     shape: str = "demonstrations"
+    layouts: tuple[VectorLayout, VectorLayout] | None = None
+    superseded: Sequence[MemoryEntry] = ()
 
     @property
     def yaw_periods(self) -> dict[str, float]:
@@ -76,18 +85,41 @@ class Experience:
         Raises:
             MemoryFormatError: The newer one comes from another robot.
         """
-        kept, added = list(self.entries), []
+        check_layouts(self.layouts, newer.layouts, "the newer one's", "appending")
+        robot = self.robot.covering(newer.robot)
+        known = dict(enumerate(self.entries))
+        by_source: dict[str, list[int]] = defaultdict(list)
+        for i, entry in known.items():
+            by_source[entry.source].append(i)
+        added: list[MemoryEntry] = []
+        replaced: list[MemoryEntry] = []
         for new in newer.entries:
-            old = next((entry for entry in kept if _same_demonstration(entry, new)), None)
-            if old is not None:
-                kept.remove(old)
-            added.append(new if old is None else replace(new, version=old.version + 1))
+            alike = (i for i in by_source[new.source] if i in known and _same_demonstration(known[i], new))
+            if (old := next(alike, None)) is not None:
+                replaced.append(known.pop(old))
+                new = replace(new, version=replaced[-1].version + 1)
+            added.append(new)
         return replace(
             self,
-            entries=(*kept, *added),
+            entries=(*known.values(), *added),
             objects={**newer.objects, **self.objects},
-            robot=self.robot.covering(newer.robot),
+            robot=robot,
+            layouts=self.layouts or newer.layouts,
+            superseded=(*self.superseded, *replaced),
         )
+
+    def with_outcomes(self, outcomes: Iterable[tuple[MemoryEntry, bool]]) -> Experience:
+        """This experience after some of its entries were acted by, each with whether it succeeded."""
+        entries = list(self.entries)
+        by_source: dict[str, list[int]] = defaultdict(list)
+        for i, entry in enumerate(entries):
+            by_source[entry.source].append(i)
+        for used, success in outcomes:
+            for i in by_source[used.source]:
+                if entries[i].version == used.version and _same_demonstration(entries[i], used):
+                    entries[i] = with_outcome(entries[i], success)
+                    break
+        return replace(self, entries=tuple(entries))
 
 
 def _same_demonstration(a: MemoryEntry, b: MemoryEntry) -> bool:
@@ -100,79 +132,88 @@ def _same_demonstration(a: MemoryEntry, b: MemoryEntry) -> bool:
 
 
 def save_experience(experience: Experience, directory: Path) -> None:
-    """Write the three files, each beside its place and then renamed, so that none is ever half-written."""
-    rows, arrays = entries_to_parts(experience.entries)
-    objects = []
+    """Write a memory: whatever interrupts this, the folder holds the one before or this one, whole."""
+    arrays: Arrays = {}
+    objects: list[Fields] = []
     for model in experience.objects.values():
-        fields, model_arrays = object_to_parts(model)
+        fields, own = object_to_parts(model)
         objects.append(fields)
-        arrays |= {f"objects.{model.name}.{key}": value for key, value in model_arrays.items()}
-    blob = save_arrays({key: np.ascontiguousarray(value) for key, value in arrays.items()})
-    memory = {
-        "format": FORMAT,
-        "version": VERSION,
-        "arrays": {"file": MEMORY_ARRAYS, "sha256": hashlib.sha256(blob).hexdigest()},
-        "perception": experience.perception,
-        "segmentation": experience.segmentation,
-        "shape": experience.shape,
-        "simulator_objects": list(experience.simulator_objects),
-        "robot": robot_to_dict(experience.robot),
-        "objects": objects,
-        "entries": rows,
-    }
-    directory.mkdir(parents=True, exist_ok=True)
-    write_beside(directory / MEMORY_ARRAYS, blob)
-    write_beside(directory / CAMERAS_JSON, _json(cameras_to_dict(experience.cameras)))
-    # Last, because it vouches for the arrays.
-    write_beside(directory / MEMORY_JSON, _json(memory))
+        arrays |= {f"objects.{model.name}.{key}": value for key, value in own.items()}
+    header = header_to_fields(header_of(experience, objects))
+    texts = chain(texts_of(experience.entries), texts_of(experience.superseded))
+    write_files(directory, header, texts, arrays, experience.cameras)
 
 
-def load_experience(directory: Path) -> Experience:
-    """Read the three files.
+def header_of(experience: Experience, objects: list[Fields]) -> Header:
+    """What the header of a memory says, given the fields of the objects' models."""
+    groups = (experience.entries, experience.superseded)
+    anchored = tuple(sorted(frozenset[str]().union(*map(anchored_objects, groups))))
+    return Header(
+        experience.perception, experience.segmentation, experience.shape, experience.simulator_objects,
+        experience.layouts, experience.robot, objects, len(experience.entries), anchored,
+    )  # fmt: skip
+
+
+def load_experience(directory: Path, cameras: Path | None = None) -> Experience:
+    """Read a memory.
+
+    Args:
+        directory: Folder of a checkpoint or of a mined memory.
+        cameras: Calibration file to use instead of the memory's own.
 
     Raises:
-        MemoryFormatError: A file is missing, truncated, malformed, too large, or of a newer version.
-        CalibrationError: The calibration is malformed.
+        MemoryFormatError: A file is missing, truncated, changed, malformed, too large, or of a newer version.
+        CalibrationError: The calibration is malformed, or not the one that the memory was saved with.
     """
+    while True:
+        header = read_header(directory)
+        try:
+            return _load(directory, header, cameras)
+        except (MemoryFormatError, CalibrationError):
+            # Another process may have saved a newer memory in between; then its files are named differently.
+            if header == read_header(directory):
+                raise
+
+
+def _load(directory: Path, fields: Fields, cameras_file: Path | None) -> Experience:
     where = str(directory / MEMORY_JSON)
-    memory = _read_json(directory / MEMORY_JSON)
-    if memory.get("format") != FORMAT:
-        raise MemoryFormatError(f"{where}: got format {memory.get('format')!r}, expected {FORMAT!r}")
-    version = memory.get("version")
-    if type(version) is not int or not 1 <= version <= VERSION:
-        raise MemoryFormatError(
-            f"{where}: got version {version!r}, this release reads up to {VERSION}; "
-            "upgrade lerobot_policy_openspm"
-        )
-    try:
-        checksum, rows, objects = memory["arrays"]["sha256"], memory["entries"], memory["objects"]
-        robot, perception = robot_from_dict(memory["robot"], where), str(memory["perception"])
-        simulator_objects = tuple(str(name) for name in memory["simulator_objects"])
-    except (KeyError, TypeError) as error:
-        raise MemoryFormatError(
-            f"{where}: field {error} is missing or malformed; train or pull it again"
-        ) from error
-    if not isinstance(rows, list) or not isinstance(objects, list):
-        raise MemoryFormatError(f"{where}: 'entries' and 'objects' must be lists")
-    if perception not in ("demonstrations", "oracle"):
-        raise MemoryFormatError(f"{where}: perception is {perception!r}, expected demonstrations or oracle")
-    # Until version 3 nothing else was known.
-    segmentation, shape = (memory.get(name, "demonstrations") for name in ("segmentation", "shape"))
-    for name, got, expected in (("segmentation", segmentation, SEGMENTERS), ("shape", shape, SHAPES)):
-        if got not in expected:
-            raise MemoryFormatError(f"{where}: {name} is {got!r}, expected one of {', '.join(expected)}")
-    arrays = _read_arrays(directory / MEMORY_ARRAYS, checksum)
-    models = {}
-    for fields in objects:
-        if not isinstance(fields, Mapping):
-            raise MemoryFormatError(f"{where}: 'objects' must hold JSON objects, got {type(fields).__name__}")
-        name = str(fields.get("name"))
-        prefix = f"objects.{name}."
+    header = header_from_fields(fields, where)
+    if fields["version"] < 5:
+        arrays = read_arrays(directory / OLD_ARRAYS, fields["arrays"]["sha256"])
+        entries, superseded = entries_from_parts(fields["entries"], arrays, where), ()
+    else:
+        arrays = _arrays_of(fields, directory)
+        entries, superseded = _entries_of(fields, header, arrays, directory)
+    models: dict[str, KnownObject] = {}
+    for model_fields in header.objects:
+        prefix = f"objects.{model_fields.get('name')}."
         own = {key.removeprefix(prefix): value for key, value in arrays.items() if key.startswith(prefix)}
-        models[name] = object_from_parts(fields, own, where)
-    entries = entries_from_parts(rows, arrays, where)
-    cameras = load_cameras(directory / CAMERAS_JSON)
-    return Experience(entries, models, robot, cameras, perception, simulator_objects, segmentation, shape)
+        model = object_from_parts(model_fields, own, where)
+        models[model.name] = model
+    cameras = read_cameras(directory, fields) if cameras_file is None else load_cameras(cameras_file)
+    return Experience(
+        entries, models, header.robot, cameras, header.perception, header.simulator_objects,
+        header.segmentation, header.shape, header.layouts, superseded,
+    )  # fmt: skip
+
+
+def _arrays_of(fields: Fields, directory: Path) -> Arrays:
+    file = file_field(fields, "arrays", directory)
+    return read_arrays(directory / file["file"], file.get("sha256"))
+
+
+def _entries_of(
+    fields: Fields, header: Header, arrays: Arrays, directory: Path
+) -> tuple[Sequence[MemoryEntry], Sequence[MemoryEntry]]:
+    """The entries, and those that were superseded."""
+    file = directory / file_field(fields, "entries", directory)["file"]
+    bank = EntryBank(file, lines_from_arrays(arrays, str(file)), frozenset(header.anchored))
+    if header.n_entries > len(bank):
+        raise MemoryFormatError(
+            f"{directory / MEMORY_JSON}: 'n_entries' is {header.n_entries}, but {file.name} holds {len(bank)}"
+        )
+    entries, superseded = bank[: header.n_entries], bank[header.n_entries :]
+    return (tuple(entries), tuple(superseded)) if len(bank) <= READ_AT_LOAD else (entries, superseded)
 
 
 def check_anchors(experience: Experience, where: str) -> None:
@@ -185,14 +226,13 @@ def check_anchors(experience: Experience, where: str) -> None:
     Raises:
         MemoryFormatError: There is no model of an object.
     """
-    known = experience.objects
-    for i, entry in enumerate(experience.entries):
-        for name in entry.objects:
-            if name not in known and experience.perception != "oracle":
-                raise MemoryFormatError(
-                    f"{where}: entries[{i}] has key poses at {name!r}, which is none of the 'objects' that "
-                    f"perception knows ({', '.join(sorted(known)) or 'none'}); train or pull it again"
-                )
+    known_objects = experience.objects
+    for name in sorted(anchored_objects(experience.entries) - set(known_objects)):
+        if experience.perception != "oracle":
+            raise MemoryFormatError(
+                f"{where}: entries have key poses at {name!r}, which is none of the 'objects' that "
+                f"perception knows ({', '.join(sorted(known_objects)) or 'none'}); train or pull it again"
+            )
 
 
 def check_labels(experience: Experience, labels: Mapping[str, int] | None, where: str) -> None:
@@ -211,46 +251,3 @@ def check_labels(experience: Experience, labels: Mapping[str, int] | None, where
             f"{where}: 'mask_labels' has no number for {', '.join(missing)}, which the memory has key poses "
             f"at; it has {', '.join(sorted(labels))}. Pass --policy.mask_labels='{{...}}' with all of them"
         )
-
-
-def _read_json(path: Path) -> dict[str, Any]:
-    try:
-        data = json.loads(_read(path, MAX_JSON_BYTES))
-    except (ValueError, RecursionError) as error:
-        if isinstance(error, MemoryFormatError):
-            raise
-        raise MemoryFormatError(f"{path}: truncated or not JSON ({error}); train or pull it again") from error
-    if not isinstance(data, dict):
-        raise MemoryFormatError(f"{path}: expected a JSON object, got {type(data).__name__}")
-    return data
-
-
-def _read_arrays(path: Path, checksum: object) -> dict[str, np.ndarray]:
-    blob = _read(path, MAX_ARRAY_BYTES)
-    if hashlib.sha256(blob).hexdigest() != checksum:
-        raise MemoryFormatError(
-            f"{path}: its checksum is not the one in {MEMORY_JSON}: truncated, changed, or from another "
-            "checkpoint; train or pull it again"
-        )
-    try:
-        return load_arrays(blob)
-    except (SafetensorError, KeyError) as error:  # KeyError: a type that NumPy does not have
-        raise MemoryFormatError(f"{path}: not safetensors ({error}); train or pull it again") from error
-
-
-def _read(path: Path, limit: int) -> bytes:
-    if not path.is_file():
-        raise MemoryFormatError(
-            f"no memory at {path}: a checkpoint of this policy holds {', '.join(FILES)}; train with "
-            "lerobot-train --policy.type=openspm, or pull the whole checkpoint. In a training's folder it is "
-            "checkpoints/last/pretrained_model"
-        )
-    if path.stat().st_size > limit:
-        raise MemoryFormatError(
-            f"{path}: {path.stat().st_size} bytes, more than the {limit} this release reads"
-        )
-    return path.read_bytes()
-
-
-def _json(data: object) -> bytes:
-    return json.dumps(data, indent=1, allow_nan=False).encode()

@@ -1,23 +1,72 @@
-"""Writing files so that none is ever half-written."""
+"""Writing files so that none is ever half-written, and changing a folder one process at a time."""
 
 from __future__ import annotations
 
 import json
 import os
+from collections.abc import Generator
+from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
+
+from filelock import FileLock, Timeout
+
+from lerobot_openspm.errors import OpenSPMError
+
+LOCK_WAIT_S = 60.0
 
 
 def write_beside(path: Path, blob: bytes) -> None:
     """Write a file beside its place, then rename it there."""
     beside = path.with_name(f".{path.name}.partial")
-    with beside.open("wb") as file:
+    with written(beside) as file:
         file.write(blob)
-        file.flush()
-        os.fsync(file.fileno())
-    beside.replace(path)
+    rename(beside, path)
 
 
 def write_json(path: Path, data: Any) -> None:
     """Write data as JSON, as a whole or not at all."""
     write_beside(path, (json.dumps(data, indent=1, allow_nan=False) + "\n").encode())
+
+
+@contextmanager
+def written(path: Path) -> Generator[BinaryIO]:
+    """A file to write; it is on the disk when the block ends."""
+    with path.open("wb") as file:
+        yield file
+        file.flush()
+        os.fsync(file.fileno())
+
+
+def rename(source: Path, target: Path) -> None:
+    """Rename a file, over another one if there is one; a power cut leaves the one or the other."""
+    os.replace(source, target)
+    if os.name == "posix":  # elsewhere folders cannot be opened
+        folder = os.open(target.parent, os.O_RDONLY)
+        try:
+            os.fsync(folder)
+        finally:
+            os.close(folder)
+
+
+@contextmanager
+def locked(path: Path) -> Generator[None]:
+    """Keep other processes from changing what a lock file stands for; may be nested in one process.
+
+    Raises:
+        OpenSPMError: Another process goes on holding it.
+    """
+    # The same lock wherever this process asks for it, hence the nesting. The file itself stays: whoever
+    # removed it could remove it from under another one that waits for it.
+    lock = FileLock(path, timeout=LOCK_WAIT_S, is_singleton=True)
+    try:
+        lock.acquire()
+    except Timeout as error:
+        raise OpenSPMError(
+            f"{path}: another process has been changing this for {LOCK_WAIT_S:.0f} s; try again"
+            " when it is done"
+        ) from error
+    try:
+        yield
+    finally:
+        lock.release()

@@ -19,11 +19,11 @@ from lerobot.policies import PreTrainedPolicy
 from torch import Tensor
 
 from lerobot_openspm.configuration_openspm import OpenSPMConfig
-from lerobot_openspm.control.row import Knowledge, Row
-from lerobot_openspm.errors import DatasetError, MemoryFormatError
+from lerobot_openspm.control.knowledge import Knowledge
+from lerobot_openspm.control.row import Row
+from lerobot_openspm.errors import DatasetError, MemoryFormatError, OpenSPMError
 from lerobot_openspm.experience import (
     CAMERAS_JSON,
-    FILES,
     MEMORY_JSON,
     Experience,
     check_anchors,
@@ -31,19 +31,28 @@ from lerobot_openspm.experience import (
     load_experience,
     save_experience,
 )  # fmt: skip
+from lerobot_openspm.experience_files import data_files
+from lerobot_openspm.experience_header import check_layouts
 from lerobot_openspm.flow.condition import CONDITION_DIM, Query, encode, to_world_frame
 from lerobot_openspm.flow.network import VelocityField
 from lerobot_openspm.flow.training_set import TrainingSet
-from lerobot_openspm.geometry.camera import check_sizes, load_cameras
+from lerobot_openspm.geometry.camera import check_sizes
 from lerobot_openspm.memory.entry import MemoryEntry
 from lerobot_openspm.memory.indexed_entries import indexed
+from lerobot_openspm.memory.names import TABLE_NAMES, Model2VecNames, NameSimilarity
 from lerobot_openspm.observation import Observation, split_batch
 from lerobot_openspm.perceive import Eyes
 from lerobot_openspm.perception.tracker import TrackerSettings
 from lerobot_openspm.perception.types import Segmenter
+from lerobot_openspm.teaching import Lesson, teach
 from lerobot_openspm.training import mine_experience, segmenter_of, training_set
 
 logger = logging.getLogger(__name__)
+
+# Options that mean nothing on another machine; a checkpoint is saved without them.
+ON_ONE_MACHINE = (
+    "cameras", "sam3d_python", "sam3d_checkout", "phase_judge_api_base", "phase_judge_cache",
+)  # fmt: skip
 
 # Of checkpoints that do not say how often their robot acts.
 DEFAULT_CONTROL_HZ = 20.0
@@ -79,6 +88,7 @@ class OpenSPMPolicy(PreTrainedPolicy):
         self._training_set: TrainingSet | None = None
         self._entries: tuple[Sequence[MemoryEntry], Sequence[MemoryEntry]] | None = None
         if dataset_meta is not None:
+            _ = self.names  # what cannot be used is an error now, not at the first observation
             config.control_hz = config.control_hz or float(dataset_meta.fps)
             self.experience = mine_experience(dataset_meta, config, segmenter=self.segmenter)
             self._training_set = training_set(dataset_meta, config, self.experience.robot)
@@ -91,6 +101,33 @@ class OpenSPMPolicy(PreTrainedPolicy):
         """Forget the running episodes."""
         self.rows: list[Row] = []
         self._eyes: list[Eyes] = []
+        self._rated: list[Row] = []
+
+    def report_outcomes(self, successes: Sequence[bool | None]) -> None:
+        """Tell how the running episodes ended, before the next :meth:`reset`; the memory learns from it.
+
+        The quality of the entries that each episode was acted by follows, for the episodes to come and in
+        what is saved from now on. An episode counts once, however often it is reported.
+
+        Args:
+            successes: For every environment, in the order of the observations, whether its episode succeeded;
+                None where that is not known.
+
+        Raises:
+            OpenSPMError: There are more or fewer environments.
+        """
+        if len(successes) != len(self.rows):
+            raise OpenSPMError(
+                f"got {len(successes)} outcomes, but {len(self.rows)} episodes are running; report one for "
+                "every environment, after acting and before reset()"
+            )
+        outcomes = []
+        for row, success in zip(self.rows, successes, strict=True):
+            if success is not None and not any(row is rated for rated in self._rated):
+                self._rated.append(row)
+                outcomes += [(entry, success) for entry in row.used_entries]
+        if outcomes:
+            self.experience = self.require_experience().with_outcomes(outcomes)
 
     @torch.no_grad()
     def select_action(self, batch: dict[str, Tensor], **kwargs: Any) -> Tensor:
@@ -159,7 +196,7 @@ class OpenSPMPolicy(PreTrainedPolicy):
         knowledge = Knowledge(
             self._entries[1], experience.yaw_periods, experience.robot, config.score_weights,
             config.transfer_limits, config.control_settings, TrackerSettings(), config.tracking,
-            self.step_s,
+            self.step_s, self.names,
         )  # fmt: skip
         return Row(knowledge, observation.instruction, observation.fingerprint(), config.noise_seed)
 
@@ -175,6 +212,12 @@ class OpenSPMPolicy(PreTrainedPolicy):
     def segmenter(self) -> Segmenter | None:
         """What finds the objects' masks, made when it is first needed; None where their colours do."""
         return segmenter_of(self.config)
+
+    @cached_property
+    def names(self) -> NameSimilarity:
+        """What says which names mean the same thing: the table of words, or with embeddings beside it."""
+        weights = self.config.name_embeddings
+        return TABLE_NAMES if weights is None else Model2VecNames(weights)
 
     def _chunk(self, row: Row, query: Query) -> np.ndarray:
         """Generate one chunk ``(chunk_size, 7)`` in the world. Rows go one by one, so batches act alike."""
@@ -220,15 +263,25 @@ class OpenSPMPolicy(PreTrainedPolicy):
         """The flow model's parameters."""
         return self.parameters()
 
+    def teach(self, dataset_meta: Any, episodes: Sequence[int] | None = None) -> Lesson:
+        """Append demonstrations to the memory; no weight changes. Running episodes go on with what they know.
+
+        Args and errors are those of :func:`lerobot_openspm.teaching.teach`; after one nothing has changed.
+        """
+        known = self.require_experience()
+        self.experience, lesson = teach(known, self.config, dataset_meta, episodes, self.segmenter)
+        return lesson
+
     # Persistence: the memory travels with the weights.
 
     def _save_pretrained(self, save_directory: Path, state_dict: dict[str, Tensor] | None = None) -> None:
         experience = self.require_experience()  # before anything is written
         super()._save_pretrained(save_directory, state_dict=state_dict)
         # What exists on one machine alone stays there; the calibration travels as a file of the checkpoint.
-        replace(self.config, cameras=None, sam3d_python=None, sam3d_checkout=None)._save_pretrained(
-            Path(save_directory)
-        )
+        here = dict.fromkeys(ON_ONE_MACHINE)
+        if self.config.name_embeddings and Path(self.config.name_embeddings).is_dir():
+            here["name_embeddings"] = None
+        replace(self.config, **here)._save_pretrained(Path(save_directory))
         save_experience(experience, Path(save_directory))
 
     @classmethod
@@ -257,24 +310,27 @@ class OpenSPMPolicy(PreTrainedPolicy):
         """
         directory = Path(pretrained_name_or_path)
         if not directory.is_dir():
-            files = [CONFIG_NAME, SAFETENSORS_SINGLE_FILE, *FILES]
+            download = partial(
+                snapshot_download, str(pretrained_name_or_path), force_download=force_download,
+                token=token, cache_dir=cache_dir, local_files_only=local_files_only,
+            )  # fmt: skip
+            files = [CONFIG_NAME, SAFETENSORS_SINGLE_FILE, MEMORY_JSON, CAMERAS_JSON]
             try:
-                snapshot = snapshot_download(
-                    str(pretrained_name_or_path), allow_patterns=files, force_download=force_download,
-                    token=token, cache_dir=cache_dir, local_files_only=local_files_only, revision=revision,
-                )  # fmt: skip
+                directory = Path(download(allow_patterns=files, revision=revision))
             except HFValidationError as error:
                 raise FileNotFoundError(
                     f"no checkpoint folder at {pretrained_name_or_path}, and no name on the Hub (user/name)"
                 ) from error
-            directory = Path(snapshot)
+            # What else it needs is named there. Pushes before may have left other files of this kind.
+            download(allow_patterns=data_files(directory), revision=directory.name)
         policy = super().from_pretrained(directory, config=config, strict=strict, **kwargs)
         policy._attach(directory, dataset_meta)
         return policy
 
     def _attach(self, directory: Path, dataset_meta: Any | None) -> None:
         """Give a freshly loaded policy its memory, and its training set when training goes on."""
-        self.experience = load_experience(directory)
+        cameras = None if self.config.cameras is None else Path(self.config.cameras)
+        self.experience = load_experience(directory, cameras)
         if not self.experience.entries:
             raise MemoryFormatError(
                 f"the memory in {directory} holds no entries, so nothing can be done with it; train again"
@@ -287,11 +343,11 @@ class OpenSPMPolicy(PreTrainedPolicy):
                     f"--policy.{name}={asked}; the two cannot be mixed, train with the one you evaluate"
                 )
         if self.config.memory_update == "keep" or dataset_meta is None:
+            where = str(directory / MEMORY_JSON)
+            check_layouts(self.experience.layouts, self.config.layouts(), "the configuration's", where)
             check_anchors(self.experience, str(directory / MEMORY_JSON))
             check_labels(self.experience, self.config.mask_labels, str(directory / CONFIG_NAME))
-        _ = self.segmenter  # what cannot be used is an error now, not at the first observation
-        if self.config.cameras is not None:
-            self.experience = replace(self.experience, cameras=load_cameras(Path(self.config.cameras)))
+        _ = self.segmenter, self.names  # what cannot be used is an error now, not at the first observation
         where = self.config.cameras or str(directory / CAMERAS_JSON)
         check_sizes(self.experience.cameras, self.config.image_sizes, where)
         if dataset_meta is not None:

@@ -4,21 +4,27 @@ from __future__ import annotations
 
 import logging
 from contextlib import AbstractContextManager, nullcontext
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from lerobot.datasets import LeRobotDataset
+from lerobot.utils.constants import HF_LEROBOT_HOME
 
 from lerobot_openspm.configuration_openspm import OpenSPMConfig
+from lerobot_openspm.datasets import open_dataset
 from lerobot_openspm.errors import CalibrationError, DatasetError, PerceptionError
 from lerobot_openspm.experience import Experience
 from lerobot_openspm.flow.samples import perturbed, segment_frames
 from lerobot_openspm.flow.training_set import TrainingSet
 from lerobot_openspm.geometry.camera import Camera, check_sizes, load_cameras
+from lerobot_openspm.judgement.cache import AnswerCache
+from lerobot_openspm.judgement.judging import judge_episodes
+from lerobot_openspm.judgement.make import make_judge
 from lerobot_openspm.memory.robot import RobotModel
 from lerobot_openspm.mining.dataset import Demonstrations
 from lerobot_openspm.mining.mine import (
+    MinedEpisode,
     build_entries,
     layouts_in_scenes,
     learn_scenes,
@@ -39,9 +45,7 @@ PERTURBED_COPIES = 3
 
 def open_demonstrations(dataset_meta: Any, config: OpenSPMConfig) -> Demonstrations:
     """The dataset behind LeRobot's metadata, read as mining reads it."""
-    dataset = LeRobotDataset(
-        dataset_meta.repo_id, root=dataset_meta.root, revision=dataset_meta.revision, video_backend="pyav"
-    )
+    dataset = open_dataset(dataset_meta)
     if config.state_layout is None or config.action_layout is None:
         config.set_dataset_feature_metadata(dataset_meta.features)
     return Demonstrations(dataset, *config.layouts())
@@ -76,7 +80,45 @@ def shapes_of(config: OpenSPMConfig) -> AbstractContextManager[ShapeBackend | No
     return Sam3dShape(worker_command(Path(config.sam3d_python), Path(config.sam3d_checkout)))
 
 
+def judged(
+    demonstrations: Demonstrations, mined: tuple[MinedEpisode, ...], robot: RobotModel, config: OpenSPMConfig
+) -> tuple[MinedEpisode, ...]:
+    """Episodes with what the configuration's judge of phases says of their key poses; unchanged without one.
+
+    Raises:
+        JudgementError: There is nothing to ask.
+        PerceptionError: A model's package or weights are missing.
+        DatasetError: The dataset was never annotated, and its annotations are the judge.
+    """
+    if config.phase_judge == "none":
+        return mined
+    judge = make_judge(
+        config.phase_judge, demonstrations, config.phase_judge_model_id, config.phase_judge_api_base,
+        config.phase_judge_timeout_s, str(config.device),
+    )  # fmt: skip
+    folder = config.phase_judge_cache or HF_LEROBOT_HOME / "openspm" / "phase_judgements"
+    cache = AnswerCache(Path(folder))
+    return judge_episodes(demonstrations, mined, robot, judge, config.phase_judge_confidence, cache)
+
+
 def mine_experience(
+    dataset_meta: Any,
+    config: OpenSPMConfig,
+    known: Experience | None = None,
+    cameras: dict[str, Camera] | None = None,
+    segmenter: Segmenter | None = None,
+) -> Experience:
+    """Mine a dataset, and append what was mined to what is known already, as :func:`mine` does each.
+
+    Raises:
+        CalibrationError, DatasetError: See :func:`mine`.
+        MemoryFormatError: What is known comes from another robot.
+    """
+    mined = mine(dataset_meta, config, known, cameras, segmenter)
+    return known.appended(mined) if known else mined
+
+
+def mine(
     dataset_meta: Any,
     config: OpenSPMConfig,
     known: Experience | None = None,
@@ -90,7 +132,7 @@ def mine_experience(
     Args:
         dataset_meta: LeRobot's metadata of the dataset.
         config: The policy's configuration.
-        known: An experience to append to. Its objects are recognised by what is known of them.
+        known: An experience whose objects are recognised by what is known of them.
         cameras: Calibration to use where the configuration names no file.
         segmenter: Finds the objects' masks, where the configuration's segmentation is not "demonstrations".
 
@@ -104,6 +146,7 @@ def mine_experience(
     episodes = demonstrations.episodes(config.memory_episodes)
     robot = observe_robot(episodes, known.robot if known else None)
     mined = mine_key_poses(demonstrations, robot, config.memory_episodes)
+    mined = replace(mined, mined=judged(demonstrations, mined.mined, robot, config))
     scenes = learn_scenes(demonstrations, mined.mined, cameras)
     models = known.objects if known else {}
     with shapes_of(config) as shapes:
@@ -126,10 +169,10 @@ def mine_experience(
         "mined %d entries from %d episodes (%d skipped); objects: %s",
         len(entries), len(mined.mined), len(mined.skipped), ", ".join(sorted(objects.models)),
     )  # fmt: skip
-    experience = Experience(
-        entries, objects.models, robot, cameras, config.perception, names, config.segmentation, config.shape
-    )
-    return known.appended(experience) if known else experience
+    return Experience(
+        entries, objects.models, robot, cameras, config.perception, names, config.segmentation, config.shape,
+        config.layouts(),
+    )  # fmt: skip
 
 
 def _calibration(

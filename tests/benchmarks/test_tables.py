@@ -42,7 +42,7 @@ def test_the_committed_page_is_made_of_the_committed_results(tmp_path, monkeypat
 def test_what_is_not_measured_says_so_and_how_to_measure_it(results, monkeypatch):
     text = page(monkeypatch, results)
     parts = [*libero_tables.libero_parts(), *perception_tables.perception_parts()]
-    assert text.count("Not measured") == 4 + len(parts) - 2  # but for the introductions
+    assert text.count("Not measured") == 5 + len(parts) - 2  # but for the introductions
     assert "`execution.json` is missing; run `python -m benchmarks.figures`" in text
     assert "`libero_goal.json` is missing; run `python -m benchmarks.libero.run`" in text
 

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import pytest
 from tests.cli.conftest import Openspm
+from tests.memory.memory_files import names
 from tests.policy.lerobot_commands import CALIBRATION, run_command
 
 from lerobot_openspm.cli.main import COMMANDS
@@ -58,11 +59,7 @@ def test_mining_then_inspecting(openspm: Openspm, tiny_dataset: Path, tmp_path: 
     assert set(summary) >= {"entries", "episodes", "key_poses", "objects", "output", "seconds"}
     assert (summary["entries"], summary["episodes"]) == (6, 6)
     assert summary["objects"] == ["bowl", "plate", "stove"]
-    assert sorted(path.name for path in memory.iterdir()) == [
-        "cameras.json",
-        "memory.json",
-        "memory.safetensors",
-    ]
+    assert sorted(path.name for path in memory.iterdir()) == sorted(names(memory))
 
     code, out, _ = openspm("inspect", f"--path={memory}")
     assert code == 0

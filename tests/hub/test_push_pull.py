@@ -1,18 +1,22 @@
 """A checkpoint goes to the Hub and comes back with everything that the policy knows."""
 
 import json
+import shutil
 import subprocess
 import sys
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from textwrap import dedent
 from typing import Any
 
 import pytest
 from tests.hub.loopback_hub import LoopbackHub
+from tests.memory.memory_files import names
+
+from lerobot_openspm.experience import load_experience, save_experience
 
 REPO = "tester/openspm-tabletop"
-MEMORY = ["memory.json", "memory.safetensors", "cameras.json"]
 
 # Acts on recorded observations; what is printed says which actions came out, to the last bit.
 ACT = """
@@ -93,9 +97,9 @@ def test_what_is_pulled_acts_as_what_was_pushed(
     files = loopback_hub.files(REPO)
     assert set(files) >= {
         "config.json", "model.safetensors", "train_config.json", "README.md", "policy_preprocessor.json",
-        "policy_postprocessor.json", *MEMORY,
+        "policy_postprocessor.json", *names(checkpoint),
     }  # fmt: skip
-    for name in MEMORY:
+    for name in names(checkpoint):
         assert files[name] == (checkpoint / name).read_bytes(), name
 
     pulled = run(ACT + PULL, tiny_dataset, REPO, home="home_b")
@@ -108,8 +112,31 @@ def test_what_is_pulled_acts_as_what_was_pushed(
 
     # Whoever deletes the memory is told so, and not given a policy without one.
     commit = loopback_hub.repo("models", REPO)
-    commit.commit({path: content for path, content in files.items() if path != "memory.safetensors"}, "oops")
+    gone = names(checkpoint)[1]
+    commit.commit({path: content for path, content in files.items() if path != gone}, "oops")
     broken = run(ACT + PULL, tiny_dataset, REPO, home="home_c")
     assert broken.returncode != 0
     assert "MemoryFormatError: no memory at" in broken.stderr
     assert "pull the whole checkpoint" in broken.stderr
+
+
+def test_a_changed_memory_is_pushed_again_and_what_it_was_before_is_not_pulled(
+    run: Run, loopback_hub: LoopbackHub, checkpoint: Path, tiny_dataset: Path, tmp_path: Path
+):
+    first = answer(run(ACT + PUSH, checkpoint, tiny_dataset, REPO, home="home_a"))
+    changed = Path(shutil.copytree(checkpoint, tmp_path / "changed"))
+    experience = load_experience(changed)
+    save_experience(replace(experience, entries=experience.entries[:5]), changed)
+    answer(run(ACT + PUSH, changed, tiny_dataset, REPO, home="home_a"))
+    files = loopback_hub.files(REPO)
+    # LeRobot's upload deletes nothing.
+    assert {*names(checkpoint), *names(changed)} <= set(files)
+    stale = set(names(checkpoint)) - set(names(changed))
+    assert len(stale) == 2
+
+    loopback_hub.requests.clear()
+    assert answer(run(ACT + PULL, tiny_dataset, REPO, home="home_b")) == [first, 5]
+    assert not [request for request in loopback_hub.requests if any(name in request for name in stale)]
+    # A cache that holds the one before gets the new one.
+    answer(run(ACT + PUSH, checkpoint, tiny_dataset, REPO, home="home_a"))
+    assert answer(run(ACT + PULL, tiny_dataset, REPO, home="home_b")) == [first, 6]

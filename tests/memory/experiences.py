@@ -1,15 +1,29 @@
 """A whole experience built by hand: entries, objects of all kinds, a robot, a camera."""
 
+from dataclasses import replace
+
 import numpy as np
-from tests.memory.builders import entry, key_pose, robot
+from tests.memory.builders import entry, key_pose, pick_and_place, robot
 from tests.perception.builders import box_model, masked_model, model, patch_model
 
 from lerobot_openspm.experience import Experience
 from lerobot_openspm.geometry import se3
 from lerobot_openspm.geometry.camera import Camera
+from lerobot_openspm.geometry.layout import parse_layout
 from lerobot_openspm.memory.entry import Axis
 
 SLIDE = Axis("slide", np.array([0.0, -0.6, 0.8]), 0.15)
+
+
+NAMES = ("x", "y", "z", "axis_angle_x", "axis_angle_y", "axis_angle_z", "gripper")
+LAYOUTS = (parse_layout(NAMES, "state"), parse_layout(NAMES[:3] + NAMES[6:], "action"))
+
+
+def merged_entry(**changes):
+    """An entry with the spread of several demonstrations around its key poses."""
+    spread = np.random.default_rng(1).normal(0, 0.01, (9, 6))
+    merged = tuple(replace(pose, covariance=np.cov(spread.T)) for pose in pick_and_place())
+    return entry(key_poses=merged, **changes)
 
 
 def experience(**changes):

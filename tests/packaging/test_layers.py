@@ -1,5 +1,7 @@
 """Imports go one way: geometry <- calibration, perception, mining, memory, flow <- control <- policy.
 
+judgement lies above mining, whose key poses it judges, and below policy.
+
 envs, bench and cli are leaves.
 """
 
@@ -12,9 +14,11 @@ import pytest
 SRC = Path(__file__).parents[2] / "src"
 PACKAGE = "lerobot_openspm"
 FACE = "lerobot_policy_openspm"
+BASICS = ("errors", "files")
 LEAVES = {"envs", "cli", "bench"}
-# What each part may import of ours besides itself and `errors`. Modules directly in the package
-# (configuration_openspm, modeling_openspm, processor_openspm and their helpers) are the part "policy".
+# What each part may import of ours besides itself and the basics: `errors`, and writing `files`. Modules
+# directly in the package (configuration_openspm, modeling_openspm, processor_openspm and their helpers) are
+# the part "policy".
 ALLOWED = {
     "geometry": set(),
     "calibration": {"geometry"},
@@ -22,20 +26,21 @@ ALLOWED = {
     "memory": {"geometry"},
     "mining": {"geometry", "perception", "memory"},
     "flow": {"geometry", "memory", "mining"},
+    "judgement": {"geometry", "perception", "memory", "mining"},
     "control": {"geometry", "perception", "memory", "flow"},
-    "policy": {"geometry", "perception", "memory", "mining", "flow", "control"},
+    "policy": {"geometry", "perception", "memory", "mining", "judgement", "flow", "control"},
 }
 PURE = ("geometry", "calibration", "perception", "memory", "control")
 
 
 def part_of(module: str) -> str:
-    """Return the part that a module of ours belongs to: a folder's name, "errors", "policy" or "face"."""
+    """Return the part that a module of ours belongs to: a folder's name, "basics", "policy" or "face"."""
     names = module.split(".")
     if names[0] == FACE:
         return "face"
     if len(names) > 1 and (SRC / PACKAGE / names[1]).is_dir():
         return names[1]
-    return "errors" if names[1:2] == ["errors"] else "policy"
+    return "basics" if names[1:2] in ([name] for name in BASICS) else "policy"
 
 
 def imported(tree: ast.AST, module: str, *, top_only: bool = False) -> Iterator[str]:
@@ -78,7 +83,7 @@ MODULES = modules()
 def ours(module: str) -> Iterator[tuple[str, str]]:
     """Yield (imported name, its part) for a module's imports of ours from other parts."""
     for name in imported(MODULES[module], module):
-        if name.split(".")[0] in (PACKAGE, FACE) and part_of(name) not in (part_of(module), "errors"):
+        if name.split(".")[0] in (PACKAGE, FACE) and part_of(name) not in (part_of(module), "basics"):
             yield name, part_of(name)
 
 
@@ -106,8 +111,9 @@ def test_envs_bench_and_cli_are_leaves():
     assert wrong == []
 
 
-def test_errors_imports_nothing_of_ours():
-    name = f"{PACKAGE}.errors"
+@pytest.mark.parametrize("module", BASICS)
+def test_the_basics_import_nothing_of_ours(module: str):
+    name = f"{PACKAGE}.{module}"
     assert [n for n in imported(MODULES[name], name) if n.startswith((PACKAGE, FACE))] == []
 
 

@@ -86,7 +86,18 @@ def test_absent_object_is_not_found(models, unseen):
 def test_two_of_a_kind_are_ambiguous(models, unseen):
     poses = unseen[0] | {"distractor": se3.from_yaw([0.0, -0.02, 0.0], 0.0)}
     views = render([(SHAPES["cup"], poses["cup"]), (SHAPES["cup"], poses["distractor"])])
-    assert localise(views, models["cup"]).status == "ambiguous"
+    estimate = localise(views, models["cup"])
+    assert estimate.status == "ambiguous"
+    assert len(estimate.others) == 1
+    for T in (poses["cup"], poses["distractor"]):
+        told = (estimate.T_world_obj, *estimate.others)
+        assert min(np.linalg.norm(one[:2, 3] - T[:2, 3]) for one in told) < 0.01
+
+
+def test_a_single_object_has_no_others(models, unseen):
+    for poses in unseen[:4]:
+        views = views_of(poses)
+        assert all(localise(views, models[name]).others == () for name in ("block", "cup"))
 
 
 def test_one_view_is_enough_and_none_is_an_error(models, unseen):

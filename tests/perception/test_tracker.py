@@ -226,3 +226,26 @@ def test_a_round_object_keeps_the_yaw_it_was_given():
     for yaw in (1.0, 2.0, 3.0):
         assert look(one, seen(se3.from_yaw(CUP[:3, 3], yaw))) == frozenset()
     assert float(se3.yaw_of(pose(one))) == pytest.approx(0.4)
+
+
+def test_what_the_hand_has_put_down_is_taken_to_be_there_until_it_is_seen_or_doubted():
+    one = tracker()
+    one.hold("cup", FAR_HAND)
+    moved = shifted(FAR_HAND, 0.3, 0.2, -0.1)
+    placed = shifted(CUP, 0.3, 0.2, -0.1)
+    one.release(["cup"], moved)
+    for _ in range(20):  # in sight, and not recognised where it is
+        look(one, unseen())
+        assert one.status("cup") is TrackStatus.HIDDEN
+    assert_allclose(pose(one), placed, atol=1e-9)
+    look(one, seen(placed))
+    for _ in range(20):
+        look(one, unseen())
+    assert one.status("cup") is TrackStatus.LOST, "it was recognised there, so it would be again"
+    one = tracker()
+    one.hold("cup", FAR_HAND)
+    one.release(["cup"], moved)
+    one.doubt(["cup"], moved)
+    for _ in range(20):
+        look(one, unseen())
+    assert one.status("cup") is TrackStatus.LOST

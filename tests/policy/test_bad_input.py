@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import torch
 from lerobot.datasets import LeRobotDataset, LeRobotDatasetMetadata
+from tests.memory.memory_files import edit_header, names
 from tests.policy.conftest import Frame, batch_of
 from tests.policy.lerobot_commands import lerobot_train, training_options
 from tests.policy.test_learning import new_config
@@ -99,10 +100,11 @@ def copy(checkpoint: Path, tmp_path: Path) -> Path:
     return Path(shutil.copytree(checkpoint, tmp_path / "checkpoint"))
 
 
-@pytest.mark.parametrize("name", ["memory.json", "memory.safetensors"])
+@pytest.mark.parametrize("index", range(3))
 def test_a_checkpoint_without_its_memory_is_refused(
-    load: Callable[..., OpenSPMPolicy], copy: Path, name: str
+    load: Callable[..., OpenSPMPolicy], copy: Path, index: int
 ):
+    name = names(copy)[index]
     (copy / name).unlink()
     with pytest.raises(MemoryFormatError, match=f"no memory at .*{name}.*pull the whole checkpoint"):
         load(copy)
@@ -114,11 +116,15 @@ def test_a_checkpoint_without_calibration_is_refused(load: Callable[..., OpenSPM
         load(copy, cameras=None)
 
 
-@pytest.mark.parametrize("name", ["memory.json", "memory.safetensors"])
-def test_a_truncated_memory_is_refused(load: Callable[..., OpenSPMPolicy], copy: Path, name: str):
+@pytest.mark.parametrize("index", range(3))
+def test_a_truncated_memory_is_refused(load: Callable[..., OpenSPMPolicy], copy: Path, index: int):
+    name = names(copy)[index]
     (copy / name).write_bytes((copy / name).read_bytes()[:-100])
     with pytest.raises(MemoryFormatError, match=f"{name}.*truncated.*train or pull it again"):
         load(copy)
+
+
+SHORT_LAYOUT = {"names": ["x", "y", "z", "gripper"], "rotation": "none"}
 
 
 @pytest.mark.parametrize(
@@ -130,18 +136,25 @@ def test_a_truncated_memory_is_refused(load: Callable[..., OpenSPMPolicy], copy:
         ),
         ({"version": "1"}, "got version '1'"),
         ({"format": "something"}, "got format 'something', expected 'openspm-memory'"),
-        ({"entries": {}}, "must be lists"),
-        ({"entries": [{}]}, r"entries\[0\] is malformed"),
+        ({"objects": {}}, "must be lists"),
         ({"objects": [3]}, "'objects' must hold JSON objects, got int"),
         ({"robot": None}, "'robot' is malformed"),
-        ({"arrays": {}}, "field 'sha256' is missing"),
+        ({"files": {}}, r"files\['arrays'\] is missing"),
+        (
+            {
+                "layouts": {
+                    what: {"names": ["x", "y", "z", "gripper"], "rotation": "none"}
+                    for what in ("state", "action")
+                }
+            },
+            r"'layouts': the memory's state is \['x', 'y', 'z', 'gripper'\].*the configuration's.*robots",
+        ),
     ],
 )
 def test_a_changed_memory_is_refused(
     load: Callable[..., OpenSPMPolicy], copy: Path, change: dict, message: str
 ):
-    memory = json.loads((copy / "memory.json").read_text())
-    (copy / "memory.json").write_text(json.dumps(memory | change))
+    edit_header(copy, lambda header: header.update(change))
     with pytest.raises(MemoryFormatError, match=message):
         load(copy)
 
@@ -271,11 +284,9 @@ def test_an_object_that_perception_does_not_know_is_refused_when_it_is_loaded(
     checkpoint: Path, tmp_path: Path
 ):
     shutil.copytree(checkpoint, tmp_path / "changed")
-    file = tmp_path / "changed" / "memory.json"
-    data = json.loads(file.read_text())
-    name = data["objects"].pop(0)["name"]
-    file.write_text(json.dumps(data))
-    with pytest.raises(MemoryFormatError, match=rf"memory\.json: entries\[\d+\] has key poses at '{name}'"):
+    name = json.loads((checkpoint / "memory.json").read_text())["objects"][0]["name"]
+    edit_header(tmp_path / "changed", lambda header: header["objects"].pop(0))
+    with pytest.raises(MemoryFormatError, match=rf"memory\.json: entries have key poses at '{name}'"):
         OpenSPMPolicy.from_pretrained(tmp_path / "changed")
 
 

@@ -5,6 +5,7 @@ import shutil
 from pathlib import Path
 
 import pytest
+from tests.memory.memory_files import names
 from tests.policy.lerobot_commands import lerobot_train, pretrained, run_command, training_options
 
 from lerobot_openspm.experience import load_experience
@@ -36,7 +37,7 @@ def evaluate(checkpoint: Path, output: Path, *options: str) -> tuple[dict, list[
 def test_training_leaves_a_whole_checkpoint(checkpoint: Path):
     names = {path.name for path in checkpoint.iterdir()}
     assert names >= {
-        "config.json", "model.safetensors", "memory.json", "memory.safetensors", "cameras.json",
+        "config.json", "model.safetensors", *names(checkpoint),
         "policy_preprocessor.json", "policy_postprocessor.json", "train_config.json",
     }  # fmt: skip
     assert not [name for name in names if name.startswith(".") or name.endswith((".pkl", ".bin", ".pt"))]
@@ -61,9 +62,7 @@ def test_evaluation_writes_its_results_and_the_episode_log(
 def test_resuming_goes_on_with_the_same_memory(training_run: Path, tmp_path: Path):
     output = tmp_path / "run"
     shutil.copytree(training_run, output, symlinks=True)
-    before = {
-        name: (pretrained(output) / name).read_bytes() for name in ("memory.json", "memory.safetensors")
-    }
+    before = {name: (pretrained(output) / name).read_bytes() for name in names(pretrained(output))}
     steps = json.loads((pretrained(output) / "train_config.json").read_text())["steps"] + 10
     lerobot_train(
         f"--config_path={pretrained(output) / 'train_config.json'}", "--resume=true", f"--steps={steps}",

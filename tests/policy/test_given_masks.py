@@ -11,6 +11,7 @@ import torch
 from lerobot.configs import PreTrainedConfig
 from lerobot.datasets import LeRobotDatasetMetadata
 from lerobot.envs.utils import preprocess_observation
+from tests.memory.memory_files import edit_header
 from tests.policy.conftest import NAME
 from tests.policy.lerobot_commands import CALIBRATION
 
@@ -95,8 +96,7 @@ def relabelled(checkpoint: Path, copy: Path) -> Path:
     copy.mkdir()
     for path in checkpoint.iterdir():
         (copy / path.name).write_bytes(path.read_bytes())
-    memory = json.loads((copy / "memory.json").read_text())
-    (copy / "memory.json").write_text(json.dumps(memory | {"segmentation": "given", "shape": "box"}))
+    edit_header(copy, lambda header: header.update(segmentation="given", shape="box"))
     return copy
 
 

@@ -6,6 +6,7 @@ import torch
 from lerobot.configs import FeatureType
 from lerobot.datasets import LeRobotDatasetMetadata
 from lerobot.utils.feature_utils import dataset_to_policy_features
+from tests.memory.memory_files import names
 from tests.policy.conftest import Frame, act
 from tests.policy.lerobot_commands import CALIBRATION
 
@@ -149,7 +150,7 @@ def test_an_episode_that_does_not_exist_is_named(tiny_meta: LeRobotDatasetMetada
 def test_mining_is_deterministic(tiny_meta: LeRobotDatasetMetadata, tmp_path: Path, checkpoint: Path):
     policy = OpenSPMPolicy(new_config(tiny_meta), dataset_meta=tiny_meta)
     policy.save_pretrained(tmp_path / "again")
-    for name in ("memory.json", "memory.safetensors", "cameras.json"):
+    for name in names(checkpoint):
         assert (tmp_path / "again" / name).read_bytes() == (checkpoint / name).read_bytes(), name
 
 

@@ -11,7 +11,7 @@ import numpy as np
 from lerobot_openspm.envs import layout, scene
 from lerobot_openspm.envs.simulator import TabletopSimulator
 from lerobot_openspm.envs.tabletop_env import RENDER_SIZE, TabletopEnv
-from lerobot_openspm.envs.tasks import TASKS
+from lerobot_openspm.envs.tasks import ANY_TASK, TASKS
 from lerobot_openspm.geometry import se3
 from lerobot_openspm.geometry.camera import Camera
 from lerobot_openspm.memory.instruction import parse_instruction
@@ -27,7 +27,7 @@ class TabletopWorld:
         self.env = env
         env.reset(seed=seed)
         self.instruction = env.task_description
-        self.max_steps = 300
+        self.max_steps = ANY_TASK[env.task].max_steps
 
     def state(self) -> np.ndarray:
         """``observation.state`` (8,)."""

@@ -6,13 +6,12 @@ import importlib
 import importlib.util
 import json
 import logging
-import multiprocessing
-from collections.abc import Callable, Iterable, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from lerobot_openspm.bench.workers import each
 from lerobot_openspm.envs.gl_backend import set_default_gl_backend
 from lerobot_openspm.envs.tasks import select_tasks
 from lerobot_openspm.errors import OpenSPMError
@@ -121,7 +120,7 @@ def perception(config: BenchConfig) -> dict[str, Any]:
     tasks = measure.tasks(config.env.type, config.env.task)
     jobs = [(tasks[i % len(tasks)], config.seed + i // len(tasks)) for i in range(config.episodes)]
     left = [job for job in jobs if not measure.file_of(folder, *job).is_file()]
-    for _ in _each(config.workers, measure.run, [(setting, folder, *job) for job in left]):
+    for _ in each(config.workers, measure.run, [(setting, folder, *job) for job in left]):
         pass  # each writes its own file
     samples = measure.read(folder, jobs)
     return {**measure.summarise(samples), **measure.costs(setting), "episodes": len(jobs)}
@@ -155,24 +154,10 @@ def _disturbed(config: BenchConfig, what: str, conditions: Sequence[Any]) -> dic
     jobs = measure.jobs(conditions, config.env.task, config.episodes, config.seed)
     done = measure.read(log)
     left = [(checkpoint, *job) for job in jobs if (job[0].name, *job[1:]) not in done]
-    for result in _each(config.workers, measure.run, left):
+    for result in each(config.workers, measure.run, left):
         measure.write_line(log, result)
     done = measure.read(log)
     return measure.summarise([done[condition.name, task, seed] for condition, task, seed in jobs])
-
-
-def _each(workers: int, function: Callable[..., Any], jobs: Sequence[tuple[Any, ...]]) -> Iterable[Any]:
-    """Call a function for every job in processes of their own; yields results as they come."""
-    from tqdm import tqdm
-
-    context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(workers, context) as pool:
-        running = [pool.submit(function, *job) for job in jobs]
-        try:
-            for future in tqdm(as_completed(running), "Episodes", len(running), disable=not jobs):
-                yield future.result()
-        finally:
-            pool.shutdown(cancel_futures=True)
 
 
 # Measures of a checkpoint in a simulator, which share their options.
@@ -184,7 +169,9 @@ MEASURES: dict[str, Callable[[BenchConfig], dict[str, Any]]] = {
 # Measures with options of their own: a module with a dataclass `Options` and `measure(options)`, which
 # returns what is printed. Imported when it is asked for.
 ON_THEIR_OWN: dict[str, str] = {
+    "language": "lerobot_openspm.bench.language",
     "memory": "lerobot_openspm.bench.memory",
+    "teach": "lerobot_openspm.bench.teach",
 }
 
 

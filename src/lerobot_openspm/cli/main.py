@@ -16,6 +16,7 @@ COMMANDS = {
     "collect": ("lerobot_openspm.cli.collect", "record scripted demonstrations on the tabletop or LIBERO"),
     "calibrate": ("lerobot_openspm.cli.calibrate", "estimate a camera's pose from a dataset's own episodes"),
     "mine": ("lerobot_openspm.cli.mine", "mine a dataset's key poses into a memory"),
+    "teach": ("lerobot_openspm.cli.teach", "teach a checkpoint a task from a few demonstrations"),
     "inspect": ("lerobot_openspm.cli.inspect", "show the memory of a checkpoint"),
     "memory": ("lerobot_openspm.cli.memory", "list, show and change the entries of a memory"),
     "bench": ("lerobot_openspm.cli.bench", "measure a checkpoint: bench perception, tracking or cameras"),

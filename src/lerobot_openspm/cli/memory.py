@@ -6,11 +6,18 @@ import importlib
 
 from lerobot_openspm.errors import OpenSPMError
 
+CHANGE = "lerobot_openspm.cli.memory_change"
 # Command -> module and function that takes the arguments, and what it is for.
 COMMANDS = {
     "list": ("lerobot_openspm.cli.memory_show", "list_entries", "a line for every entry or task"),
     "show": ("lerobot_openspm.cli.memory_show", "show", "entries with all their numbers"),
     "search": ("lerobot_openspm.cli.memory_search", "search", "what an instruction finds, with its scores"),
+    "add": (CHANGE, "add", "add entries of another memory or of an exported file"),
+    "remove": (CHANGE, "remove", "remove entries; they are kept as superseded"),
+    "merge": (CHANGE, "merge", "merge near-duplicates, their spread kept as covariance"),
+    "rate": (CHANGE, "rate", "say how acting by an entry ended"),
+    "cameras": (CHANGE, "cameras", "give a memory another calibration"),
+    "export": ("lerobot_openspm.cli.memory_export", "export", "write entries to a file or folder"),
 }
 
 

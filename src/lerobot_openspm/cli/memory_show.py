@@ -25,12 +25,14 @@ class ListConfig:
         path: Folder of the checkpoint or of a mined memory.
         instruction: List only entries whose instruction contains this.
         tasks: List tasks, with the number and mean quality of their entries, instead of entries.
+        all: List superseded entries too: those that were replaced, merged or removed.
         limit: List at most this many.
     """
 
     path: str = "outputs/memory"
     instruction: str = ""
     tasks: bool = False
+    all: bool = False
     limit: int = 50
 
 
@@ -57,12 +59,16 @@ def list_entries(args: list[str]) -> None:
     experience = load_experience(Path(config.path))
     listed = [entry for entry in experience.entries if config.instruction in entry.language]
     lines = _task_lines(listed) if config.tasks else [_line(entry) for entry in listed]
+    if config.all:
+        old = [entry for entry in experience.superseded if config.instruction in entry.language]
+        lines += [f"{_line(entry)}  superseded" for entry in old]
     for line in lines[: config.limit]:
         print(line)
     if len(lines) > config.limit:
         print(f"... {len(lines) - config.limit} more; --limit={len(lines)} lists all")
     per_task = Counter(entry.language for entry in listed)
-    print(json.dumps({"entries": len(experience.entries), "listed": len(listed), "per_task": per_task}))
+    counts = {"entries": len(experience.entries), "superseded": len(experience.superseded)}
+    print(json.dumps({**counts, "listed": len(listed), "per_task": per_task}))
 
 
 def show(args: list[str]) -> None:

@@ -10,6 +10,7 @@ from pathlib import Path
 import draccus
 
 from lerobot_openspm.configuration_openspm import OpenSPMConfig
+from lerobot_openspm.datasets import dataset_metadata
 from lerobot_openspm.experience import save_experience
 from lerobot_openspm.training import mine_experience, segmenter_of
 
@@ -33,11 +34,9 @@ class MineConfig:
 
 def main(args: list[str]) -> None:
     """Mine, save, and print one JSON object."""
-    from lerobot.datasets import LeRobotDatasetMetadata
-
     config = draccus.parse(MineConfig, args=args)
     start_s = time.monotonic()
-    meta = LeRobotDatasetMetadata(config.repo_id, root=config.root)
+    meta = dataset_metadata(config.repo_id, config.root)
     experience = mine_experience(meta, config.policy, segmenter=segmenter_of(config.policy))
     save_experience(experience, Path(config.output))
     summary = {

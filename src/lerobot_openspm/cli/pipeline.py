@@ -81,9 +81,14 @@ def train(
 
 
 def evaluate(
-    checkpoint: Path, output: Path, episodes: int, seed: int, options: Sequence[str] = ()
+    checkpoint: Path,
+    output: Path,
+    episodes: int,
+    seed: int,
+    options: Sequence[str] = (),
+    tasks: Sequence[str] = TASK_NAMES,
 ) -> list[Episode]:
-    """Run lerobot-eval on all tasks, unless it is done. Returns its episodes.
+    """Run lerobot-eval on all tasks, or those given, unless it is done. Returns its episodes.
 
     Two runs share the tasks, one environment each: on two cores that is twice as fast as one run with a batch
     of environments, whose images all pass through one process. An episode is the same either way. Tasks that
@@ -94,17 +99,17 @@ def evaluate(
     discard_unless(output, made_of)
     output.mkdir(parents=True, exist_ok=True)
     finished = Counter(e.task for e in read_episodes(log, seeds))
-    left = [task for task in TASK_NAMES if finished[task] < episodes]
+    left = [task for task in tasks if finished[task] < episodes]
     runs = [
-        _start_evaluation(checkpoint, output / f"lerobot_eval_{half}", tasks, log, episodes, seed, options)
-        for half, tasks in enumerate((left[::2], left[1::2]))
-        if tasks
+        _start_evaluation(checkpoint, output / f"lerobot_eval_{half}", some, log, episodes, seed, options)
+        for half, some in enumerate((left[::2], left[1::2]))
+        if some
     ]
     _wait(runs, log, len(left) * episodes)
     found = read_episodes(log, seeds)
-    if len(found) != len(TASK_NAMES) * episodes:
+    if len(found) != len(tasks) * episodes:
         raise RuntimeError(
-            f"{log} holds {len(found)} episodes, expected {len(TASK_NAMES)} tasks x {episodes} seeds; "
+            f"{log} holds {len(found)} episodes, expected {len(tasks)} tasks x {episodes} seeds; "
             f"delete {output} and run again"
         )
     return found

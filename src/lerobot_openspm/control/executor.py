@@ -116,6 +116,11 @@ class Executor:
             self._replace_target(present)
         self._queue.clear()
 
+    def finish_part(self) -> None:
+        """Wait for the plan of the next part, which gets attempts of its own."""
+        self.stop(Status.WAITING)
+        self.attempts = 0
+
     @property
     def target(self) -> Target | None:
         """The key pose that is being approached, or None."""

@@ -1,24 +1,30 @@
-"""One environment from instruction to actions: look, retrieve, transfer, follow, look again."""
+"""One environment from instruction to actions: look, retrieve, transfer, follow, look again.
+
+An instruction that no demonstration shows as a whole is carried out part by part: each is planned when it is
+reached, from a fresh look, because what the parts before it moved is elsewhere now.
+"""
 
 from __future__ import annotations
 
 import logging
 import zlib
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 
-from lerobot_openspm.control.executor import ControlSettings, Executor, Hand, Status
-from lerobot_openspm.control.transfer import Target, TransferLimits, check_transfer, geometric_score, transfer
+from lerobot_openspm.control.executor import Executor, Hand, Status
+from lerobot_openspm.control.knowledge import Knowledge
+from lerobot_openspm.control.referents import Referents, references
+from lerobot_openspm.control.transfer import Target, rise
 from lerobot_openspm.flow.condition import Query
 from lerobot_openspm.geometry import se3
 from lerobot_openspm.geometry.se3 import Array
+from lerobot_openspm.memory.compound import Candidate, plan_parts
 from lerobot_openspm.memory.entry import MemoryEntry
-from lerobot_openspm.memory.retrieval import Scored, ScoreWeights, retrieve, semantic_candidates
-from lerobot_openspm.memory.robot import RobotModel
+from lerobot_openspm.memory.retrieval import Scored
 from lerobot_openspm.perception.camera_watch import Fault
-from lerobot_openspm.perception.tracker import Tracker, TrackerSettings, TrackStatus
+from lerobot_openspm.perception.tracker import Tracker, TrackStatus
 from lerobot_openspm.perception.types import PoseEstimate
 
 logger = logging.getLogger(__name__)
@@ -52,33 +58,6 @@ class Seen:
 Look = Callable[[Sequence[str], Mapping[str, Array], float], Seen]
 
 
-@dataclass(frozen=True)
-class Knowledge:
-    """What every environment shares: the memory, the robot, how to choose and how to follow.
-
-    Attributes:
-        entries: The memory bank.
-        yaw_periods: Angle by object that turns it into itself, radians.
-        robot: The robot.
-        weights: Of retrieval.
-        limits: Of transferred key poses.
-        settings: How key poses are followed.
-        tracker: When poses are believed.
-        tracking: Whether objects are looked for again once a plan is made.
-        step_s: Seconds that a control step takes.
-    """
-
-    entries: Sequence[MemoryEntry]
-    yaw_periods: Mapping[str, float]
-    robot: RobotModel
-    weights: ScoreWeights
-    limits: TransferLimits
-    settings: ControlSettings
-    tracker: TrackerSettings = field(default_factory=TrackerSettings)
-    tracking: bool = True
-    step_s: float = 0.05
-
-
 class Row:
     """State of one environment, and nothing that another environment could see.
 
@@ -86,7 +65,8 @@ class Row:
         instruction: What is to be done.
         executor: Follows the plan.
         tracker: Follows the objects.
-        ranked: The entries of the last retrieval with their scores, best first.
+        ranked: The entries of the last retrieval with their scores, best first; where a part of the
+            instruction is carried out, those parts of entries that are about it.
         layout: Poses ``T_world_obj`` that the plan was made with: of what the hand has touched, from before.
         seen: What the last look brought; None before the first.
         is_paused: Whether the hand holds still until something is seen again.
@@ -101,6 +81,13 @@ class Row:
         self.layout: dict[str, Array] = {}
         self.seen: Seen | None = None
         self.is_paused = False
+        # What the instruction is carried out by; made at the first look, because it may be refused.
+        self._parts: tuple[tuple[Candidate, ...], ...] = ()
+        self._part = 0
+        self._used: list[MemoryEntry] = []
+        self._referents = Referents()
+        self._altered: set[str] = set()  # opened or turned: looks different now, and stands still
+        self._start_height = np.inf
         self._step = -1
         # Both at least one step; four looks a second whatever the robot's rate.
         self._look_again_steps = max(1, round(LOOK_AGAIN_S / knowledge.step_s))
@@ -114,6 +101,11 @@ class Row:
     def status(self) -> Status:
         """What the execution is up to."""
         return self.executor.status
+
+    @property
+    def used_entries(self) -> tuple[MemoryEntry, ...]:
+        """The entries of the bank that were acted by so far, each once, in order."""
+        return tuple(self._used)
 
     def observe(self, hand: Hand, look: Look) -> None:
         """Take in a new observation: plan, advance, look around, go where things are now, try again."""
@@ -129,7 +121,9 @@ class Row:
             index = self.executor.index
             is_to_retry = not self.is_paused and self.executor.advance(hand)
             self._carry(index, hand)
-            if is_to_retry:
+            if self._is_to_go_on():
+                self._begin_next_part(hand, look)
+            elif is_to_retry:
                 self._try_again(hand, look)
             elif self._is_time_to_look(index):
                 self._look_around(hand, look)
@@ -148,27 +142,60 @@ class Row:
 
     # Planning.
 
+    @property
+    def _is_last_part(self) -> bool:
+        return self._part + 1 >= len(self._parts)
+
     def _plan(self, hand: Hand, look: Look) -> None:
-        candidates = semantic_candidates(self.instruction, self._knowledge.entries)
-        names = list(dict.fromkeys(name for entry, _ in candidates for name in entry.objects))
-        self._see(names, hand, look)
+        """Plan the part that is to be carried out now, once its objects are found."""
+        if not self._parts:
+            self._parts = plan_parts(self.instruction, self._knowledge.entries, self._knowledge.names)
+            self._refer()
+            self._start_height = float(hand.T_world_ee[2, 3])
+        self._see(self._sought(), hand, look)
         if self.status is Status.CAMERA_FAULT:
             return
         self.layout |= self.tracker.poses(hand.T_world_ee)
-        self.ranked = retrieve(
-            candidates, lambda entry: self._geometric_score(entry, hand.T_world_ee), self._knowledge.weights
-        )
+        candidates = self._parts[self._part]
+        self.ranked = self._knowledge.rank(candidates, self.layout, hand.T_world_ee)
         best = self.ranked[0].entry
         if missing := [name for name in best.objects if name not in self.layout]:
             logger.info("%r: cannot find %s", self.instruction, missing)
             self.executor.status = Status.OBJECT_NOT_FOUND
-        elif problems := self._problems(best, hand.T_world_ee):
+        elif problems := self._knowledge.problems(best, self.layout, hand.T_world_ee):
             logger.warning("%r: %s", self.instruction, "; ".join(problems))
             self.executor.status = Status.INFEASIBLE
         else:
+            source = next(one.source for one in candidates if one.entry is best)
+            if not any(used is source for used in self._used):
+                self._used.append(source)
             self._begin(0, hand)
             if self._is_tracking:  # else nothing is looked at any more that could end the waiting
                 self._wait_for_what_is_needed(hand)
+
+    def _sought(self) -> list[str]:
+        """Objects of this part, and of those to come, which it may hide; not what looks different now."""
+        entries = [one.entry for part in self._parts[self._part :] for one in part]
+        needed = [name for entry in entries for name in entry.objects]
+        names = dict.fromkeys([*needed, *self._referents.landmarks])
+        return [name for name in names if name not in self._altered]
+
+    def _refer(self) -> None:
+        """Take in which of several like objects this part is about."""
+        said = {name: where for one in self._parts[self._part] for name, where in references(one).items()}
+        self.tracker.forget(self._referents.hear(said))
+
+    def _is_to_go_on(self) -> bool:
+        """Whether a part is done that others follow."""
+        return self.status is Status.DONE and not self._is_last_part
+
+    def _begin_next_part(self, hand: Hand, look: Look) -> None:
+        """Look at what the hand has left behind, and go on from there."""
+        self._part += 1
+        self._refer()
+        logger.info("%r: part %d of %d", self.instruction, self._part + 1, len(self._parts))
+        self.executor.finish_part()
+        self._plan(hand, look)
 
     def _try_again(self, hand: Hand, look: Look) -> None:
         """Find the objects of the remaining key poses again and go back to the approach of this contact."""
@@ -177,7 +204,8 @@ class Row:
         if self._knowledge.tracking:
             # What should be in the hand is not, or what was to be met is not there: it may be anywhere.
             attempted = self.executor.plan[index : self.executor.index + 1]
-            self.tracker.doubt({pose.memory.anchor.place for pose in attempted}, hand.T_world_ee)
+            places = {pose.memory.anchor.place for pose in attempted}
+            self.tracker.doubt(places - self._altered, hand.T_world_ee)
             ahead = self._anchors(index)
             self._see(ahead, hand, look)
             self._update(ahead, hand)
@@ -226,7 +254,8 @@ class Row:
             if fault.seconds >= GIVE_UP_S:
                 logger.warning("%r: stopping, camera %r: %s", self.instruction, camera, fault.reason)
                 self.executor.stop(Status.CAMERA_FAULT)
-        return self.tracker.look(self.seen.estimates, hand.T_world_ee, waited_s)
+        meant = self._referents.sort_out(self.seen.estimates, self.tracker.poses(hand.T_world_ee))
+        return self.tracker.look(meant, hand.T_world_ee, waited_s)
 
     def _look_around(self, hand: Hand, look: Look) -> None:
         """Look at what the remaining key poses need and what is in the hand; act on what has changed."""
@@ -272,13 +301,16 @@ class Row:
                 self.tracker.hold(passed.anchor.place, hand.T_world_ee)
             elif passed.phase in ("release", "push"):
                 self.tracker.release(self.tracker.held, hand.T_world_ee)
+            elif passed.phase in ("open", "turn"):
+                self._altered.add(passed.anchor.place)
         if self.status is Status.DONE:
             self.tracker.release(self.tracker.held, hand.T_world_ee)
 
     def _anchors(self, index: int) -> list[str]:
-        """Objects of the key poses from one on."""
+        """Objects of the key poses from one on that look as they did in the demonstrations."""
         ahead = self.ranked[0].entry.key_poses[index:]
-        return list(dict.fromkeys(name for pose in ahead for name in pose.anchor.objects))
+        names = dict.fromkeys(name for pose in ahead for name in pose.anchor.objects)
+        return [name for name in names if name not in self._altered]
 
     def _untouched(self) -> list[str]:
         """Objects of the key poses to come that still are where they were seen."""
@@ -317,22 +349,15 @@ class Row:
             return changed
         entry, believed = self.ranked[0].entry, self.layout
         self.layout = {**believed, **{name: poses[name] for name in changed}}
-        if problems := self._problems(entry, self._planned_from):
+        if problems := self._knowledge.problems(entry, self.layout, self._planned_from):
             logger.info("%r: not believed: %s", self.instruction, "; ".join(problems))
             self.layout = believed
             return set()
         return changed
 
-    def _geometric_score(self, entry: MemoryEntry, T_world_ee: Array) -> float:
-        known = self._knowledge
-        return geometric_score(entry, self.layout, known.yaw_periods, T_world_ee, known.robot, known.limits)
-
     def _transfer(self, entry: MemoryEntry, T_world_ee: Array) -> tuple[Target, ...]:
-        return transfer(entry, self.layout, self._knowledge.yaw_periods, T_world_ee)
-
-    def _problems(self, entry: MemoryEntry, T_world_ee: Array) -> list[str]:
-        targets = self._transfer(entry, T_world_ee)
-        return check_transfer(targets, T_world_ee, self._knowledge.robot, self._knowledge.limits)
+        targets = self._knowledge.transfer(entry, self.layout, T_world_ee)
+        return targets if self._is_last_part else (*targets, *rise(targets[-1], self._start_height))
 
 
 def _touches(target: Target) -> bool:

@@ -19,6 +19,8 @@ PRECISE_PHASES = ("grasp", "place", "release", "push", "open", "turn")
 CONSTRAINED_PHASES = ("push", "open", "turn")
 # How far the hand backs off at the end.
 RETREAT_M = 0.06
+# A hand that is this little too low need not rise.
+LEVEL_M = 0.02
 # How much a different way through free space counts beside a different way in contact.
 FREE_SPACE_SHARE = 0.2
 # An entry whose key poses lie this much differently to one another here counts as 1/e alike.
@@ -124,6 +126,20 @@ def _retreat(targets: Sequence[Target]) -> tuple[Target, ...]:
     step = se3.transform(np.eye(3), RETREAT_M * back / max(float(np.linalg.norm(back)), 1e-9))
     memory = replace(last.memory, phase="retreat", n_steps=1, dwell=False, confidence=0.5)
     return (Target(contact.T_world_ee @ step, memory, precise=False),)
+
+
+def rise(last: Target, height: float) -> tuple[Target, ...]:
+    """Straight up from the last key pose to a height in metres, if that is higher.
+
+    The next task begins from there as its demonstrations did: clear of what stands around, and without the
+    hand between the cameras and the objects.
+    """
+    T_world_ee = last.T_world_ee.copy()
+    if height - T_world_ee[2, 3] < LEVEL_M:
+        return ()
+    T_world_ee[2, 3] = height
+    memory = replace(last.memory, phase="retreat", n_steps=1, dwell=False, axis=None, confidence=0.5)
+    return (Target(T_world_ee, memory, precise=False),)
 
 
 def _nearest_equivalent(

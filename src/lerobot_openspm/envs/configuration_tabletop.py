@@ -12,7 +12,7 @@ from lerobot.envs.utils import _LazyAsyncVectorEnv, freeze_after_episode_end
 from lerobot.utils.constants import ACTION, OBS_IMAGES, OBS_STATE, OBS_STR
 
 from lerobot_openspm.envs.scene import CAMERA_NAMES, OBJECT_NAMES
-from lerobot_openspm.envs.tasks import TASK_NAMES, select_tasks
+from lerobot_openspm.envs.tasks import ANY_TASK, TASK_NAMES, select_tasks
 
 SUITE_NAME = "openspm_tabletop"
 ACTION_SIZE = 7
@@ -23,11 +23,15 @@ OBJECT_POSES_SIZE = 7 * len(OBJECT_NAMES)
 @EnvConfig.register_subclass(SUITE_NAME)
 @dataclass
 class TabletopEnvConfig(EnvConfig):
-    """The embedded tabletop: `task` is a task name, a comma list of them, or "all"."""
+    """The embedded tabletop: `task` is a task name, a comma list of them, or a selection.
+
+    The selections are "all" (the ten), "compound" and "two_bowls", see `envs.tasks`.
+    """
 
     task: str | None = "all"
     fps: int = 20
-    episode_length: int = 300
+    # Control steps; by default the task's own, 300 for each part of its instruction.
+    episode_length: int | None = None
     observation_height: int = 256
     observation_width: int = 256
     # True poses as observation.object_poses: for oracle ablations, never for a policy's reported figure.
@@ -79,7 +83,7 @@ class TabletopEnvConfig(EnvConfig):
     def create_envs(
         self, n_envs: int, use_async_envs: bool = False
     ) -> dict[str, dict[int, gym.vector.VectorEnv]]:
-        """Make one vector environment per selected task; the task id is its place among `TASK_NAMES`.
+        """Make one vector environment per selected task; the task id is its place in `ANY_TASK`.
 
         Finished rows are frozen until the next rollout, with and without worker processes.
 
@@ -90,13 +94,14 @@ class TabletopEnvConfig(EnvConfig):
             raise ValueError(f"n_envs must be positive, got {n_envs}")
         probe = make_env(TASK_NAMES[0], self.gym_kwargs)
         spaces_and_metadata = (probe.observation_space, probe.action_space, probe.metadata)
+        numbers = {name: number for number, name in enumerate(ANY_TASK)}
         envs: dict[int, Any] = {}
         for name in select_tasks(self.task or ""):
             functions = [partial(make_env, name, self.gym_kwargs) for _ in range(n_envs)]
             if use_async_envs and n_envs > 1:
-                envs[TASK_NAMES.index(name)] = _LazyAsyncVectorEnv(functions, *spaces_and_metadata)
+                envs[numbers[name]] = _LazyAsyncVectorEnv(functions, *spaces_and_metadata)
             else:
-                envs[TASK_NAMES.index(name)] = _make_sync(functions)
+                envs[numbers[name]] = _make_sync(functions)
         return {SUITE_NAME: envs}
 
 

@@ -1,4 +1,7 @@
-"""Scripted experts for the ten tasks: they read the true poses and act by the same 7-D actions."""
+"""Scripted experts for the ten tasks, and so for those that are made of them.
+
+They read the true poses and act by the same 7-D actions.
+"""
 
 import math
 from collections.abc import Callable
@@ -15,7 +18,7 @@ from lerobot_openspm.envs.motions import (
     yaw_matrix,
 )
 from lerobot_openspm.envs.simulator import TabletopSimulator
-from lerobot_openspm.envs.tasks import TASKS
+from lerobot_openspm.envs.tasks import ANY_TASK, TASKS
 
 HOVER_Z = 0.21
 CARRY_Z = 0.26
@@ -41,12 +44,22 @@ def expert_actions(simulator: TabletopSimulator, task: str, rng: np.random.Gener
 
     Args:
         simulator: Simulator of the environment that is stepped.
-        task: A name in `TASKS`.
+        task: A name in `ANY_TASK`.
         rng: Source of the demonstration's imperfections.
     """
     hand = ScriptedHand(simulator, rng)
-    yield from EXPERTS[task](hand)
+    for i, part in enumerate(ANY_TASK[task].parts or (task,)):
+        if i > 0:
+            hand.closing = False
+            yield from _rise(hand)
+        yield from EXPERTS[part](hand)
     yield from hand.hold(FINAL_HOLD_STEPS)
+
+
+def _rise(hand: ScriptedHand) -> Actions:
+    """Up to where every task begins, clear of all that stands on the table."""
+    T_world_ee = hand.simulator.ee_pose()
+    yield from _retreat(hand, scene.HOME_POSITION[2] - float(T_world_ee[2, 3]))
 
 
 def _above(point: np.ndarray, z: float) -> np.ndarray:

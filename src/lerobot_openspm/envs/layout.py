@@ -1,6 +1,7 @@
 """Where everything stands at the start of an episode: uniform draws, rejected when they come too close."""
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -75,6 +76,34 @@ def sample_layout(rng: np.random.Generator) -> dict[str, Placement]:
         if is_admissible(layout):
             return layout
     raise LayoutError(f"no layout without overlaps in {MAX_TRIES} tries; is the nominal layout too crowded?")
+
+
+def sample_two_bowls(
+    rng: np.random.Generator, is_clear: Callable[[dict[str, Placement]], bool]
+) -> dict[str, Placement]:
+    """Draw a placement of every object and of a second bowl, which may stand anywhere on the table.
+
+    Args:
+        rng: Source of randomness.
+        is_clear: Whether a layout leaves no doubt which of the two bowls is meant.
+
+    Returns:
+        Placement per name in `scene.OBJECT_NAMES`, and of `scene.SECOND_BOWL`.
+
+    Raises:
+        LayoutError: No clear draw in `MAX_TRIES`.
+    """
+    for _ in range(MAX_TRIES):
+        layout = {name: _draw(name, rng) for name in scene.OBJECT_NAMES}
+        x, y = rng.uniform((TABLE_X[0], TABLE_Y[0]), (TABLE_X[1], TABLE_Y[1])).tolist()
+        second = Placement(x, y, 0.0)
+        # Either bowl in the other one's place must do: their footprints keep the gap, and so does the hand.
+        swapped = {**layout, "bowl": second}
+        apart = math.hypot(x - layout["bowl"].x, y - layout["bowl"].y) > 2 * scene.BOWL_RADIUS + HAND_RADIUS
+        both = {**layout, scene.SECOND_BOWL: second}
+        if apart and is_clear(both) and is_admissible(layout) and is_admissible(swapped):
+            return both
+    raise LayoutError(f"no clear layout with two bowls in {MAX_TRIES} tries; is the condition too narrow?")
 
 
 def _draw(name: str, rng: np.random.Generator) -> Placement:

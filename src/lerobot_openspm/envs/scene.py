@@ -49,6 +49,8 @@ OBJECT_NAMES = ("bowl", "plate", "box", "bottle", "rack", "cabinet", "stove")
 # Numbers in the simulator's own segmentation; 0 is everything else.
 OBJECT_LABELS = {name: number for number, name in enumerate(OBJECT_NAMES, 1)}
 MOVABLE_NAMES = ("bowl", "plate", "box", "bottle")
+# Another bowl just like the first, only in scenes whose instruction tells which one is meant.
+SECOND_BOWL = "second_bowl"
 DRAWER_NAMES = ("drawer_bottom", "drawer_middle", "drawer_top")
 CAMERA_NAMES = ("front", "side", "wrist")
 
@@ -120,7 +122,7 @@ def _inertial(mass: float, height: float, inertia: tuple) -> str:
     return f'<inertial pos="0 0 {height:g}" mass="{mass:g}" diaginertia="{diagonal}"/>'
 
 
-def _movables() -> str:
+def _movables(second_bowl: bool) -> str:
     bowl = (
         _feet(0.035, 0.003, 6, "bowl")
         + _geom(
@@ -153,8 +155,10 @@ def _movables() -> str:
         )
         + _geom("cylinder", (BOTTLE_NECK_RADIUS, neck_half), (0, 0, BOTTLE_BODY_HEIGHT + neck_half), "bottle")
     )
+    bowl_inertial = _inertial(0.15, 0.018, (2e-4, 2e-4, 3e-4))
     return (
-        _movable("bowl", bowl, _inertial(0.15, 0.018, (2e-4, 2e-4, 3e-4)))
+        _movable("bowl", bowl, bowl_inertial)
+        + (_movable(SECOND_BOWL, bowl, bowl_inertial) if second_bowl else "")
         + _movable("plate", plate, _inertial(0.20, 0.006, (4e-4, 4e-4, 8e-4)))
         + _movable("box", box, _inertial(0.08, BOX_HALF[2], (1.7e-5, 3e-5, 3.5e-5)))
         + _movable("bottle", bottle, _inertial(0.20, 0.035, (2.5e-4, 2.5e-4, 6e-5)))
@@ -276,7 +280,7 @@ def _excludes() -> str:
     return "".join(f'<exclude body1="{a}" body2="{b}"/>' for a, b in pairs)
 
 
-def build_mjcf() -> str:
+def build_mjcf(second_bowl: bool = False) -> str:
     """Return the scene as an MJCF string; object poses are set at reset, not here."""
     table = _geom("box", (0.46, 0.49, 0.02), (0.03, 0, -0.0201), "table", 'contype="0" conaffinity="0"')
     floor = _geom("box", (4, 4, 0.01), (0, 0, -0.71), "floor", 'contype="0" conaffinity="0"')
@@ -307,7 +311,7 @@ def build_mjcf() -> str:
     <camera name="front" pos="0.945 0 1.280" xyaxes="0 1 0 -0.788 0 0.616" fovy="35"/>
     <camera name="side" pos="0.060 -0.905 1.230" xyaxes="1 0 0 0 0.788 0.616" fovy="35"/>
     <geom name="table" type="plane" size="1 1 0.1" rgba="0 0 0 0" group="4"/>
-    {table}{floor}{_hand()}{_movables()}{_rack()}{_cabinet()}{_stove()}
+    {table}{floor}{_hand()}{_movables(second_bowl)}{_rack()}{_cabinet()}{_stove()}
   </worldbody>
   <contact>{_excludes()}</contact>
   <equality>

@@ -45,9 +45,9 @@ HAND_BODIES = ("hand", "finger_left", "finger_right")
 
 
 @functools.cache
-def compiled_model() -> mujoco.MjModel:
-    """Compile the scene once per process; every simulator works on its own copy."""
-    return mujoco.MjModel.from_xml_string(scene.build_mjcf())
+def compiled_model(second_bowl: bool = False) -> mujoco.MjModel:
+    """Compile a scene once per process; every simulator works on its own copy."""
+    return mujoco.MjModel.from_xml_string(scene.build_mjcf(second_bowl))
 
 
 def _bounded(vector: np.ndarray, limit: float) -> np.ndarray:
@@ -56,16 +56,23 @@ def _bounded(vector: np.ndarray, limit: float) -> np.ndarray:
 
 
 class TabletopSimulator:
-    """One tabletop. Instances share nothing but the compiled model, of which each has its own copy."""
+    """One tabletop. Instances share nothing but the compiled model, of which each has its own copy.
 
-    def __init__(self) -> None:
-        self.model: mujoco.MjModel = copy.copy(compiled_model())
+    Args:
+        second_bowl: Whether there is another bowl just like the first, `scene.SECOND_BOWL`.
+    """
+
+    def __init__(self, second_bowl: bool = False) -> None:
+        self.model: mujoco.MjModel = copy.copy(compiled_model(second_bowl))
         self.data = mujoco.MjData(self.model)
         self._renderers: dict[tuple[int, int], Any] = {}
-        names = ("hand", *scene.OBJECT_NAMES, *scene.DRAWER_NAMES, "knob", "finger_left", "finger_right")
-        self._body = {n: self.model.body(n).id for n in names}
-        self._qpos = {n: int(self.model.joint(n).qposadr[0]) for n in _joint_names()}
-        self._dof = {n: int(self.model.joint(n).dofadr[0]) for n in _joint_names()}
+        self._movable = (*scene.MOVABLE_NAMES, *((scene.SECOND_BOWL,) if second_bowl else ()))
+        fingers = ("finger_left", "finger_right")
+        bodies = ("hand", *scene.OBJECT_NAMES, *self._movable, *scene.DRAWER_NAMES, "knob", *fingers)
+        joints = ("hand", *fingers, "knob", *self._movable, *scene.DRAWER_NAMES)
+        self._body = {n: self.model.body(n).id for n in bodies}
+        self._qpos = {n: int(self.model.joint(n).qposadr[0]) for n in joints}
+        self._dof = {n: int(self.model.joint(n).dofadr[0]) for n in joints}
         self._hand_bodies = {self._body[n] for n in HAND_BODIES}
         self._geom_labels = self._label_geoms()
         self._target_position = np.array(scene.HOME_POSITION)
@@ -76,7 +83,7 @@ class TabletopSimulator:
         mujoco.mj_resetData(self.model, self.data)
         for name, at in layout.items():
             quat_wxyz = (math.cos(at.yaw / 2), 0.0, 0.0, math.sin(at.yaw / 2))
-            if name in scene.MOVABLE_NAMES:
+            if name in self._movable:
                 start = self._qpos[name]
                 self.data.qpos[start : start + 7] = (at.x, at.y, 0.0, *quat_wxyz)
             else:
@@ -178,7 +185,7 @@ class TabletopSimulator:
     def is_at_rest(self, name: str, linear: float = 0.02, angular: float = 0.4) -> bool:
         """Whether an object, a drawer or the knob moves slower than `linear` m/s and `angular` rad/s."""
         start = self._dof[name]
-        if name not in scene.MOVABLE_NAMES:
+        if name not in self._movable:
             return abs(self.data.qvel[start]) < (angular if name == "knob" else linear)
         velocity = self.data.qvel[start : start + 6]
         return bool(np.linalg.norm(velocity[:3]) < linear and np.linalg.norm(velocity[3:]) < angular)
@@ -252,6 +259,8 @@ class TabletopSimulator:
         roots = self.model.body_rootid[self.model.geom_bodyid]
         for name, number in scene.OBJECT_LABELS.items():
             labels[roots == self._body[name]] = number
+        if scene.SECOND_BOWL in self._body:
+            labels[roots == self._body[scene.SECOND_BOWL]] = scene.OBJECT_LABELS["bowl"]
         return labels
 
     def close(self) -> None:
@@ -264,10 +273,6 @@ def _close_at_exit(reference: "weakref.ref[TabletopSimulator]") -> None:
     simulator = reference()
     if simulator is not None:
         simulator.close()
-
-
-def _joint_names() -> tuple[str, ...]:
-    return ("hand", "finger_left", "finger_right", "knob", *scene.MOVABLE_NAMES, *scene.DRAWER_NAMES)
 
 
 def _make_renderer(model: mujoco.MjModel, height: int, width: int) -> Any:

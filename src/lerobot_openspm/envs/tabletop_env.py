@@ -9,10 +9,10 @@ from gymnasium import spaces
 from scipy.spatial.transform import Rotation
 
 from lerobot_openspm.envs import scene
-from lerobot_openspm.envs.layout import sample_layout
+from lerobot_openspm.envs.layout import sample_layout, sample_two_bowls
 from lerobot_openspm.envs.recording import pose_names, pose_vector
 from lerobot_openspm.envs.simulator import TabletopSimulator
-from lerobot_openspm.envs.tasks import TASKS, select_tasks
+from lerobot_openspm.envs.tasks import ANY_TASK, select_tasks
 
 STATE_NAMES = ("x", "y", "z", "axis_angle_x", "axis_angle_y", "axis_angle_z", "finger_left", "finger_right")
 ACTION_NAMES = (
@@ -66,7 +66,7 @@ class TabletopEnv(gym.Env):
     def __init__(
         self,
         task: str = "bowl_on_plate",
-        episode_length: int = 300,
+        episode_length: int | None = None,
         observation_height: int = 256,
         observation_width: int = 256,
         object_poses: bool = False,
@@ -82,11 +82,11 @@ class TabletopEnv(gym.Env):
         ):
             if not MIN_IMAGE_SIZE <= size <= MAX_IMAGE_SIZE:
                 raise ValueError(f"{label} must lie in [{MIN_IMAGE_SIZE}, {MAX_IMAGE_SIZE}], got {size}")
-        if episode_length <= 0:
+        if episode_length is not None and episode_length <= 0:
             raise ValueError(f"episode_length must be positive, got {episode_length}")
         (self.task,) = select_tasks(task)
-        self.task_description = TASKS[self.task].instruction
-        self._max_episode_steps = episode_length
+        self.task_description = ANY_TASK[self.task].instruction
+        self._max_episode_steps = episode_length or ANY_TASK[self.task].max_steps
         self.render_mode = render_mode
         self._size = (observation_height, observation_width)
         self._with_object_poses = object_poses
@@ -116,14 +116,16 @@ class TabletopEnv(gym.Env):
     def simulator(self) -> TabletopSimulator:
         """The physics behind this environment; made on first use, in the process that uses it."""
         if self._simulator is None:
-            self._simulator = TabletopSimulator()
+            self._simulator = TabletopSimulator(second_bowl=ANY_TASK[self.task].is_clear is not None)
         return self._simulator
 
     def reset(self, *, seed: int | None = None, options: dict | None = None) -> tuple[dict, dict[str, Any]]:
         """Draw a new layout from the seed; the options are those of Gymnasium and are not used."""
         super().reset(seed=seed)
         self._seed = seed
-        self.simulator.reset(sample_layout(self.np_random))
+        is_clear = ANY_TASK[self.task].is_clear
+        rng = self.np_random
+        self.simulator.reset(sample_layout(rng) if is_clear is None else sample_two_bowls(rng, is_clear))
         self._steps = self._held = 0
         return self._observe(), self._info("running")
 
@@ -150,7 +152,7 @@ class TabletopEnv(gym.Env):
         self._steps += 1
         if self.simulator.is_unstable():
             return 0.0, True, False, self._info("unstable")
-        self._held = self._held + 1 if TASKS[self.task].is_done(self.simulator) else 0
+        self._held = self._held + 1 if ANY_TASK[self.task].is_done(self.simulator) else 0
         if self._held >= SUCCESS_HOLD_STEPS:
             return 1.0, True, False, self._info("success")
         truncated = self._steps >= self._max_episode_steps

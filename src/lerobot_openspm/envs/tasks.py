@@ -1,4 +1,8 @@
-"""The ten tasks: their instructions, and the physical predicates that say when one is done."""
+"""The ten tasks: their instructions, and the physical predicates that say when one is done.
+
+Beside them, five tasks that are made of the ten: their parts can be demonstrated and the whole never is. And
+five of the ten's goals with a second bowl on the table: the instruction says which of the two is meant.
+"""
 
 import math
 from collections.abc import Callable
@@ -7,7 +11,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from lerobot_openspm.envs import scene
+from lerobot_openspm.envs import scene, two_bowls
 
 if TYPE_CHECKING:
     from lerobot_openspm.envs.simulator import TabletopSimulator
@@ -15,6 +19,7 @@ if TYPE_CHECKING:
 DRAWER_OPEN_M = 0.10
 KNOB_ON_RAD = math.radians(75)
 PLATE_TOLERANCE_M = 0.03
+STEPS_PER_PART = 300
 UPRIGHT_COSINE = math.cos(math.radians(20))
 
 
@@ -91,11 +96,27 @@ def _stove_on(simulator: "TabletopSimulator") -> bool:
 
 @dataclass(frozen=True)
 class Task:
-    """A goal on the shared tabletop: what to type, what to say, and when it is reached."""
+    """A goal on the shared tabletop: what to type, what to say, and when it is reached.
+
+    Attributes:
+        name: What to type.
+        instruction: What to say.
+        is_done: Whether the goal is reached now.
+        parts: Names of the tasks that it is made of, in the order of the instruction; none for the ten.
+        is_clear: Whether a layout with a second bowl leaves no doubt that the first one is meant; None where
+            there is one bowl.
+    """
 
     name: str
     instruction: str
     is_done: Callable[["TabletopSimulator"], bool]
+    parts: tuple[str, ...] = ()
+    is_clear: Callable[[two_bowls.Layout], bool] | None = None
+
+    @property
+    def max_steps(self) -> int:
+        """Control steps after which an episode ends by default: so many for each part."""
+        return STEPS_PER_PART * max(1, len(self.parts))
 
 
 _CABINET_TOP = ((scene.CABINET_HALF[0] - 0.01, scene.CABINET_HALF[1] - 0.01), scene.CABINET_HEIGHT)
@@ -131,19 +152,110 @@ TASKS: dict[str, Task] = {
 TASK_NAMES = tuple(TASKS)
 
 
+def _compound(name: str, instruction: str, *parts: str) -> Task:
+    """A task whose goal is that the goals of all its parts hold at the same time."""
+
+    def done(simulator: "TabletopSimulator") -> bool:
+        return all(TASKS[part].is_done(simulator) for part in parts)
+
+    return Task(name, instruction, done, parts)
+
+
+# Not among "all": nothing demonstrates them as a whole. The third and the fourth depend on their order: the
+# second part takes place where the first one has put something.
+COMPOUND_TASKS: dict[str, Task] = {
+    task.name: task
+    for task in (
+        _compound(
+            "bowl_on_plate_then_stove",
+            "put the bowl on the plate and turn on the stove",
+            "bowl_on_plate",
+            "turn_on_stove",
+        ),
+        _compound(
+            "bottle_on_rack_then_box_in_bowl",
+            "put the wine bottle on the rack and put the cream cheese box in the bowl",
+            "bottle_on_rack",
+            "box_in_bowl",
+        ),
+        _compound(
+            "bowl_on_plate_then_box_in_bowl",
+            "put the bowl on the plate and put the cream cheese box in the bowl",
+            "bowl_on_plate",
+            "box_in_bowl",
+        ),
+        _compound(
+            "push_plate_then_bowl_on_plate",
+            "push the plate to the front of the stove and put the bowl on the plate",
+            "push_plate",
+            "bowl_on_plate",
+        ),
+        _compound(
+            "open_drawer_then_bottle_on_cabinet",
+            "open the middle drawer of the cabinet and put the wine bottle on top of the cabinet",
+            "open_middle_drawer",
+            "bottle_on_cabinet",
+        ),
+    )
+}
+COMPOUND_TASK_NAMES = tuple(COMPOUND_TASKS)
+
+
+def _of_two_bowls(
+    name: str, instruction: str, like: str, is_clear: Callable[[two_bowls.Layout], bool]
+) -> Task:
+    """A task of the ten, done with the one of two bowls that the instruction tells."""
+    return Task(name, instruction, TASKS[like].is_done, (like,), is_clear)
+
+
+# Not among "all" either: no demonstration shows two bowls.
+TWO_BOWL_TASKS: dict[str, Task] = {
+    task.name: task
+    for task in (
+        _of_two_bowls(
+            "bowl_next_to_rack_on_plate",
+            "pick up the bowl next to the rack and put it on the plate",
+            "bowl_on_plate",
+            two_bowls.next_to("rack"),
+        ),
+        _of_two_bowls(
+            "bowl_between_plate_and_box_on_stove",
+            "put the bowl between the plate and the cream cheese box on the stove",
+            "bowl_on_stove",
+            two_bowls.between("plate", "box"),
+        ),
+        _of_two_bowls(
+            "bowl_next_to_box_on_cabinet",
+            "pick up the bowl next to the cream cheese box and place it on top of the cabinet",
+            "bowl_on_cabinet",
+            two_bowls.next_to("box"),
+        ),
+        _of_two_bowls(
+            "left_bowl_on_plate", "put the left bowl on the plate", "bowl_on_plate", two_bowls.left
+        ),
+        _of_two_bowls(
+            "right_bowl_on_stove", "put the right bowl on the stove", "bowl_on_stove", two_bowls.right
+        ),
+    )
+}
+# Every task that can be named; the place of a name here is the task's number.
+ANY_TASK = {**TASKS, **COMPOUND_TASKS, **TWO_BOWL_TASKS}
+SELECTIONS = {"all": TASK_NAMES, "compound": COMPOUND_TASK_NAMES, "two_bowls": tuple(TWO_BOWL_TASKS)}
+
+
 def select_tasks(spec: str) -> list[str]:
-    """Expand a task name, a comma list or "all" into task names, in the order given.
+    """Expand a task name, a comma list or a selection ("all": the ten) into task names, in the order given.
 
     Raises:
         ValueError: A name is unknown, or there is none.
     """
     names = [part.strip() for part in spec.split(",") if part.strip()]
-    if names == ["all"]:
-        return list(TASK_NAMES)
-    unknown = [name for name in names if name not in TASKS]
+    if len(names) == 1 and names[0] in SELECTIONS:
+        return list(SELECTIONS[names[0]])
+    unknown = [name for name in names if name not in ANY_TASK]
     if unknown or not names:
         raise ValueError(
             f"unknown openspm_tabletop task {', '.join(unknown) or repr(spec)}; "
-            f"expected 'all' or a comma list of: {', '.join(TASK_NAMES)}"
+            f"expected {', '.join(map(repr, SELECTIONS))} or a comma list of: {', '.join(ANY_TASK)}"
         )
     return names

@@ -1,123 +1,225 @@
-"""From an instruction to its task elements, by a small grammar and an alias table. No download."""
+"""From an instruction to its task elements, by a small grammar and a table of words. No download.
+
+``wording`` makes plain imperatives of other ways to ask, ``sentences`` splits them into clauses, ``clauses``
+reads a verb with its ``nouns`` and ``prepositions``; here clauses become sub-tasks and pronouns get nouns.
+"""
 
 from __future__ import annotations
 
-import re
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 from lerobot_openspm.errors import InstructionError
+from lerobot_openspm.memory import vocabulary as v
+from lerobot_openspm.memory.clauses import Said, read_clause
 from lerobot_openspm.memory.entry import SubTask
+from lerobot_openspm.memory.nouns import Noun
+from lerobot_openspm.memory.sentences import Clause, read_clauses
 
-# Verb phrases, longest first within an operation, and the operation they mean.
-_VERBS = {
-    "put": ("pick up", "pick", "put", "place", "set down", "set", "lay", "move", "bring", "stack"),
-    "open": ("open", "pull open", "pull out"),
-    "close": ("close", "shut", "push in"),
-    "push": ("push", "slide", "shove"),
-    "turn on": ("turn on", "switch on", "light", "ignite"),
-    "turn off": ("turn off", "switch off", "extinguish"),
-}
-# Prepositions and the relation they mean, longest first so that "on top of" is not read as "on".
-_RELATIONS = {
-    "to the front of": "front of", "in front of": "front of",
-    "to the left of": "left of", "to the right of": "right of",
-    "on top of": "on", "onto": "on", "on": "on",
-    "inside of": "in", "inside": "in", "into": "in", "in": "in",
-    "next to": "next to", "beside": "next to", "behind": "behind", "under": "under", "to": "at",
-}  # fmt: skip
-# Parts that are named without the object they belong to.
-_PART_OF = {"drawer": "cabinet", "burner": "stove", "knob": "stove"}
-_ARTICLES = r"^(?:the|a|an|some|it|this|that)\b\s*"
-# A mug may be "yellow and white": an "and" begins a clause only where a verb follows.
-_ANY_VERB = "|".join(sorted((v for verbs in _VERBS.values() for v in verbs), key=len, reverse=True))
-_AND = rf"\band\b(?=\s+(?:{_ANY_VERB}|turn|switch)\b)"
-_SPLIT = re.compile(rf"\s*(?:,\s*(?:and\s+)?(?:then\s+)?|\band then\b|\bthen\b|{_AND})\s*")
-# Where something is picked up, beside the prepositions above.
-_SOURCES = ("between", "from")
+PICK = "pick"
+
+
+@dataclass(frozen=True)
+class _Meant:
+    """What a clause means: its sub-tasks, and its place in the order of execution.
+
+    Attributes:
+        sub_tasks: One for each of its targets; of operation "pick" where something is only taken.
+        step: Its place.
+        is_done: Whether it only says what is done by then.
+    """
+
+    sub_tasks: tuple[SubTask, ...]
+    step: int
+    is_done: bool = False
 
 
 def parse_instruction(instruction: str) -> tuple[SubTask, ...]:
-    """Read what is to be done, in order.
+    """Read what is to be done, in the order of execution.
 
     "open the top drawer and put the bowl inside" gives two sub-tasks, the second with the cabinet of the
     first as its landmark. "pick up the bowl on the stove and put it on the plate" gives one: where a thing is
-    picked up is not where it goes.
+    picked up tells which is meant, not where it goes.
 
     Raises:
-        InstructionError: No verb of the grammar begins the instruction, or the verb has no object.
+        InstructionError: It is no instruction to do something (a question, a statement, a negation, a
+            condition), no verb of the grammar is in it, or the verb has no object.
     """
-    clauses = [clause for clause in _SPLIT.split(_normalise(instruction)) if clause]
-    sub_tasks: list[SubTask] = []
-    picked_up = False
+    try:
+        return _parse(instruction)
+    except InstructionError as error:
+        raise InstructionError(f"the instruction {instruction!r} {error}") from None
+
+
+def _parse(instruction: str) -> tuple[SubTask, ...]:
+    clauses = read_clauses(instruction)
+    said: list[Said] = []
     for clause in clauses:
-        sub_task = _parse_clause(clause, sub_tasks[-1] if sub_tasks else None, instruction)
-        if picked_up and (sub_task.operation, sub_task.target) == ("put", sub_tasks[-1].target):
-            sub_tasks.pop()
-        sub_tasks.append(sub_task)
-        picked_up = clause.startswith("pick")
-    if not sub_tasks:
-        raise InstructionError(
-            f"got the instruction {instruction!r}, expected one like 'put the bowl on the plate'"
+        said.append(read_clause(clause, said[-1] if said else None))
+    if len(said) == 1 and said[0].operation == PICK and clauses[0].words[0] == "get":
+        said = [
+            read_clause(replace(clauses[0], words=("put", *clauses[0].words[1:])), None)
+        ]  # "get it on the plate"
+    if len(said) > 1 and not said[-1].operation and said[-2].landmark:  # "... and then the tomato sauce"
+        said[-1] = replace(said[-2], targets=said[-1].targets)
+    if not any(one.operation for one in said):
+        raise InstructionError("states something; say what to do")
+    meant = _resolve_all(clauses, said)
+    return _merged(sorted(meant, key=lambda one: one.step))
+
+
+def _resolve_all(clauses: Sequence[Clause], said: Sequence[Said]) -> list[_Meant]:
+    """Give pronouns their nouns: from what was said before, else from what is to be done before."""
+    order = list(range(len(said)))
+    if _lacks_noun(said[0]):  # "before putting the bowl inside, open the drawer"
+        order.sort(key=lambda i: clauses[i].step)
+    meant: list[_Meant] = []
+    topic: Noun | None = None
+    for i in order:
+        if not said[i].operation:
+            topic = said[i].targets[0]
+            following = said[i + 1].targets[0].pronoun if i + 1 < len(said) else ""
+            if following not in ("it", "them"):
+                raise InstructionError(f"states something of {topic.name or 'it'!r}; say what to do")
+            continue
+        sub_tasks = _Resolver([s for one in meant for s in one.sub_tasks], topic).resolve(said[i])
+        meant.append(_Meant(sub_tasks, clauses[i].step, clauses[i].is_done))
+        topic = None
+    return meant
+
+
+def _lacks_noun(said: Said) -> bool:
+    nouns = (*said.targets, *([said.landmark] if said.landmark else []))
+    return any(noun.pronoun in ("it", "them", "there") for noun in nouns)
+
+
+@dataclass(frozen=True)
+class _Resolver:
+    """Gives pronouns their nouns.
+
+    Attributes:
+        before: The sub-tasks said before.
+        topic: What is spoken of, if a clause named just that.
+    """
+
+    before: Sequence[SubTask]
+    topic: Noun | None
+
+    def resolve(self, said: Said) -> tuple[SubTask, ...]:
+        """One sub-task for each target, and for each of several that are counted."""
+        targets = [t for noun in said.targets for t in self._targets(noun, said.operation)]
+        if not said.landmark:
+            return tuple(
+                SubTask(said.operation, t.name, t.part, target_where=t.where)
+                for t in targets
+                for _ in range(t.count)
+            )
+        landmark = self._landmark(said.landmark, said.relation, targets[-1])
+        part = landmark.part
+        if said.relation == "on" and part.endswith("drawer"):
+            part = ""  # what is put on a drawer stands on the cabinet
+        return tuple(
+            SubTask(
+                said.operation, t.name, t.part or part, said.relation, landmark.name, t.where, landmark.where
+            )
+            for t in targets
+            for _ in range(t.count)
         )
-    return tuple(sub_tasks)
+
+    def _targets(self, noun: Noun, operation: str) -> list[Noun]:
+        last = self.before[-1] if self.before else None
+        if last and noun.count > 1 and noun.name == last.target == last.landmark:  # "the two bowls", stacked
+            noun = Noun(pronoun="them")
+        if noun.pronoun not in ("it", "them", "there"):
+            return [self._named(noun, operation)]
+        if self.topic is not None:
+            return [self.topic]
+        if last is None:
+            raise InstructionError(f"names no object after {operation!r}")
+        landmark = Noun(last.landmark, last.part, last.landmark_where)
+        target = Noun(last.target, "" if last.landmark else last.part, last.target_where)
+        if operation in ("open", "close") and last.relation == "in":
+            return [landmark]
+        if operation in ("turn on", "turn off") and last.landmark:
+            return [landmark]
+        if noun.pronoun == "them":
+            if last.operation == "put" and last.relation in ("on", "in") and len(self._together()) == 1:
+                return [landmark]  # of two that are stacked, the lower one carries the other
+            return self._together()
+        return [target]
+
+    def _together(self) -> list[Noun]:
+        """The targets of the last sub-tasks of one operation and one landmark: "them"."""
+        last = self.before[-1]
+        same = [s for s in self.before if (s.operation, s.landmark) == (last.operation, last.landmark)]
+        return [Noun(s.target, "", s.target_where) for s in same]
+
+    def _landmark(self, noun: Noun, relation: str, target: Noun) -> Noun:
+        if noun.pronoun == "one":
+            last = self.before[-1] if self.before else None
+            if last and last.landmark and not noun.name:  # "... on the left plate, ... on the right one"
+                return replace(noun, name=last.landmark, pronoun="")
+            return self._named(noun, "put", target)
+        if noun.pronoun not in ("it", "them", "there"):
+            return self._named(noun, "put")
+        before = [s for s in self.before if s.operation != PICK or s.target != target.name]
+        if not before:
+            raise InstructionError(f"names no object after {relation!r}")
+        last = before[-1]
+        beside = relation not in ("in", "on", "at") or noun.pronoun == "there"
+        if last.landmark and (beside or last.target == target.name):
+            return Noun(last.landmark, last.part, last.landmark_where)
+        return Noun(last.target, last.part, last.target_where)
+
+    def _named(self, noun: Noun, operation: str, target: Noun | None = None) -> Noun:
+        """A noun that leans on another: "the white one", "its top drawer", "the drawer", "the door"."""
+        if not self.before and target is None:
+            return self._whole(noun)
+        if noun.pronoun == "one":
+            name = target.name if target else self.before[-1].target
+            if (
+                noun.name in v.HEIGHTS and self.before and self.before[-1].part
+            ):  # "the bottom one", of drawers
+                part = f"{v.HEIGHTS[noun.name]} {self.before[-1].part.split()[-1]}"
+                return Noun(self.before[-1].landmark or name, part)
+            return replace(noun, name=f"{noun.name} {name.split()[-1]}" if noun.name else name, pronoun="")
+        last = self.before[-1] if self.before else None
+        if last is None:
+            return self._whole(noun)
+        if noun.pronoun == "its":
+            name = last.target if not last.landmark else last.landmark
+            return replace(noun, name=name, pronoun="")
+        if noun.name == "door":
+            return Noun(last.landmark or last.target, "")
+        parts = [s for s in self.before if noun.part in v.PART_OF and s.part.endswith(f" {noun.part}")]
+        if parts:
+            owner = parts[-1].landmark or parts[-1].target
+            return replace(noun, name=owner, part=parts[-1].part)
+        return self._whole(noun)
+
+    def _whole(self, noun: Noun) -> Noun:
+        if noun.pronoun:
+            raise InstructionError(f"does not say what {noun.pronoun!r} is")
+        return replace(noun, part="") if noun.part == "door" else noun
 
 
-def _parse_clause(clause: str, before: SubTask | None, instruction: str) -> SubTask:
-    operation, rest = _split_verb(clause, instruction)
-    rest = re.sub(r"^up\b\s*|\s*\bup$", "", rest)
-    relation, landmark_words = "", ""
-    if clause.startswith("pick"):
-        rest = re.split(rf"\s*\b(?:{'|'.join([*_SOURCES, *_RELATIONS])})\b", rest)[0]
-    elif operation in ("put", "push"):
-        rest, relation, landmark_words = _split_relation(rest)
-    target, part = _object_and_part(rest)
-    if (
-        not target and before is not None
-    ):  # "put it on the plate"; but "close it" is said of what things are in
-        inside = operation in ("open", "close") and before.relation == "in"
-        target, part = (before.landmark if inside else before.target), before.part
-    if not target:
-        raise InstructionError(f"the instruction {instruction!r} names no object after {clause!r}")
-    landmark, landmark_part = _object_and_part(landmark_words)
-    if relation and not landmark and before is not None:
-        landmark, landmark_part = before.target, before.part
-    return SubTask(operation, target, part or landmark_part, relation, landmark)
+def _is_vaguer(one: SubTask, other: SubTask) -> bool:
+    """Whether another says the same more exactly: "to the rack", "on the rack"."""
+    return one.relation == "at" != other.relation and replace(one, relation=other.relation) == other
 
 
-def _split_verb(clause: str, instruction: str) -> tuple[str, str]:
-    phrases = [(phrase, operation) for operation, verbs in _VERBS.items() for phrase in verbs]
-    for phrase, operation in sorted(phrases, key=lambda item: -len(item[0])):
-        if match := re.match(rf"{phrase}\b\s*", clause):
-            return operation, clause[match.end() :]
-    # "turn the stove on" splits the verb around its object.
-    if match := re.match(r"(?:turn|switch)\s+(.*)\s+(on|off)$", clause):
-        return f"turn {match[2]}", match[1]
-    known = ", ".join(sorted(phrase for phrase, _ in phrases))
-    raise InstructionError(f"the instruction {instruction!r} begins with no verb I know ({known})")
-
-
-def _split_relation(words: str) -> tuple[str, str, str]:
-    """Split "the bowl on top of the cabinet" into the target's words, the relation, the landmark's words."""
-    for preposition in sorted(_RELATIONS, key=lambda item: -len(item)):
-        if match := re.search(rf"\b{preposition}\b", words):
-            return words[: match.start()], _RELATIONS[preposition], words[match.end() :]
-    return words, "", ""
-
-
-def _object_and_part(words: str) -> tuple[str, str]:
-    """Split "the middle drawer of the cabinet" into object and part; a bare part gets its usual object."""
-    words = words.strip()
-    if " of " in words:
-        part, whole = words.split(" of ", 1)
-        return _strip_article(whole), _strip_article(part)
-    name = _strip_article(words)
-    if name and (whole := _PART_OF.get(name.split()[-1])):
-        return whole, name
-    return name, ""
-
-
-def _strip_article(words: str) -> str:
-    return re.sub(_ARTICLES, "", words.strip()).strip()
-
-
-def _normalise(instruction: str) -> str:
-    return re.sub(r"[^a-z0-9, ]+", " ", instruction.lower().replace("_", " ")).strip(" ,")
+def _merged(meant: Sequence[_Meant]) -> tuple[SubTask, ...]:
+    """Join what is taken with where it is put, and leave out what is said twice."""
+    found: list[SubTask] = []
+    for one in meant:
+        for sub_task in one.sub_tasks:
+            if one.is_done and sub_task in found:
+                continue
+            taken = next((s for s in found if s.operation == PICK and s.target == sub_task.target), None)
+            if taken is not None and sub_task.operation == "put":
+                found.remove(taken)
+                sub_task = replace(sub_task, target_where=sub_task.target_where or taken.target_where)
+            if found and _is_vaguer(found[-1], sub_task):
+                found.pop()
+            found.append(sub_task)
+    return tuple(replace(s, operation="put") if s.operation == PICK else s for s in found)

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from scipy.sparse import csr_array  # pyright: ignore[reportMissingTypeStubs]
 
 from lerobot_openspm.memory.entry import Reference, SubTask
+from lerobot_openspm.memory.meaning import canonical
 
 Vectors = NDArray[np.float32]
 
@@ -48,7 +49,7 @@ def key_vector(sub_tasks: Sequence[SubTask]) -> Vectors:
     differ in them share a vector, and with it one place in the index.
 
     Args:
-        sub_tasks: What is to be done, in order; names in the form in which the memory keeps them.
+        sub_tasks: What is to be done, in order; other names of the same things give the same vector.
     """
     return key_vectors([sub_tasks])[0]
 
@@ -71,6 +72,7 @@ def key_vectors(keys: Sequence[Sequence[SubTask]]) -> Vectors:
 
 
 def _elements(position: int, sub_task: SubTask) -> list[_Element]:
+    sub_task = canonical(sub_task)
     # That there is no landmark or part is an element too, as it is in the semantic score.
     elements = [
         (position, "operation", sub_task.operation),

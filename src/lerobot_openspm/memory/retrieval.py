@@ -2,16 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 from lerobot_openspm.errors import InstructionError
 from lerobot_openspm.memory.entry import MemoryEntry, SubTask
 from lerobot_openspm.memory.indexed_entries import near
 from lerobot_openspm.memory.instruction import parse_instruction
+from lerobot_openspm.memory.meaning import semantic_score
+from lerobot_openspm.memory.names import TABLE_NAMES, NameSimilarity, TableFirst
 
 # Below this semantic score an entry is about something else.
 MIN_SEMANTIC = 0.75
+# Entries about different things whose scores lie this close together leave open which is meant.
+MARGIN = 0.05
+# So many known instructions are named in an error.
+MAX_NAMED = 20
 
 
 @dataclass(frozen=True)
@@ -34,52 +40,73 @@ class Scored:
     total: float
 
 
-def semantic_candidates(instruction: str, entries: Sequence[MemoryEntry]) -> list[tuple[MemoryEntry, float]]:
+def semantic_candidates(
+    instruction: str, entries: Sequence[MemoryEntry], names: NameSimilarity = TABLE_NAMES
+) -> list[tuple[MemoryEntry, float]]:
     """Entries that are about what the instruction says, with their ``S_sem``.
 
+    Args:
+        instruction: What is asked.
+        entries: The memory.
+        names: Says which names mean the same thing.
+
     Raises:
-        InstructionError: No entry is. The error lists the instructions the memory knows.
+        InstructionError: It cannot be read, no entry is about it, or entries about different things fit it as
+            well. The error names the instructions that the memory knows, or those that may be meant.
     """
     sub_tasks = parse_instruction(instruction)
     entries = near(sub_tasks, entries, semantic_score)
-    scored = [(entry, semantic_score(sub_tasks, entry.key.sub_tasks)) for entry in entries]
-    close = [(entry, score) for entry, score in scored if score >= MIN_SEMANTIC]
-    if not close:
-        known = "; ".join(sorted({entry.language for entry in entries})) or "nothing yet"
+    # Demonstrations of one task share their key, so there are far fewer keys than entries.
+    keys = {entry.key.sub_tasks for entry in entries}
+    names = TableFirst(names, {name for key in keys for sub_task in key for name in sub_task.objects})
+    scores = {key: semantic_score(sub_tasks, key, names) for key in keys}
+    best = max(scores, key=lambda key: scores[key], default=())
+    if scores.get(best, 0.0) < MIN_SEMANTIC:
+        raise InstructionError(_unknown(instruction, entries, scores))
+    _check_rivals(instruction, entries, scores, best, names)
+    alike = {key for key, score in scores.items() if score >= MIN_SEMANTIC and _is_alike(best, key, names)}
+    return [(entry, scores[entry.key.sub_tasks]) for entry in entries if entry.key.sub_tasks in alike]
+
+
+def _is_alike(one: Sequence[SubTask], other: Sequence[SubTask], names: NameSimilarity) -> bool:
+    """Whether two keys may mean the same thing, one perhaps said with fewer words."""
+    return max(semantic_score(one, other, names), semantic_score(other, one, names)) >= MIN_SEMANTIC
+
+
+def _check_rivals(
+    instruction: str,
+    entries: Sequence[MemoryEntry],
+    scores: Mapping[tuple[SubTask, ...], float],
+    best: tuple[SubTask, ...],
+    names: NameSimilarity,
+) -> None:
+    """Raise InstructionError where something else is nearly as likely to be meant as the best."""
+    close = [key for key, score in scores.items() if score >= max(scores[best] - MARGIN, MIN_SEMANTIC)]
+    rivals = [key for key in close if not _is_alike(best, key, names)]
+    if rivals:
+        meant = sorted({entry.language for entry in entries if entry.key.sub_tasks in {best, *rivals}})
         raise InstructionError(
-            f"the memory holds no experience for the instruction {instruction!r}; it knows: {known}. "
-            "Record demonstrations of it and train again, or use one of these instructions"
+            f"the instruction {instruction!r} may mean different things; did you mean "
+            f"{' or '.join(repr(language) for language in _shortened(meant))}? Say it in those words"
         )
-    return close
 
 
-def semantic_score(asked: Sequence[SubTask], known: Sequence[SubTask]) -> float:
-    """``S_sem`` in 0..1: how many task elements agree, sub-task by sub-task, in order."""
-    if len(asked) != len(known):
-        return 0.0
-    scores = [_sub_task_score(a, k) for a, k in zip(asked, known, strict=True)]
-    return min(scores) if scores else 0.0
+def _unknown(
+    instruction: str, entries: Sequence[MemoryEntry], scores: Mapping[tuple[SubTask, ...], float]
+) -> str:
+    known = "; ".join(_shortened(sorted({entry.language for entry in entries}))) or "nothing yet"
+    nearest = max(entries, key=lambda entry: scores[entry.key.sub_tasks], default=None)
+    is_near = nearest is not None and scores[nearest.key.sub_tasks] > 0
+    did_you_mean = f"; did you mean {nearest.language!r}?" if nearest is not None and is_near else ""
+    return (
+        f"the memory holds no experience for the instruction {instruction!r}{did_you_mean or ';'} it knows: "
+        f"{known}. Record demonstrations of it and train again, or use one of these instructions"
+    )
 
 
-def _sub_task_score(asked: SubTask, known: SubTask) -> float:
-    if asked.operation != known.operation:
-        return 0.0
-    terms = [
-        (0.3, _names_agree(asked.target, known.target)),
-        (0.3, _names_agree(asked.landmark, known.landmark)),
-        (0.3, _names_agree(asked.part, known.part)),
-        (0.1, float(asked.relation == known.relation)),
-    ]
-    return 0.0 if min(terms[0][1], terms[1][1]) == 0.0 else sum(weight * value for weight, value in terms)
-
-
-def _names_agree(asked: str, known: str) -> float:
-    """1 for the same words, less for a shorter or longer name of the same thing ("bottle"), 0 for another."""
-    if asked == known:
-        return 1.0
-    a, k = asked.split(), known.split()
-    shared = len(set(a) & set(k))
-    return 0.8 if a and k and shared == min(len(set(a)), len(set(k))) else 0.0
+def _shortened(languages: list[str]) -> list[str]:
+    more = len(languages) - MAX_NAMED
+    return languages if more <= 0 else [*languages[:MAX_NAMED], f"and {more} more"]
 
 
 def retrieve(

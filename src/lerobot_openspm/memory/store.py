@@ -1,8 +1,8 @@
-"""Entries and the robot model as JSON that a person can read, and arrays beside it."""
+"""Entries and the robot model as JSON that a person can read."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import asdict
 from typing import Any, cast, get_args
 
@@ -22,94 +22,109 @@ from lerobot_openspm.memory.entry import (
     RetrievalKey,
     SubTask,
 )
+from lerobot_openspm.memory.fields import (
+    MALFORMED,
+    Fields,
+    flag,
+    integer,
+    known,
+    number,
+    numbers,
+    text,
+    texts,
+)
 from lerobot_openspm.memory.robot import RobotModel
 
-# What reading a field of another kind, or a number beyond what Python converts, ends in.
-MALFORMED = (KeyError, TypeError, ValueError, IndexError, AttributeError, OverflowError)
+ENTRY = frozenset(
+    ("source", "language", "version", "quality", "trials", "successes", "key", "layout", "key_poses")
+)
+KEY_POSE = frozenset(
+    (
+        "phase", "anchor", "T_obj_ee", "closed", "opening", "n_steps", "dwell", "confidence", "sub_task",
+        "axis", "covariance",
+    )
+)  # fmt: skip
+SUB_TASK = frozenset(SubTask.__dataclass_fields__)
 
-KEY_POSE_ARRAY, LAYOUT_ARRAY = "entries.T_obj_ee", "entries.T_world_obj"
+
+def entry_to_fields(entry: MemoryEntry) -> dict[str, Any]:
+    """The JSON form of an entry. Transforms are their first three rows; what is empty is left out."""
+    return {
+        "source": entry.source,
+        "language": entry.language,
+        "version": entry.version,
+        "quality": entry.quality,
+        "trials": entry.trials,
+        "successes": entry.successes,
+        "key": {
+            "sub_tasks": [_sub_task_fields(sub_task) for sub_task in entry.key.sub_tasks],
+            "phases": list(entry.key.phases),
+        },
+        "layout": {name: T[:3].tolist() for name, T in entry.layout.items()},
+        "key_poses": [_key_pose_fields(pose) for pose in entry.key_poses],
+    }
 
 
-def entries_to_parts(entries: Sequence[MemoryEntry]) -> tuple[list[dict[str, Any]], dict[str, Array]]:
-    """Split entries into JSON rows and two arrays of transforms, in the order of the rows."""
-    rows: list[dict[str, Any]] = []
-    for entry in entries:
-        key_poses = [_key_pose_fields(pose) for pose in entry.key_poses]
-        rows.append(
-            {
-                "language": entry.language,
-                "key": asdict(entry.key),
-                "quality": entry.quality,
-                "version": entry.version,
-                "source": entry.source,
-                "key_poses": key_poses,
-                "layout": list(entry.layout),
-            }
-        )
-    poses = [pose.T_obj_ee for entry in entries for pose in entry.key_poses]
-    layouts = [T for entry in entries for T in entry.layout.values()]
-    return rows, {KEY_POSE_ARRAY: _stacked(poses), LAYOUT_ARRAY: _stacked(layouts)}
+def _sub_task_fields(sub_task: SubTask) -> dict[str, Any]:
+    return {name: value for name, value in asdict(sub_task).items() if value or name == "target"}
 
 
 def _key_pose_fields(pose: MemoryKeyPose) -> dict[str, Any]:
-    """What a key pose says beside its transform."""
-    fields = {name: value for name, value in asdict(pose).items() if name != "T_obj_ee"}
+    fields: dict[str, Any] = {
+        "phase": pose.phase,
+        "sub_task": pose.sub_task,
+        "anchor": {"place": pose.anchor.place, "axes": pose.anchor.axes},
+        "closed": pose.closed,
+        "opening": pose.opening,
+        "n_steps": pose.n_steps,
+        "dwell": pose.dwell,
+        "confidence": pose.confidence,
+        "T_obj_ee": pose.T_obj_ee[:3].tolist(),
+    }
     if pose.axis is not None:
-        fields["axis"] = {**fields["axis"], "direction": pose.axis.direction.tolist()}
+        axis = pose.axis
+        fields["axis"] = {"kind": axis.kind, "direction": axis.direction.tolist(), "amount": axis.amount}
+    if pose.covariance is not None:
+        fields["covariance"] = pose.covariance.tolist()
     return fields
 
 
-def _stacked(transforms: Sequence[Array]) -> Array:
-    return np.stack(transforms) if transforms else np.zeros((0, 4, 4))
+def entry_from_fields(fields: Any) -> MemoryEntry:
+    """Inverse of :func:`entry_to_fields`.
 
-
-def entries_from_parts(
-    rows: Sequence[Mapping[str, Any]], arrays: Mapping[str, Array], where: str
-) -> tuple[MemoryEntry, ...]:
-    """Inverse of :func:`entries_to_parts`. Raises MemoryFormatError naming file and field."""
-    poses = _transforms(arrays, KEY_POSE_ARRAY, where)
-    layouts = _transforms(arrays, LAYOUT_ARRAY, where)
-    entries: list[MemoryEntry] = []
-    n_poses, n_layouts = 0, 0
-    for i, row in enumerate(rows):
-        try:
-            k, n = len(row["key_poses"]), len(row["layout"])
-            entry = _entry(row, poses[n_poses : n_poses + k], layouts[n_layouts : n_layouts + n])
-        except MALFORMED as error:
-            raise MemoryFormatError(
-                f"{where}: entries[{i}] is malformed: {error!r}; train or pull it again"
-            ) from error
-        entries.append(entry)
-        n_poses, n_layouts = n_poses + k, n_layouts + n
-    if n_poses != len(poses) or n_layouts != len(layouts):
-        raise MemoryFormatError(
-            f"{where}: got {len(poses)} key poses and {len(layouts)} object poses, expected {n_poses} and "
-            f"{n_layouts}; the files do not belong together, train or pull it again"
-        )
-    return tuple(entries)
-
-
-def _entry(row: Mapping[str, Any], poses: Array, layouts: Array) -> MemoryEntry:
-    if len(poses) != len(row["key_poses"]) or len(layouts) != len(row["layout"]):
-        raise ValueError("fewer transforms than the entry names")
-    sub_tasks = tuple(_sub_task(item) for item in row["key"]["sub_tasks"])
-    key = RetrievalKey(sub_tasks, tuple(str(phase) for phase in row["key"]["phases"]))
-    key_poses = tuple(_key_pose(fields, T) for fields, T in zip(row["key_poses"], poses, strict=True))
-    layout = {str(name): T for name, T in zip(row["layout"], layouts, strict=True)}
+    Raises:
+        KeyError, TypeError, ValueError: A field is missing, unknown, of another type, or out of range. The
+            error names it; :data:`~lerobot_openspm.memory.fields.MALFORMED` has all that may be raised.
+    """
+    fields = known(fields, ENTRY, "the entry")
+    key = known(fields["key"], frozenset(("sub_tasks", "phases")), "'key'")
+    sub_tasks = tuple(_sub_task(item) for item in key["sub_tasks"])
+    rows = [known(row, KEY_POSE, "a key pose") for row in fields["key_poses"]]
+    if not rows or not sub_tasks:
+        raise ValueError("an entry needs a sub-task and a key pose")
+    named = known(fields["layout"], frozenset(fields["layout"]), "'layout'")
+    poses = _transforms([row["T_obj_ee"] for row in rows], "T_obj_ee of the key poses")
+    layout = dict(zip(named, _transforms(list(named.values()), "'layout'"), strict=True))
+    key_poses = tuple(_key_pose(row, T, len(sub_tasks)) for row, T in zip(rows, poses, strict=True))
     if unknown := {name for pose in key_poses for name in pose.anchor.objects} - set(layout):
         raise ValueError(f"anchors {sorted(unknown)} are not in its layout {sorted(layout)}")
-    quality = float(row["quality"])
-    if not 0 <= quality <= 1:
-        raise ValueError(f"quality is {quality}, expected 0 to 1")
-    if not key_poses or not sub_tasks:
-        raise ValueError("an entry needs a sub-task and a key pose")
+    phases = texts(key, "phases")
+    if phases != tuple(pose.phase for pose in key_poses):
+        raise ValueError(f"'phases' are {phases}, but its key poses have others")
+    trials = integer(fields, "trials")
+    successes = integer(fields, "successes")
+    if successes > trials:
+        raise ValueError(f"'successes' is {successes}, more than the {trials} 'trials'")
     return MemoryEntry(
-        key, str(row["language"]), key_poses, quality, int(row["version"]), str(row["source"]), layout
-    )
+        RetrievalKey(sub_tasks, phases), text(fields, "language"), key_poses,
+        number(fields, "quality", 0, 1), integer(fields, "version", 1), text(fields, "source"), layout,
+        trials, successes,
+    )  # fmt: skip
 
 
-def _sub_task(fields: Mapping[str, Any]) -> SubTask:
-    words = {str(k): str(v) for k, v in fields.items() if not k.endswith("_where")}
+def _sub_task(fields: Any) -> SubTask:
+    fields = known(fields, SUB_TASK, "a sub-task")
+    words = {name: text(fields, name) for name in fields if not name.endswith("_where")}
     return SubTask(
         **words,
         target_where=_reference(fields.get("target_where")),
@@ -117,57 +132,64 @@ def _sub_task(fields: Mapping[str, Any]) -> SubTask:
     )
 
 
-def _reference(fields: Mapping[str, Any] | None) -> Reference | None:
+def _reference(fields: Any) -> Reference | None:
     if fields is None:
         return None
-    return Reference(str(fields["relation"]), tuple(str(name) for name in fields["landmarks"]))
+    fields = known(fields, frozenset(("relation", "landmarks")), "which of several objects is meant")
+    return Reference(text(fields, "relation"), texts(fields, "landmarks"))
 
 
-def _key_pose(fields: Mapping[str, Any], T_obj_ee: Array) -> MemoryKeyPose:
-    phase, confidence, opening = str(fields["phase"]), float(fields["confidence"]), float(fields["opening"])
+def _key_pose(fields: Fields, T_obj_ee: Array, n_sub_tasks: int) -> MemoryKeyPose:
+    phase, sub_task = text(fields, "phase"), integer(fields, "sub_task")
     if phase not in PHASES:
         raise ValueError(f"phase is {phase!r}, expected one of {PHASES}")
-    if not (0 <= confidence <= 1 and np.isfinite(opening)):
-        raise ValueError(f"confidence {confidence} or opening {opening} is out of range")
-    if not isinstance(fields["closed"], bool) or not isinstance(fields["dwell"], bool):
-        raise ValueError("'closed' and 'dwell' must be true or false")
-    anchor = Anchor(str(fields["anchor"]["place"]), str(fields["anchor"]["axes"]))
+    if sub_task >= n_sub_tasks:
+        raise ValueError(f"'sub_task' is {sub_task}, but the entry has {n_sub_tasks} sub-tasks from 0 on")
+    anchor = known(fields["anchor"], frozenset(("place", "axes")), "'anchor'")
+    axis, covariance = fields.get("axis"), fields.get("covariance")
     return MemoryKeyPose(
-        anchor,
+        Anchor(text(anchor, "place"), text(anchor, "axes")),
         T_obj_ee,
         phase,
-        confidence,
-        fields["closed"],
-        opening,
-        int(fields["n_steps"]),
-        fields["dwell"],
-        None if fields.get("axis") is None else _axis(fields["axis"]),
+        number(fields, "confidence", 0, 1),
+        flag(fields, "closed"),
+        number(fields, "opening"),
+        integer(fields, "n_steps"),
+        flag(fields, "dwell"),
+        None if axis is None else _axis(axis),
+        sub_task,
+        None if covariance is None else _covariance(covariance),
     )
 
 
-def _axis(fields: Mapping[str, Any]) -> Axis:
-    kind, direction = str(fields["kind"]), np.asarray(fields["direction"], float)
-    amount = float(fields["amount"])
+def _axis(fields: Any) -> Axis:
+    fields = known(fields, frozenset(("kind", "direction", "amount")), "'axis'")
+    kind, direction = text(fields, "kind"), numbers(fields["direction"], (3,), "the axis's unit 'direction'")
     if kind not in get_args(AxisKind):
         raise ValueError(f"axis is of kind {kind!r}, expected one of {get_args(AxisKind)}")
-    if direction.shape != (3,) or not abs(float(np.linalg.norm(direction)) - 1) < 1e-6:
+    if not abs(float(np.linalg.norm(direction)) - 1) < 1e-6:
         raise ValueError(f"axis has direction {direction.tolist()}, expected a unit vector of 3 numbers")
-    if not np.isfinite(amount):
-        raise ValueError(f"axis has amount {amount}, expected a finite number")
-    return Axis(cast(AxisKind, kind), direction, amount)
+    return Axis(cast(AxisKind, kind), direction, number(fields, "amount"))
 
 
-def _transforms(arrays: Mapping[str, Array], name: str, where: str) -> Array:
-    if name not in arrays:
-        raise MemoryFormatError(
-            f"{where}: array {name!r} is missing, got {sorted(arrays)}; train or pull it again"
-        )
-    T = arrays[name]
-    if T.ndim != 3 or T.shape[1:] != (4, 4) or T.dtype != np.float64 or not se3.is_rigid(T):
-        raise MemoryFormatError(
-            f"{where}: array {name!r} has shape {T.shape} and type {T.dtype}, expected rigid transforms "
-            "(n, 4, 4) of float64; train or pull it again"
-        )
+def _covariance(value: Any) -> Array:
+    covariance = numbers(value, (6, 6), "'covariance'")
+    scale = float(np.abs(covariance).max())
+    if not np.allclose(covariance, covariance.T, rtol=0, atol=1e-9 * scale):
+        raise ValueError("'covariance' is not symmetric")
+    if np.linalg.eigvalsh(covariance)[0] < -1e-9 * scale:
+        raise ValueError("'covariance' is not positive semi-definite")
+    return covariance
+
+
+def _transforms(rows: list[Any], what: str) -> Array:
+    """Rigid transforms ``(n, 4, 4)`` of their first three rows each."""
+    T = np.zeros((len(rows), 4, 4))
+    T[:, 3, 3] = 1
+    if rows:
+        T[:, :3] = numbers(rows, (len(rows), 3, 4), what)
+    if not se3.is_rigid(T):
+        raise ValueError(f"{what} must be rigid transforms, three rows of four numbers each")
     return T
 
 
@@ -179,14 +201,10 @@ def robot_to_dict(robot: RobotModel) -> dict[str, Any]:
 def robot_from_dict(fields: Mapping[str, Any], where: str) -> RobotModel:
     """Inverse of :func:`robot_to_dict`. Raises MemoryFormatError naming file and field."""
     try:
-        numbers = {
-            name: float(fields[name]) for name in RobotModel.__dataclass_fields__ if name != "workspace"
-        }
-        workspace = np.asarray(fields["workspace"], float)
+        fields = known(fields, frozenset(RobotModel.__dataclass_fields__), "the robot")
+        own = {name: number(fields, name) for name in RobotModel.__dataclass_fields__ if name != "workspace"}
+        return RobotModel(workspace=numbers(fields["workspace"], (2, 3), "'workspace'"), **own)
     except MALFORMED as error:
         raise MemoryFormatError(
             f"{where}: 'robot' is malformed: {error!r}; train or pull it again"
         ) from error
-    if workspace.shape != (2, 3) or not np.isfinite([*numbers.values(), *workspace.flat]).all():
-        raise MemoryFormatError(f"{where}: 'robot' must hold finite numbers and a (2, 3) workspace")
-    return RobotModel(workspace=workspace, **numbers)

@@ -10,6 +10,7 @@ import numpy as np
 
 from lerobot_openspm.geometry import se3
 from lerobot_openspm.geometry.se3 import Array
+from lerobot_openspm.memory.compound import sub_task_index
 from lerobot_openspm.memory.entry import WORLD, Anchor, SubTask
 from lerobot_openspm.mining.key_poses import KeyPose
 
@@ -53,9 +54,8 @@ def roles(key_poses: Sequence[KeyPose]) -> list[Role]:
 
 
 def sub_task_of(pose: KeyPose, sub_tasks: Sequence[SubTask]) -> SubTask:
-    """The sub-task a key pose serves: each one takes two gripper transitions, and leaving is part of it."""
-    contact = pose.contact - 1 if pose.phase == "retreat" else pose.contact
-    return sub_tasks[min(max(contact, 0) // 2, len(sub_tasks) - 1)]
+    """The sub-task a key pose serves, see :func:`sub_task_index`."""
+    return sub_tasks[sub_task_index(pose.contact, pose.phase, len(sub_tasks))]
 
 
 def suggested_anchor(pose: KeyPose, sub_tasks: Sequence[SubTask]) -> str:

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 from lerobot.datasets import LeRobotDataset
+from lerobot.datasets.language import LANGUAGE_PERSISTENT
 from lerobot.datasets.video_utils import decode_video_frames
 from lerobot.utils.constants import ACTION, OBS_STATE
 from numpy.typing import NDArray
@@ -45,6 +46,11 @@ class Demonstrations:
     def name(self) -> str:
         """The dataset's repository id."""
         return str(self._dataset.repo_id)
+
+    @property
+    def fps(self) -> float:
+        """Frames per second, as the dataset says of itself."""
+        return float(self._dataset.meta.fps)
 
     def episodes(self, indices: Sequence[int] | None = None) -> list[Episode]:
         """Read the given episodes, or all of them. Raises DatasetError for an index that does not exist."""
@@ -98,6 +104,45 @@ class Demonstrations:
             depth, labels = depth_of(layers, key, size), labels_of(layers, key, size)
             views[key] = View(image, scaled, scaled.T_world_cam(episode.T_world_ee[frame]), depth, labels)
         return views
+
+    def pictures(
+        self, episode: Episode, frames: Sequence[int], n_cameras: int
+    ) -> dict[str, list[NDArray[np.uint8]]]:
+        """Decode a few frames of the first colour cameras, calibrated or not, ``(height, width, 3)`` RGB.
+
+        Args:
+            episode: Of this dataset.
+            frames: Frames within the episode.
+            n_cameras: How many cameras, in the dataset's order.
+        """
+        pictures: dict[str, list[NDArray[np.uint8]]] = {}
+        for frame in frames:
+            item: dict[str, Any] = self._dataset[episode.from_index + frame]  # pyright: ignore[reportAssignmentType]
+            colour = [key for key in self._dataset.meta.camera_keys if item[key].shape[0] == 3]
+            for key in colour[:n_cameras]:
+                image = item[key].numpy().transpose(1, 2, 0)
+                image = image if image.dtype == np.uint8 else np.round(image * 255).astype(np.uint8)
+                pictures.setdefault(key, []).append(image)
+        return pictures
+
+    def subtask_rows(self, index: int) -> list[tuple[float, str]]:
+        """What lerobot-annotate wrote of an episode: second at which each sub-task begins, and its words.
+
+        Raises:
+            DatasetError: The dataset was never annotated.
+        """
+        if LANGUAGE_PERSISTENT not in self._dataset.features:
+            raise DatasetError(
+                f"dataset {self.name} has no column {LANGUAGE_PERSISTENT!r}, which phase_judge=annotations "
+                f"reads; write it with lerobot-annotate --root={self._dataset.root}, or leave "
+                "--policy.phase_judge out"
+            )
+        # An episode's rows stand beside each of its frames.
+        meta: Any = self._dataset.meta.episodes
+        column: Any = self._dataset.hf_dataset.select_columns([LANGUAGE_PERSISTENT])
+        rows = column[int(meta["dataset_from_index"][index])][LANGUAGE_PERSISTENT] or []
+        found = [(row["timestamp"], row["content"]) for row in rows if row["style"] == "subtask"]
+        return sorted((float(begin), str(words or "")) for begin, words in found)
 
     def images(self, episode: Episode, camera: str) -> NDArray[np.uint8]:
         """All images ``(n, height, width, 3)`` of one camera, uint8 RGB, decoded in one go.

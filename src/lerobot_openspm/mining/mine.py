@@ -14,6 +14,7 @@ from lerobot_openspm.errors import DatasetError, InstructionError
 from lerobot_openspm.geometry import se3
 from lerobot_openspm.geometry.camera import Camera
 from lerobot_openspm.geometry.se3 import Array
+from lerobot_openspm.memory.compound import sub_task_index
 from lerobot_openspm.memory.entry import Anchor, Axis, MemoryEntry, MemoryKeyPose, RetrievalKey, SubTask
 from lerobot_openspm.memory.instruction import parse_instruction
 from lerobot_openspm.memory.robot import RobotModel
@@ -35,7 +36,7 @@ from lerobot_openspm.perception.learning import Shape, learn_objects
 from lerobot_openspm.perception.localise import localise_all
 from lerobot_openspm.perception.model import KnownObject
 from lerobot_openspm.perception.object_shape import ShapeBackend
-from lerobot_openspm.perception.types import Hint, Scene, Segmenter
+from lerobot_openspm.perception.types import Hint, PoseEstimate, Scene, Segmenter
 
 logger = logging.getLogger(__name__)
 
@@ -157,8 +158,20 @@ def layouts_in_scenes(
         wanted = dict.fromkeys(name for sub_task in item.sub_tasks for name in sub_task.objects)
         sought = {name: models[name] for name in wanted if name in models}
         estimates = localise_all(scene.views, sought, segmenter)
-        layouts.append({name: e.T_world_obj for name, e in estimates.items() if e.status == "found"})
+        places = {name: _place(name, estimate, scene.hints) for name, estimate in estimates.items()}
+        layouts.append({name: T for name, T in places.items() if T is not None})
     return LearnedObjects(models, layouts)
+
+
+def _place(name: str, estimate: PoseEstimate, touched: Sequence[Hint]) -> Array | None:
+    """Where an object is; of several that look alike, the one that the hand went to. None if unknown."""
+    points = [hint.point_world[:2] for hint in touched if hint.name == name]
+    if estimate.status == "not_found" or (estimate.status == "ambiguous" and not points):
+        return None
+    if not estimate.others or not points:
+        return estimate.T_world_obj
+    places = (estimate.T_world_obj, *estimate.others)
+    return min(places, key=lambda T: float(np.linalg.norm(np.asarray(points) - T[:2, 3], axis=1).min()))
 
 
 def oracle_layouts(
@@ -237,7 +250,7 @@ def build_entries(
         anchors = consensus(group, sub_tasks)
         judged = zip(members, group, constrained_axes(group, anchors), qualities(group, anchors), strict=True)
         for i, demonstration, axes, quality in judged:
-            key_poses = _remember(demonstration, anchors, axes)
+            key_poses = _remember(demonstration, anchors, axes, len(sub_tasks))
             if key_poses is None:
                 logger.warning(
                     "skipping episode %d of %s: its anchors were not found", mined[i].episode.index, source
@@ -255,7 +268,10 @@ def build_entries(
 
 
 def _remember(
-    demonstration: Demonstration, anchors: Mapping[Role, Anchor], axes: Mapping[Role, Axis]
+    demonstration: Demonstration,
+    anchors: Mapping[Role, Anchor],
+    axes: Mapping[Role, Axis],
+    n_sub_tasks: int,
 ) -> tuple[MemoryKeyPose, ...] | None:
     """Express key poses in their anchors' frames; None if a contact's anchor was not found."""
     kept = []
@@ -277,6 +293,7 @@ def _remember(
                 pose.n_steps,
                 pose.dwell,
                 axes.get(role),
+                sub_task_index(pose.contact, pose.phase, n_sub_tasks),
             )
         )
     return tuple(kept)

@@ -51,10 +51,12 @@ def localise_box(views: Mapping[str, View], model: BoxModel, instances: Instance
     if not placed:
         return PoseEstimate("not_found", np.eye(4), np.diag([1.0, 1.0, 1.0, UNKNOWN_YAW_STD**2]), 0.0, {})
     best, sighting = placed[0]
-    status, confidence = fitting.verdict([one.score for one, _ in placed], model.typical_overlap)
-    T_world_obj = canonical(best.fit.body.T_world_obj, model.box_period, model.yaw_centre)
+    scores = [one.score for one, _ in placed]
+    status, confidence = fitting.verdict(scores, model.typical_overlap)
+    places = [canonical(one.fit.body.T_world_obj, model.box_period, model.yaw_centre) for one, _ in placed]
     masks = {camera: one.mask for camera, one in sighting.items()}
-    return PoseEstimate(status, T_world_obj, best.fit.covariance, confidence, masks)
+    alike = tuple(places[1 : 1 + fitting.others(scores, model.typical_overlap)])
+    return PoseEstimate(status, places[0], best.fit.covariance, confidence, masks, others=alike)
 
 
 def place(views: Mapping[str, View], sighting: Sighting, model: BoxModel) -> Placed:

@@ -23,6 +23,8 @@ MIN_VISIBLE_SHARE = 0.35
 # Relative to the overlap that is typical of the object's demonstrations.
 FOUND_CONFIDENCE = 0.5
 RIVAL_SHARE = 0.93
+# A further place must explain the images so well to count as another object of the kind.
+ANOTHER_CONFIDENCE = 0.75
 
 
 @dataclass(frozen=True)
@@ -160,6 +162,11 @@ def verdict(
         return "not_found", confidence
     is_rivalled = len(scores) > 1 and scores[1] > RIVAL_SHARE * scores[0]
     return "ambiguous" if is_rivalled else "found", confidence
+
+
+def others(scores: Sequence[float], typical_overlap: float) -> int:
+    """How many of the fits after the best, from the same scores, show an object of the kind too."""
+    return sum(score >= ANOTHER_CONFIDENCE * typical_overlap for score in scores[1:])
 
 
 def _covariance(information: Array, prior: Array) -> Array:

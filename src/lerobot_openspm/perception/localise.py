@@ -19,7 +19,7 @@ from lerobot_openspm.geometry.se3 import Array
 from lerobot_openspm.perception import colour
 from lerobot_openspm.perception.blobs import find_blobs
 from lerobot_openspm.perception.box_finding import localise_box
-from lerobot_openspm.perception.fitting import COARSE_PX, Cloud, Evidence, Fit, Freedom, fit, verdict
+from lerobot_openspm.perception.fitting import COARSE_PX, Cloud, Evidence, Fit, Freedom, fit, others, verdict
 from lerobot_openspm.perception.model import BoxModel, KnownObject, ObjectModel, PatchModel
 from lerobot_openspm.perception.patches import localise_patches
 from lerobot_openspm.perception.sightings import Instances
@@ -184,16 +184,19 @@ def _localise_shape(
 def _estimate(
     fits: Sequence[Fit], model: ObjectModel, masks: dict[str, Mask], visible: float
 ) -> PoseEstimate:
-    """The best of several fits, and what the others say of it."""
-    best = fits[0]
-    status, confidence = verdict([one.score for one in fits], model.typical_overlap)
+    """The best of several fits, the best first, and what the others say of it."""
+    best, scores = fits[0], [one.score for one in fits]
+    status, confidence = verdict(scores, model.typical_overlap)
+    places = [canonical(one.T_world_obj, model.yaw_period, model.yaw_centre) for one in fits]
     covariance = best.covariance.copy()
     if model.yaw_period == 0:
         covariance[3, :] = covariance[:, 3] = 0
         covariance[3, 3] = UNKNOWN_YAW_STD**2
-    T_world_obj = canonical(best.T_world_obj, model.yaw_period, model.yaw_centre)
-    support = _support(best, model, masks)
-    return PoseEstimate(status, T_world_obj, covariance, confidence, masks, visible, support)
+    support, alike = (
+        _support(best, model, masks),
+        tuple(places[1 : 1 + others(scores, model.typical_overlap)]),
+    )
+    return PoseEstimate(status, places[0], covariance, confidence, masks, visible, support, alike)
 
 
 def _support(best: Fit, model: ObjectModel, masks: Mapping[str, Mask]) -> Support:

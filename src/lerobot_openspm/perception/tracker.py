@@ -80,6 +80,7 @@ class _Track:
         hidden: Whether the last look could not tell.
         rivalled: Whether two places explained the last look's pictures.
         doubted: Whether the next sure sight is believed wherever it is.
+        placed: Whether the hand has let go of it where it is taken to be, and it was not seen since.
     """
 
     belief: kalman.Belief
@@ -90,6 +91,7 @@ class _Track:
     hidden: bool = False
     rivalled: bool = False
     doubted: bool = False
+    placed: bool = False
 
 
 @dataclass
@@ -167,11 +169,12 @@ class Tracker:
             self._carry(track, se3.inverse(T_world_ee), held=True)
 
     def release(self, names: Iterable[str], T_world_ee: Array) -> None:
-        """The hand lets go of objects, which stay where they are now."""
+        """The hand lets go of objects, which stay where they are now, be they recognised there or not."""
         for name in names:
             track = self._tracks.get(name)
             if track is not None and track.held:
                 self._carry(track, T_world_ee, held=False)
+                track.placed = True
 
     def doubt(self, names: Iterable[str], T_world_ee: Array) -> None:
         """Objects need not be where they are taken to be; the next sure sight of them is believed at once."""
@@ -179,6 +182,11 @@ class Tracker:
         for name in names:
             if name in self._tracks:
                 self._tracks[name].doubted = True
+
+    def forget(self, names: Iterable[str]) -> None:
+        """These names stand for other objects from now on."""
+        for name in names:
+            self._tracks.pop(name, None)
 
     @property
     def held(self) -> frozenset[str]:
@@ -214,7 +222,7 @@ class Tracker:
             )
             if innovation.accepted[0]:
                 track.belief, track.rival, track.missed_s = belief, None, 0.0
-                track.hidden = track.rivalled = track.doubted = False
+                track.hidden = track.rivalled = track.doubted = track.placed = False
                 track.smoothed = self._smoothed(track.smoothed, belief.T[0])
                 return False
         rival, track.rival = T_world_obj if track.doubted else track.rival, T_world_obj
@@ -225,13 +233,17 @@ class Tracker:
         return True
 
     def _miss(self, track: _Track, estimate: PoseEstimate, T_world_ee: Array, waited_s: float) -> None:
-        """An object that is in sight but not recognised is on its way to being lost; a hidden one is not."""
+        """An object that is in sight but not recognised is on its way to being lost; a hidden one is not.
+
+        Nor is one that the hand has put where it looks different, as in a drawer.
+        """
         expected = _in_world(track.belief.T[0], track, T_world_ee)
         near = self.settings.carrying_m if self.held else self.settings.hand_m
         track.rival = None
         track.hidden = (
             estimate.visible < self.settings.visible
             or estimate.status == "found"
+            or (track.placed and not track.doubted)
             or float(np.linalg.norm(expected[:3, 3] - T_world_ee[:3, 3])) < near
         )
         track.rivalled = estimate.status == "ambiguous" and not track.hidden

@@ -141,6 +141,8 @@ class PoseEstimate:
         visible: Share of the object that is in sight in the view that shows it best, where the hand is not in
             the way: at its place if it was found, else where it was expected.
         support: What the estimate rests on; None where the covariance says all.
+        others: Poses ``(4, 4)`` of further places that show such an object too, the surest first. Of objects
+            known by patches none are told.
     """
 
     status: Literal["found", "not_found", "ambiguous"]
@@ -150,3 +152,4 @@ class PoseEstimate:
     masks: dict[str, Mask]
     visible: float = 1.0
     support: Support | None = None
+    others: tuple[Array, ...] = ()

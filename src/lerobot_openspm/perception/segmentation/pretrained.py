@@ -98,7 +98,7 @@ def transformers_class(name: str) -> Any:
     try:
         import transformers
     except ImportError as error:
-        raise PerceptionError(f"this segmenter needs transformers: {error}. Install it: {INSTALL}") from error
+        raise PerceptionError(f"this model needs transformers: {error}. Install it: {INSTALL}") from error
     try:
         return getattr(transformers, name)
     except (AttributeError, ImportError) as error:

@@ -1,0 +1,202 @@
+"""How well instructions are read: known ones, paraphrases, and those that the memory must refuse."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import cache
+from importlib.resources import files
+from pathlib import Path
+from typing import Any
+
+from lerobot_openspm.errors import InstructionError, OpenSPMError
+from lerobot_openspm.memory.entry import MemoryEntry, Reference, RetrievalKey, SubTask
+from lerobot_openspm.memory.instruction import parse_instruction
+from lerobot_openspm.memory.meaning import same_meaning
+from lerobot_openspm.memory.names import TABLE_NAMES, Model2VecNames, NameSimilarity
+from lerobot_openspm.memory.retrieval import semantic_candidates
+
+# The instructions and their elements, which were checked by reading every line.
+KNOWN, PARAPHRASES, OUT_OF_DOMAIN = "known.json", "paraphrases.json", "out_of_domain.json"
+HELD_OUT = "held_out"
+# A line of paraphrases.json ("paraphrase", "of", "split") or of out_of_domain.json ("instruction", ...).
+Row = dict[str, str]
+# The suites with demonstrations or their keys, over which the right entry is to come first.
+SUITES = ("libero_spatial", "libero_object", "libero_goal", "libero_10", "tabletop")
+
+
+@dataclass
+class Options:
+    """Measure how instructions are read. Needs no checkpoint and no simulator."""
+
+    folder: str | None = None  # of paraphrases.json and out_of_domain.json; default: those of the package
+    name_embeddings: str | None = None  # model2vec model, as in --policy.name_embeddings
+    failures: bool = False  # whether to list what failed
+
+
+@dataclass(frozen=True)
+class Known:
+    """An instruction of LIBERO or the tabletop.
+
+    Attributes:
+        instruction: Its words.
+        tasks: ``suite/task`` of the tasks that are told in these words.
+        names: Of the tasks whose name says it in these words, which differ from those they are told in.
+        elements: What it means.
+    """
+
+    instruction: str
+    tasks: tuple[str, ...]
+    names: tuple[str, ...]
+    elements: tuple[SubTask, ...]
+
+    @property
+    def suites(self) -> frozenset[str]:
+        """The suites it belongs to."""
+        return frozenset(task.split("/")[0] for task in (*self.tasks, *self.names))
+
+
+@cache
+def known_instructions() -> tuple[Known, ...]:
+    """Every instruction of LIBERO's 130 tasks and the tabletop's ten, with its elements."""
+    rows = json.loads(files("lerobot_openspm.bench").joinpath("instructions", KNOWN).read_text())
+    return tuple(
+        Known(
+            row["instruction"],
+            tuple(row.get("tasks", ())),
+            tuple(row.get("names", ())),
+            tuple(_sub_task(e) for e in row["elements"]),
+        )
+        for row in rows
+    )
+
+
+def _sub_task(fields: dict[str, Any]) -> SubTask:
+    def reference(key: str) -> Reference | None:
+        where = fields.get(key)
+        return Reference(where["relation"], tuple(where.get("landmarks", ()))) if where else None
+
+    words = {key: value for key, value in fields.items() if not key.endswith("_where")}
+    return SubTask(
+        **words, target_where=reference("target_where"), landmark_where=reference("landmark_where")
+    )
+
+
+def bank(suites: Sequence[str] | None = None) -> list[MemoryEntry]:
+    """A memory of keys alone: one entry for each wording of the tasks of some suites, or of all."""
+    return [
+        MemoryEntry(RetrievalKey(known.elements, ()), known.instruction, (), 1.0, 1, "instructions")
+        for known in known_instructions()
+        if suites is None or known.suites & set(suites)
+    ]
+
+
+def read_rows(name: str, folder: str | None = None) -> list[Row]:
+    """The paraphrases, or the instructions out of domain; each row with its "split", "dev" or "held_out".
+
+    Raises:
+        OpenSPMError: There are none.
+    """
+    path = Path(folder) / name if folder else files("lerobot_openspm.bench").joinpath("instructions", name)
+    if not path.is_file():
+        raise OpenSPMError(f"no {name} at {path}; pass --folder with {PARAPHRASES} and {OUT_OF_DOMAIN}")
+    return json.loads(path.read_text())
+
+
+def is_parsed(row: Row) -> bool:
+    """Whether a paraphrase means the same as its original."""
+    original = _elements()[row["of"]]
+    try:
+        return same_meaning(parse_instruction(row["paraphrase"]), original)
+    except InstructionError:
+        return False
+
+
+@cache
+def _elements() -> dict[str, tuple[SubTask, ...]]:
+    return {known.instruction: known.elements for known in known_instructions()}
+
+
+def is_refused(row: Row, entries: Sequence[MemoryEntry], names: NameSimilarity = TABLE_NAMES) -> bool:
+    """Whether an instruction is not read, or nothing in the memory is about it."""
+    try:
+        semantic_candidates(row["instruction"], entries, names)
+    except InstructionError:
+        return True
+    return False
+
+
+def is_first(row: Row, entries: Sequence[MemoryEntry], names: NameSimilarity = TABLE_NAMES) -> bool:
+    """Whether the best entries for a paraphrase are all of its original's meaning."""
+    try:
+        found = semantic_candidates(row["paraphrase"], entries, names)
+    except InstructionError:
+        return False
+    best = max(score for _, score in found)
+    original = _elements()[row["of"]]
+    return all(same_meaning(entry.key.sub_tasks, original) for entry, score in found if score == best)
+
+
+def measure(options: Options) -> dict[str, Any]:
+    """Read everything; the rates named first are those of the held-out half, where there is one."""
+    names = Model2VecNames(options.name_embeddings) if options.name_embeddings else TABLE_NAMES
+    failures: dict[str, list[str]] = {}
+    splits = {
+        split: _measure_split(split, options.folder, names, failures) for split in _splits(options.folder)
+    }
+    headline = splits.get(HELD_OUT) or next(iter(splits.values()))
+    of_libero = [known for known in known_instructions() if known.suites - {"tabletop"}]
+    read = [known for known in of_libero if _is_read(known)]
+    result = {
+        "libero_parsed": _wordings(read) / _wordings(of_libero),
+        **headline,
+        "n_libero": _wordings(of_libero),
+        "splits": splits,
+    }
+    return {**result, "failures": failures} if options.failures else result
+
+
+def _wordings(known: Sequence[Known]) -> int:
+    """Wordings of LIBERO's tasks: what each is told in, and what its name says where that is different."""
+    return sum(not task.startswith("tabletop") for one in known for task in (*one.tasks, *one.names))
+
+
+def _is_read(known: Known) -> bool:
+    try:
+        return parse_instruction(known.instruction) == known.elements
+    except InstructionError:
+        return False
+
+
+def _splits(folder: str | None) -> list[str]:
+    return sorted({row["split"] for row in read_rows(PARAPHRASES, folder)})
+
+
+def _measure_split(
+    split: str, folder: str | None, names: NameSimilarity, failures: dict[str, list[str]]
+) -> dict[str, Any]:
+    paraphrases = [row for row in read_rows(PARAPHRASES, folder) if row["split"] == split]
+    strangers = [row for row in read_rows(OUT_OF_DOMAIN, folder) if row["split"] == split]
+    everything, demonstrated = bank(), bank(SUITES)
+    of_demonstrated = {entry.language for entry in demonstrated}
+    to_find = [row for row in paraphrases if row["of"] in of_demonstrated]
+
+    def rate(what: str, rows: list[Row], passes: Callable[[Row], bool]) -> float | None:
+        failed = [row for row in rows if not passes(row)]
+        failures[f"{split}_{what}"] = [row.get("paraphrase") or row["instruction"] for row in failed]
+        return 1 - len(failed) / len(rows) if rows else None
+
+    return {
+        "paraphrases_parsed": rate("paraphrases_parsed", paraphrases, is_parsed),
+        "out_of_domain_refused": rate(
+            "out_of_domain_refused", strangers, lambda row: is_refused(row, everything, names)
+        ),
+        "retrieved_first": rate("retrieved_first", to_find, lambda row: is_first(row, demonstrated, names)),
+        "n": len(paraphrases),
+        "retrieved_first_of_all": rate(
+            "retrieved_first_of_all", paraphrases, lambda row: is_first(row, everything, names)
+        ),
+        "n_out_of_domain": len(strangers),
+        "n_retrieved": len(to_find),
+    }

@@ -1,0 +1,221 @@
+"""`openspm memory add | remove | merge | rate | cameras`: commands that change a memory, each as a whole."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import draccus
+
+from lerobot_openspm.errors import OpenSPMError
+from lerobot_openspm.experience import Experience, load_experience, save_experience
+from lerobot_openspm.experience_exchange import combined, read_parcel
+from lerobot_openspm.experience_files import changing
+from lerobot_openspm.geometry.camera import load_cameras
+from lerobot_openspm.memory.entry import MemoryEntry
+from lerobot_openspm.memory.merging import merge_near_duplicates
+from lerobot_openspm.memory.quality import with_outcome
+
+
+@dataclass
+class AddConfig:
+    """Add entries to a memory.
+
+    Args:
+        path: Folder of the checkpoint or memory that is added to.
+        other: Folder of another one, or a file that ``openspm memory export`` wrote.
+    """
+
+    path: str = "outputs/memory"
+    other: str = ""
+
+
+@dataclass
+class RemoveConfig:
+    """Remove entries from a memory. They are kept as superseded: ``list --all=true`` shows them.
+
+    Args:
+        path: Folder of the checkpoint or memory.
+        source: Remove entries that come from this dataset and episode, as ``list`` names them.
+        instruction: Remove entries of this very instruction.
+    """
+
+    path: str = "outputs/memory"
+    source: str = ""
+    instruction: str = ""
+
+
+@dataclass
+class MergeConfig:
+    """Merge near-duplicates: entries of one task whose key poses all lie close together.
+
+    Args:
+        path: Folder of the checkpoint or memory.
+        instruction: Merge only entries of this very instruction.
+        distance_m: Every two of what is merged have each key pose within this distance.
+        angle_rad: And within this angle.
+    """
+
+    path: str = "outputs/memory"
+    instruction: str = ""
+    distance_m: float = 0.01
+    angle_rad: float = 0.1
+
+    def __post_init__(self) -> None:
+        for name in ("distance_m", "angle_rad"):
+            if not 0 < getattr(self, name) < math.inf:
+                raise ValueError(f"{name} is {getattr(self, name)}, expected more than 0")
+
+
+@dataclass
+class RateConfig:
+    """Say how acting by an entry ended; its quality follows.
+
+    Args:
+        path: Folder of the checkpoint or memory.
+        source: Dataset and episode of the entry, as ``list`` names them.
+        instruction: Its very instruction, where several entries have the same source.
+        success: Whether it succeeded.
+    """
+
+    path: str = "outputs/memory"
+    source: str = ""
+    instruction: str = ""
+    success: bool | None = None
+
+
+@dataclass
+class CamerasConfig:
+    """Give a memory another calibration.
+
+    Args:
+        path: Folder of the checkpoint or memory.
+        file: Calibration file, as ``openspm calibrate`` writes it.
+    """
+
+    path: str = "outputs/memory"
+    file: str = ""
+
+
+def add(args: list[str]) -> None:
+    """Add entries of another memory or of an exported file."""
+    config = draccus.parse(AddConfig, args=args)
+    _required(config.other, "--other=FOLDER or --other=FILE")
+    parcel = read_parcel(Path(config.other))
+    folder = Path(config.path)
+    with changing(folder):
+        before = load_experience(folder)
+        after, n_added = combined(before, parcel, config.other)
+        if n_added:
+            save_experience(after, folder)
+    _report(after, added=n_added, unchanged=len(parcel.experience.entries) - n_added)
+
+
+def remove(args: list[str]) -> None:
+    """Remove entries; the memory keeps them as superseded."""
+    config = draccus.parse(RemoveConfig, args=args)
+    _required(config.source + config.instruction, "--source=DATASET#EPISODE or --instruction=TEXT")
+    folder = Path(config.path)
+    with changing(folder):
+        before = load_experience(folder)
+        gone = _chosen(before, config.source, config.instruction, config.path)
+        kept = [entry for i, entry in enumerate(before.entries) if i not in gone]
+        if not kept:
+            raise OpenSPMError(
+                f"this would remove all {len(gone)} entries of the memory at {config.path}, and nothing can "
+                "be done with an empty one; delete the folder instead"
+            )
+        after = replace(before, entries=tuple(kept), superseded=(*before.superseded, *gone.values()))
+        save_experience(after, folder)
+    for entry in gone.values():
+        print(f"removed version {entry.version} of {entry.source}: {entry.language!r}")
+    _report(after, removed=len(gone))
+
+
+def merge(args: list[str]) -> None:
+    """Merge near-duplicates; the memory keeps what they were as superseded."""
+    config = draccus.parse(MergeConfig, args=args)
+    folder = Path(config.path)
+    with changing(folder):
+        before = load_experience(folder)
+        result = merge_near_duplicates(
+            before.entries, config.distance_m, config.angle_rad, config.instruction or None
+        )
+        after = before
+        if result.superseded:
+            after = replace(
+                before, entries=result.entries, superseded=(*before.superseded, *result.superseded)
+            )
+            save_experience(after, folder)
+    n_merged = len(result.superseded)
+    _report(after, merged=n_merged, into=len(after.entries) - len(before.entries) + n_merged)
+
+
+def rate(args: list[str]) -> None:
+    """Count an outcome of one entry."""
+    config = draccus.parse(RateConfig, args=args)
+    _required(config.source, "--source=DATASET#EPISODE")
+    if config.success is None:
+        raise OpenSPMError("how did it end? pass --success=true or --success=false")
+    folder = Path(config.path)
+    with changing(folder):
+        before = load_experience(folder)
+        chosen = _chosen(before, config.source, config.instruction, config.path)
+        if len(chosen) > 1:
+            raise OpenSPMError(
+                f"{len(chosen)} entries come from {config.source!r}; pass --instruction=TEXT with one of: "
+                + "; ".join(sorted({entry.language for entry in chosen.values()}))
+            )
+        [(index, entry)] = chosen.items()
+        rated = with_outcome(entry, config.success)
+        entries = tuple(rated if i == index else other for i, other in enumerate(before.entries))
+        after = replace(before, entries=entries)
+        save_experience(after, folder)
+    _report(after, quality=rated.quality, trials=rated.trials, successes=rated.successes)
+
+
+def cameras(args: list[str]) -> None:
+    """Put another calibration into a memory."""
+    config = draccus.parse(CamerasConfig, args=args)
+    _required(config.file, "--file=CALIBRATION")
+    folder, file = Path(config.path), Path(config.file)
+    load_cameras(file)
+    with changing(folder):
+        after = load_experience(folder, cameras=file)
+        save_experience(after, folder)
+    _report(after, cameras=sorted(after.cameras))
+
+
+def _required(value: str, option: str) -> None:
+    if not value:
+        raise OpenSPMError(f"nothing to do; pass {option}")
+
+
+def _chosen(experience: Experience, source: str, instruction: str, path: str) -> dict[int, MemoryEntry]:
+    """Entries by index of a source and of an instruction, where these are given. Raises if there is none."""
+    found = {
+        i: entry
+        for i, entry in enumerate(experience.entries)
+        if source in ("", entry.source) and instruction in ("", entry.language)
+    }
+    if not found:
+        asked = " and ".join(repr(value) for value in (source, instruction) if value)
+        raise OpenSPMError(
+            f"the memory at {path} holds no entry of {asked}; it knows: {_known(experience.entries)}. "
+            f"`openspm memory list --path={path}` lists its entries"
+        )
+    return found
+
+
+def _known(entries: Sequence[MemoryEntry], limit: int = 20) -> str:
+    languages = sorted({entry.language for entry in entries})
+    return "; ".join(languages[:limit]) + (" ..." if len(languages) > limit else "")
+
+
+def _report(after: Experience, **numbers: object) -> None:
+    """Print one JSON object: what there is now, and what was done."""
+    now = {"entries": len(after.entries), "superseded": len(after.superseded)}
+    print(json.dumps({**now, **numbers}))

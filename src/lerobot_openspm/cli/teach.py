@@ -1,0 +1,122 @@
+"""`openspm teach`: append a task to a checkpoint's memory from a few demonstrations, without training."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import time
+from collections import Counter
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import draccus
+
+from lerobot_openspm.datasets import dataset_metadata
+from lerobot_openspm.errors import OpenSPMError
+from lerobot_openspm.experience import FILES, Experience, save_experience
+from lerobot_openspm.teaching import Lesson
+
+
+@dataclass
+class DatasetOption:
+    """The demonstrations to teach."""
+
+    repo_id: str = "local/openspm_tabletop"  # name on the Hub, or of a local one
+    root: str | None = None  # its folder; LeRobot's cache if not given
+    episodes: list[int] | None = None  # e.g. [0,1,2]; all if not given
+
+
+@dataclass
+class PolicyOption:
+    """What the checkpoint does not say."""
+
+    cameras: str | None = None  # calibration of the demonstrations; theirs or the checkpoint's if not given
+    sam3d_python: str | None = None  # for checkpoints whose shapes are SAM 3D's, see docs/sam3d.md
+    sam3d_checkout: str | None = None
+
+
+@dataclass
+class TeachConfig:
+    """Teach a checkpoint a task from a few demonstrations. Its weights stay as they are."""
+
+    into: str  # folder of the checkpoint
+    output: str | None = None  # folder of a new checkpoint to write instead of changing the old one
+    dataset: DatasetOption = field(default_factory=DatasetOption)
+    policy: PolicyOption = field(default_factory=PolicyOption)
+
+
+def main(args: list[str]) -> None:
+    """Teach, save, and print one JSON object."""
+    start_s = time.monotonic()
+    config = draccus.parse(TeachConfig, args=args)
+    into, output = Path(config.into), Path(config.output) if config.output else None
+    _check_folders(into, output)
+    experience, lesson = _taught(config)
+    if output is None:
+        save_experience(experience, into)
+    else:
+        _write_copy(experience, into, output)
+    print("\n".join(_lines(lesson)))
+    summary = {
+        "taught": list(lesson.instructions),
+        "entries": len(lesson.entries),
+        "entries_in_memory": len(experience.entries),
+        "entries_known_before": sum(lesson.known_before.values()),
+        "skipped": list(lesson.skipped),
+        "objects_learned": list(lesson.objects_learned),
+        "objects_recognised": list(lesson.objects_recognised),
+        "output": str(output or into),
+        "seconds": round(time.monotonic() - start_s, 1),
+    }
+    print(json.dumps(summary))
+
+
+def _check_folders(into: Path, output: Path | None) -> None:
+    for name in ("config.json", *FILES):
+        if not (into / name).is_file():
+            raise FileNotFoundError(
+                f"no checkpoint of this policy at {into}: it has no {name}; pass --into=FOLDER, in a "
+                "training's folder checkpoints/last/pretrained_model"
+            )
+    if output is not None and output.exists():
+        raise OpenSPMError(f"{output} exists already; choose another --output, or remove it")
+
+
+def _taught(config: TeachConfig) -> tuple[Experience, Lesson]:
+    """What the checkpoint knows after the lesson, and the lesson."""
+    from lerobot_openspm.modeling_openspm import OpenSPMPolicy
+
+    meta = dataset_metadata(config.dataset.repo_id, config.dataset.root)
+    policy = OpenSPMPolicy.from_pretrained(config.into)
+    given = {name: value for name, value in vars(config.policy).items() if value is not None}
+    policy.config = replace(policy.config, **given)
+    lesson = policy.teach(meta, config.dataset.episodes)
+    return policy.require_experience(), lesson
+
+
+def _write_copy(experience: Experience, into: Path, output: Path) -> None:
+    """Write the checkpoint with another memory, as a whole or not at all."""
+    beside = output.with_name(f".{output.name}.partial")
+    if beside.exists():  # of a run that was interrupted
+        shutil.rmtree(beside)
+    shutil.copytree(into, beside)
+    save_experience(experience, beside)
+    beside.rename(output)
+
+
+def _lines(lesson: Lesson) -> list[str]:
+    """What was learned, for a person."""
+    counts = Counter(entry.language for entry in lesson.entries)
+    lines = []
+    for task, before in lesson.known_before.items():
+        known = f", beside {before} that the memory had" if before else ""
+        lines.append(f"{task!r}: {counts[task]} new {'entries' if counts[task] > 1 else 'entry'}{known}")
+        entry = next(entry for entry in lesson.entries if entry.language == task)
+        lines.append(f"  {' > '.join(pose.phase for pose in entry.key_poses)}")
+    if lesson.objects_learned:
+        lines.append(f"objects learned: {', '.join(lesson.objects_learned)}")
+    if lesson.objects_recognised:
+        lines.append(f"objects recognised: {', '.join(lesson.objects_recognised)}")
+    if lesson.skipped:
+        lines.append(f"skipped episodes, see the warnings above: {', '.join(map(str, lesson.skipped))}")
+    return lines

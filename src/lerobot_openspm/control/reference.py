@@ -1,0 +1,154 @@
+"""Which of several objects of one name is meant: told from where they are, and from nothing else.
+
+Left, right, front and back are said as a person sees the table who stands opposite the robot: its left is
+that person's right. LIBERO says it that way too. Its camera ``agentview`` and the tabletop's ``front`` look
+along the world's -x at a robot that looks along +x; there left is -y, right is +y, front (near that person)
+is +x, and back is -x. A scene whose robot looks another way passes its own ``looking``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+
+import numpy as np
+
+from lerobot_openspm.errors import InstructionError
+from lerobot_openspm.geometry.se3 import Array
+from lerobot_openspm.memory.entry import Reference
+
+# Where a person looks who stands opposite a robot that looks along the world's x.
+OPPOSITE_THE_ROBOT = np.array([-1.0, 0.0])
+
+# The second best has to be this much worse than the best, in metres, for the best to be meant.
+MARGIN_M = 0.02
+# What is this near the middle of something, as seen from above, is on or in it and not next to it.
+WITHIN_M = 0.05
+# What stands on something is not lower than it, up to the error of a height.
+HEIGHT_ERROR_M = 0.01
+# How much a metre to the side counts beside a metre of distance, beyond half a right angle.
+SIDEWAYS_SHARE = 3.0
+
+# Costs (n,) in metres of candidates (n, 3), given landmarks (k, 3): the least is meant. Infinite: not at all,
+# not even if the candidate lay so many metres more favourably.
+_Cost = Callable[[Array, Array, float], Array]
+
+_ALIASES = {
+    "left of": "left", "right of": "right", "front of": "front", "in front of": "front", "behind": "back",
+    "inside": "in", "beside": "next to", "center": "middle",
+}  # fmt: skip
+
+
+def choose(
+    reference: Reference,
+    candidates: Sequence[Array],
+    landmarks: Mapping[str, Array],
+    looking: Array = OPPOSITE_THE_ROBOT,
+) -> int | None:
+    """Tell which of several objects a reference means.
+
+    Args:
+        reference: Where the object is said to be.
+        candidates: Poses ``T_world_obj`` ``(4, 4)`` of the objects of its name; z is up, origins at the
+            middle of what they stand on.
+        landmarks: Poses ``T_world_obj`` ``(4, 4)`` by name of the objects that the reference may name.
+        looking: Horizontal direction ``(2,)`` in the world in which the speaker looks; only left, right,
+            front and back depend on it.
+
+    Returns:
+        Index of the candidate; that of the only one whatever is said of it. None where no candidate is
+        there, another one is there as well up to :data:`MARGIN_M`, or a landmark was not found.
+
+    Raises:
+        InstructionError: The relation is none of those that can be told.
+    """
+    relation = _ALIASES.get(reference.relation, reference.relation)
+    cost = _costs(np.asarray(looking, float)).get((relation, len(reference.landmarks)))
+    if cost is None:
+        known = sorted(f"{name} ({count} landmarks)" for name, count in _costs(OPPOSITE_THE_ROBOT))
+        raise InstructionError(
+            f"cannot tell which object is {reference.relation!r} of {len(reference.landmarks)} landmarks; "
+            f"expected one of {', '.join(known)}; say it by one of these"
+        )
+    if len(candidates) == 1:
+        return 0
+    if not candidates or any(name not in landmarks for name in reference.landmarks):
+        return None
+    places = np.stack(candidates)[:, :3, 3]
+    marks = np.array([landmarks[name][:3, 3] for name in reference.landmarks]).reshape(-1, 3)
+    costs = cost(places, marks, 0.0)
+    best = int(np.argmin(costs))
+    # The best fulfils what is said; the others do not even nearly, or are clearly worse.
+    others = np.delete(cost(places, marks, MARGIN_M), best)
+    is_clear = np.isfinite(costs[best]) and others.min() - costs[best] >= MARGIN_M
+    return best if is_clear else None
+
+
+def _costs(looking: Array) -> dict[tuple[str, int], _Cost]:
+    """How to judge every relation with its number of landmarks."""
+    away = looking / np.linalg.norm(looking)
+    right = np.array([away[1], -away[0]])
+    sides = {"right": right, "left": -right, "back": away, "front": -away}
+    among: dict[tuple[str, int], _Cost] = {(name, 0): _furthest(way) for name, way in sides.items()}
+    beside: dict[tuple[str, int], _Cost] = {(name, 1): _at_side(way) for name, way in sides.items()}
+    return {
+        **among,
+        **beside,
+        ("middle", 0): _middle,
+        ("between", 2): _between,
+        ("next to", 1): _next_to,
+        ("on", 1): _above,
+        ("in", 1): _above,
+        ("under", 1): _below,
+    }
+
+
+def _furthest(way: Array) -> _Cost:
+    """The one that is furthest in a direction ``(2,)``."""
+
+    def cost(places: Array, *_: object) -> Array:
+        return -places[:, :2] @ way
+
+    return cost
+
+
+def _at_side(way: Array) -> _Cost:
+    """The nearest one on one side of the landmark: within half a right angle of a direction ``(2,)``."""
+
+    def cost(places: Array, marks: Array, slack: float) -> Array:
+        offset = places[:, :2] - marks[0, :2]
+        along = offset @ way
+        across = np.abs(offset @ np.array([way[1], -way[0]]))
+        sideways = SIDEWAYS_SHARE * np.maximum(across - along, 0.0)
+        return np.where(along >= MARGIN_M - slack, np.linalg.norm(offset, axis=1) + sideways, np.inf)
+
+    return cost
+
+
+def _middle(places: Array, *_: object) -> Array:
+    """The one that is nearest to all others; of two, neither."""
+    apart = np.linalg.norm(places[:, None, :2] - places[None, :, :2], axis=-1)
+    return apart.sum(axis=1)
+
+
+def _between(places: Array, marks: Array, _: float) -> Array:
+    """The one that makes the way between two landmarks longer by least."""
+    legs = np.linalg.norm(places[:, None, :2] - marks[None, :, :2], axis=-1).sum(axis=1)
+    return legs - float(np.linalg.norm(marks[0, :2] - marks[1, :2]))
+
+
+def _next_to(places: Array, marks: Array, slack: float) -> Array:
+    """The nearest one that is not on or in the landmark."""
+    away = np.linalg.norm(places[:, :2] - marks[0, :2], axis=1)
+    return np.where(away < WITHIN_M - slack, np.inf, away)
+
+
+def _above(places: Array, marks: Array, slack: float) -> Array:
+    """The nearest one, as seen from above, that is not lower than the landmark."""
+    away = np.linalg.norm(places[:, :2] - marks[0, :2], axis=1)
+    return np.where(places[:, 2] < marks[0, 2] - HEIGHT_ERROR_M - slack, np.inf, away)
+
+
+def _below(places: Array, marks: Array, slack: float) -> Array:
+    """The nearest one, as seen from above, that is not higher than the landmark."""
+    away = np.linalg.norm(places[:, :2] - marks[0, :2], axis=1)
+    return np.where(places[:, 2] > marks[0, 2] + HEIGHT_ERROR_M + slack, np.inf, away)

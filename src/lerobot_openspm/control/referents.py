@@ -1,0 +1,99 @@
+"""Which of several like objects an instruction means, kept over an episode."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from lerobot_openspm.control.reference import choose
+from lerobot_openspm.geometry.se3 import Array
+from lerobot_openspm.memory.compound import Candidate
+from lerobot_openspm.memory.entry import Reference
+from lerobot_openspm.perception.types import PoseEstimate
+
+logger = logging.getLogger(__name__)
+
+# What is seen this near to where one that is not meant was seen is that one.
+SAME_PLACE_M = 0.05
+
+
+def references(candidate: Candidate) -> dict[str, Reference]:
+    """By the name that an entry gives an object: where the instruction says that it is."""
+    said: dict[str, Reference] = {}
+    for asked, known in zip(candidate.asked, candidate.entry.key.sub_tasks, strict=True):
+        if asked.target_where is not None:
+            said[known.target] = asked.target_where
+        if asked.landmark_where is not None:
+            said[known.landmark] = asked.landmark_where
+    return said
+
+
+@dataclass
+class Referents:
+    """Tells objects of one name apart, in one environment.
+
+    Attributes:
+        said: By name, where the instruction says that the object is.
+    """
+
+    said: Mapping[str, Reference] = field(default_factory=dict[str, Reference])
+    _not_meant: dict[str, tuple[Array, ...]] = field(default_factory=dict[str, tuple[Array, ...]])
+
+    @property
+    def landmarks(self) -> tuple[str, ...]:
+        """The objects that others are told by, each once."""
+        return tuple(dict.fromkeys(name for one in self.said.values() for name in one.landmarks))
+
+    def hear(self, said: Mapping[str, Reference]) -> frozenset[str]:
+        """Take in what a part of the instruction says; the names that mean another object from now on."""
+        changed = frozenset(name for name in said if name in self.said and self.said[name] != said[name])
+        self.said = {**self.said, **said}
+        self._not_meant = {name: T for name, T in self._not_meant.items() if name not in changed}
+        return changed
+
+    def sort_out(
+        self, estimates: Mapping[str, PoseEstimate], layout: Mapping[str, Array]
+    ) -> dict[str, PoseEstimate]:
+        """What was seen of the objects that are meant.
+
+        An object is told from its like once, when several are first seen; from then on those that are not
+        meant are known by their places. One that cannot be told is ambiguous.
+
+        Args:
+            estimates: What a look brought.
+            layout: Poses ``T_world_obj`` ``(4, 4)`` of objects seen before.
+        """
+        places = {name: one.T_world_obj for name, one in estimates.items() if one.status == "found"}
+        known = {**places, **layout}
+        return {name: self._meant(name, one, known) for name, one in estimates.items()}
+
+    def _meant(self, name: str, estimate: PoseEstimate, layout: Mapping[str, Array]) -> PoseEstimate:
+        if name in self._not_meant:
+            return self._unless_another(name, estimate)
+        if estimate.status == "not_found" or not estimate.others:
+            return estimate
+        candidates = (estimate.T_world_obj, *estimate.others)
+        landmarks = {mark: T for mark, T in layout.items() if mark != name}
+        index = choose(self.said[name], candidates, landmarks) if name in self.said else None
+        if index is None:
+            where = self.said.get(name, "nothing")
+            logger.info("cannot tell which of %d objects like the %r is meant: %s is said of it",
+                        len(candidates), name, where)  # fmt: skip
+            return replace(estimate, status="ambiguous")
+        self._not_meant[name] = candidates[:index] + candidates[index + 1 :]
+        return replace(estimate, status="found", T_world_obj=candidates[index], others=())
+
+    def _unless_another(self, name: str, estimate: PoseEstimate) -> PoseEstimate:
+        """The estimate, unless it is of one that is not meant; then that of the place that is left."""
+        left = [T for T in (estimate.T_world_obj, *estimate.others) if not self._is_another(name, T)]
+        if estimate.status == "not_found" or not left:
+            return replace(estimate, status="not_found")
+        status = "ambiguous" if len(left) > 1 and estimate.status == "ambiguous" else "found"
+        return replace(estimate, status=status, T_world_obj=left[0], others=tuple(left[1:]))
+
+    def _is_another(self, name: str, T_world_obj: Array) -> bool:
+        apart = [float(np.linalg.norm(T[:2, 3] - T_world_obj[:2, 3])) for T in self._not_meant[name]]
+        return min(apart) < SAME_PLACE_M

@@ -1,0 +1,183 @@
+"""Entries that go from one memory to another: as a memory's folder, or as a JSON file that people edit."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from lerobot_openspm.errors import MemoryFormatError
+from lerobot_openspm.experience import Experience, header_of, load_experience
+from lerobot_openspm.experience_files import MAX_JSON_BYTES, VERSION, Fields, read_bytes
+from lerobot_openspm.experience_header import header_from_fields, header_to_fields
+from lerobot_openspm.files import write_beside
+from lerobot_openspm.memory.bank import anchored_objects, entry_to_json
+from lerobot_openspm.memory.entry import MemoryEntry
+from lerobot_openspm.memory.fields import MALFORMED, known, text
+from lerobot_openspm.memory.store import entry_from_fields
+from lerobot_openspm.memory.strict_json import loads
+from lerobot_openspm.perception.model import KnownObject
+from lerobot_openspm.perception.store import to_parts as object_to_parts
+
+FORMAT = "openspm-entries"
+NAMES = (
+    "format", "version", "perception", "segmentation", "shape", "simulator_objects", "layouts", "robot",
+    "objects", "entries",
+)  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Parcel:
+    """Entries from elsewhere.
+
+    Attributes:
+        experience: The entries and what they were mined with. One from a file has no objects and no cameras.
+        digests: By name, what tells apart the models of the objects that the entries have key poses at.
+        is_edited: Whether an entry takes the place of one from the same source whatever both hold.
+    """
+
+    experience: Experience
+    digests: Mapping[str, str]
+    is_edited: bool
+
+
+def digest(model: KnownObject) -> str:
+    """What tells a model of an object from any other one."""
+    fields, arrays = object_to_parts(model)
+    sha256 = hashlib.sha256(json.dumps(fields, sort_keys=True).encode())
+    for name, array in sorted(arrays.items()):
+        sha256.update(f"{name} {array.dtype} {array.shape}".encode() + np.ascontiguousarray(array).tobytes())
+    return sha256.hexdigest()[:16]
+
+
+def write_entries_file(experience: Experience, path: Path) -> None:
+    """Write the entries of an experience as one JSON file, an entry on every line."""
+    names = anchored_objects(experience.entries) & experience.objects.keys()
+    fields = header_to_fields(header_of(experience, []))
+    fields["format"] = FORMAT
+    fields["objects"] = {name: digest(experience.objects[name]) for name in sorted(names)}
+    head = json.dumps({name: fields[name] for name in NAMES if name != "entries"}, indent=1, allow_nan=False)
+    lines = b",\n".join(map(entry_to_json, experience.entries))
+    write_beside(path, head.removesuffix("\n}").encode() + b',\n "entries": [\n' + lines + b"\n ]\n}\n")
+
+
+def read_parcel(path: Path) -> Parcel:
+    """Read entries from a memory's folder or from a file that :func:`write_entries_file` wrote.
+
+    Raises:
+        MemoryFormatError: There is none, or it is malformed. Names file and field.
+        CalibrationError: The memory's calibration is not its own.
+    """
+    if path.is_dir():
+        experience = load_experience(path)
+        digests = {name: digest(model) for name, model in experience.objects.items()}
+        return Parcel(experience, digests, is_edited=False)
+    return _read_entries_file(path)
+
+
+def _read_entries_file(path: Path) -> Parcel:
+    if not path.is_file():
+        raise MemoryFormatError(
+            f"nothing at {path}; expected a checkpoint's folder, or a file that `openspm memory export` wrote"
+        )
+    fields = loads(read_bytes(path, MAX_JSON_BYTES), str(path))
+    if not isinstance(fields, dict) or fields.get("format") != FORMAT or fields.get("version") != VERSION:
+        got = (
+            {name: fields.get(name) for name in ("format", "version")} if isinstance(fields, dict) else fields
+        )
+        raise MemoryFormatError(
+            f"{path}: got {str(got)[:100]}, expected format {FORMAT!r} and version {VERSION}, as "
+            "`openspm memory export` writes it"
+        )
+    try:
+        known(fields, NAMES, "the file")
+        objects = known(fields["objects"], fields["objects"], "'objects'")
+        digests = {name: text(objects, name) for name in objects}
+        rows = fields["entries"]
+        if not isinstance(rows, list):
+            raise ValueError("'entries' must be a list")
+    except MALFORMED as error:
+        raise MemoryFormatError(f"{path}: malformed: {error!r}") from error
+    own = {name: fields[name] for name in NAMES if name in fields and name not in ("objects", "entries")}
+    header = header_from_fields(
+        {**own, "objects": [], "n_entries": 0, "anchored": [], "files": {}}, str(path)
+    )
+    entries = tuple(_entry(row, f"{path}: entries[{i}]") for i, row in enumerate(rows))
+    experience = Experience(
+        entries, {}, header.robot, {}, header.perception, header.simulator_objects, header.segmentation,
+        header.shape, header.layouts,
+    )  # fmt: skip
+    return Parcel(experience, digests, is_edited=True)
+
+
+def _entry(fields: Fields, where: str) -> MemoryEntry:
+    try:
+        return entry_from_fields(fields)
+    except MALFORMED as error:
+        raise MemoryFormatError(f"{where} is malformed: {error!r}") from error
+
+
+def combined(ours: Experience, parcel: Parcel, where: str) -> tuple[Experience, int]:
+    """A memory with the entries of a parcel that it does not hold yet.
+
+    Args:
+        ours: The memory.
+        parcel: What is added.
+        where: Names the parcel in errors.
+
+    Returns:
+        The memory afterwards, and how many entries are new or newer. What they replace is superseded.
+
+    Raises:
+        MemoryFormatError: The parcel comes from another robot, from another perception, or has key poses in
+            the frames of other models of objects.
+    """
+    theirs = parcel.experience
+    for name in ("perception", "segmentation", "shape", "simulator_objects"):
+        mine, other = getattr(ours, name), getattr(theirs, name)
+        if mine != other:
+            raise MemoryFormatError(
+                f"{where}: {name} is {other!r}, the memory's {mine!r}: its key poses are in other frames. "
+                "Mine its demonstrations into this memory: openspm teach, or --policy.memory_update=append"
+            )
+    _check_objects(ours, parcel, where)
+    held = {entry_to_json(entry) for entry in ours.entries}
+    new = [entry for entry in theirs.entries if entry_to_json(entry) not in held]
+    if parcel.is_edited:
+        return _with_edited(ours, new, theirs), len(new)
+    return ours.appended(replace(theirs, entries=tuple(new), superseded=())), len(new)
+
+
+def _with_edited(ours: Experience, new: Sequence[MemoryEntry], theirs: Experience) -> Experience:
+    """The memory with edited entries in the place of those of the same source and instruction."""
+    edited = {(entry.source, entry.language): entry for entry in new}
+    gone = [entry for entry in ours.entries if (entry.source, entry.language) in edited]
+    versions = {(entry.source, entry.language): entry.version for entry in gone}
+    added = [
+        replace(entry, version=max(entry.version, 1 + versions.get(key, 0))) for key, entry in edited.items()
+    ]
+    kept = tuple(entry for entry in ours.entries if (entry.source, entry.language) not in edited)
+    rest = replace(ours, entries=kept).appended(replace(theirs, entries=tuple(added)))
+    return replace(rest, superseded=(*ours.superseded, *gone))
+
+
+def _check_objects(ours: Experience, parcel: Parcel, where: str) -> None:
+    """Every object that entries have key poses at has to be known by the same model, or to come along."""
+    theirs = parcel.experience
+    for name in sorted(anchored_objects(theirs.entries)):
+        model = ours.objects.get(name)
+        if model is None and name not in theirs.objects and ours.perception != "oracle":
+            raise MemoryFormatError(
+                f"{where}: entries have key poses at {name!r}, which the memory knows no model of; it knows "
+                f"{', '.join(sorted(ours.objects))}. Add from the checkpoint's folder, which holds the models"
+            )
+        if model is not None and parcel.digests.get(name) != digest(model):
+            raise MemoryFormatError(
+                f"{where}: 'objects': {name!r} is known by another model there, so its key poses are in "
+                "another frame. Mine its demonstrations into this memory: openspm teach, or "
+                "--policy.memory_update=append"
+            )

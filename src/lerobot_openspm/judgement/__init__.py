@@ -1,0 +1,1 @@
+"""Judgement of phases by a multimodal model: the third kind of evidence for key poses."""

@@ -1,0 +1,182 @@
+"""Compound tasks: what an entry teaches by its parts, and by which entries an instruction is carried out.
+
+"open the top drawer and put the bowl inside" also teaches "open the top drawer". An instruction that no
+demonstration shows as a whole is carried out by entries of its parts, one after another.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+from lerobot_openspm.errors import InstructionError
+from lerobot_openspm.memory.entry import MemoryEntry, MemoryKeyPose, Reference, RetrievalKey, SubTask
+from lerobot_openspm.memory.indexed_entries import near
+from lerobot_openspm.memory.instruction import parse_instruction
+from lerobot_openspm.memory.meaning import semantic_score
+from lerobot_openspm.memory.names import TABLE_NAMES, NameSimilarity
+from lerobot_openspm.memory.retrieval import MIN_SEMANTIC, semantic_candidates
+
+# A sub-task takes hold of something and lets it go again.
+TRANSITIONS_PER_SUB_TASK = 2
+# Ways through free space; without the objects they are relative to, the hand finds another way.
+FREE_PHASES = ("approach", "lift", "pre-place", "retreat")
+# Relations that are not the preposition that one says.
+_PREPOSITIONS = {"front of": "to the front of", "left of": "to the left of", "right of": "to the right of",
+                 "at": "to", "center": "in the center of"}  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """An entry that a part of an instruction can be carried out by.
+
+    Attributes:
+        entry: What is executed: an entry of the bank, or one sub-task of it.
+        semantic: Its ``S_sem``.
+        source: The entry of the bank.
+        asked: What of the instruction it carries out, one for each of the entry's sub-tasks.
+    """
+
+    entry: MemoryEntry
+    semantic: float
+    source: MemoryEntry
+    asked: tuple[SubTask, ...] = ()
+
+
+def sub_task_index(contact: int, phase: str, count: int) -> int:
+    """Which of ``count`` sub-tasks a key pose serves, by the ordinal of its gripper transition.
+
+    Each sub-task takes two transitions, and leaving is part of it.
+    """
+    own = contact - 1 if phase == "retreat" else contact
+    return min(max(own, 0) // TRANSITIONS_PER_SUB_TASK, count - 1)
+
+
+def parts(entry: MemoryEntry) -> tuple[MemoryEntry, ...]:
+    """One entry for every sub-task of an entry that has several; the entry itself where it has one.
+
+    A part holds its own key poses, and the objects that its sub-task names. A sub-task whose contacts are
+    relative to other objects is no part, because nothing would look for these.
+    """
+    sub_tasks = entry.key.sub_tasks
+    if len(sub_tasks) == 1:
+        return (entry,)
+    serves = _sub_tasks_of(entry)
+    found: list[MemoryEntry] = []
+    for i, sub_task in enumerate(sub_tasks):
+        own = [pose for pose, served in zip(entry.key_poses, serves, strict=True) if served == i]
+        part = _part(entry, sub_task, own)
+        if part is not None:
+            found.append(part)
+    return tuple(found)
+
+
+def _part(entry: MemoryEntry, sub_task: SubTask, own: Sequence[MemoryKeyPose]) -> MemoryEntry | None:
+    kept = tuple(
+        replace(pose, sub_task=0)
+        for pose in own
+        if set(pose.anchor.objects) <= set(sub_task.objects) or pose.phase not in FREE_PHASES
+    )
+    contacts = [pose for pose in kept if pose.phase not in FREE_PHASES]
+    if not contacts or any(not set(pose.anchor.objects) <= set(sub_task.objects) for pose in contacts):
+        return None
+    return replace(
+        entry,
+        key=RetrievalKey((sub_task,), tuple(pose.phase for pose in kept)),
+        language=phrase(sub_task),
+        key_poses=kept,
+        layout={name: T for name, T in entry.layout.items() if name in sub_task.objects},
+    )
+
+
+def _sub_tasks_of(entry: MemoryEntry) -> list[int]:
+    """The sub-task of every key pose; told by the gripper where an older memory does not say it."""
+    if any(pose.sub_task > 0 for pose in entry.key_poses):
+        return [pose.sub_task for pose in entry.key_poses]
+    served: list[int] = []
+    contact = 0
+    for pose in entry.key_poses:
+        served.append(sub_task_index(contact, pose.phase, len(entry.key.sub_tasks)))
+        contact += pose.dwell  # the fingers have closed or opened here
+    return served
+
+
+def plan_parts(
+    instruction: str, entries: Sequence[MemoryEntry], names: NameSimilarity = TABLE_NAMES
+) -> tuple[tuple[Candidate, ...], ...]:
+    """What an instruction can be carried out by: for each part, in order, the entries that are about it.
+
+    An entry that was demonstrated as a whole wins; then it is one part. Else the parts are the longest runs
+    of sub-tasks that were demonstrated together, a single one also as a part of something else.
+
+    Args:
+        instruction: What is asked.
+        entries: The memory.
+        names: Says which names mean the same thing.
+
+    Raises:
+        InstructionError: The instruction cannot be read, or there is no experience of one of its sub-tasks;
+            the error names the sub-task and lists what the memory knows.
+    """
+    asked = parse_instruction(instruction)
+    entries = near(asked, entries, semantic_score)
+    try:
+        whole = semantic_candidates(instruction, entries, names)
+    except InstructionError:
+        singles = [Candidate(part, 0.0, entry) for entry in entries for part in parts(entry)]
+        if len(asked) == 1 and not _about(asked, singles, names):
+            raise
+    else:
+        return (tuple(Candidate(entry, score, entry, asked) for entry, score in whole),)
+    runs = [Candidate(entry, 0.0, entry) for entry in entries]
+    chain: list[tuple[Candidate, ...]] = []
+    i = 0
+    while i < len(asked):
+        for end in range(len(asked), i, -1):
+            if found := _about(asked[i:end], runs if end > i + 1 else singles, names):
+                break
+        else:
+            raise _no_experience(instruction, asked[i], singles)
+        chain.append(found)
+        i = end
+    return tuple(chain)
+
+
+def _about(
+    asked: Sequence[SubTask], candidates: Sequence[Candidate], names: NameSimilarity
+) -> tuple[Candidate, ...]:
+    """Those of some candidates that are about what is asked, with their score."""
+    scored = [
+        replace(one, semantic=semantic_score(asked, one.entry.key.sub_tasks, names), asked=tuple(asked))
+        for one in candidates
+    ]
+    return tuple(one for one in scored if one.semantic >= MIN_SEMANTIC)
+
+
+def _no_experience(instruction: str, sub_task: SubTask, known: Sequence[Candidate]) -> InstructionError:
+    languages = "; ".join(sorted({one.entry.language for one in known})) or "nothing yet"
+    return InstructionError(
+        f"the memory holds no experience of {phrase(sub_task)!r}, which is a part of the instruction "
+        f"{instruction!r}; it knows: {languages}. Record demonstrations of that part and train again, or say "
+        "it by these instructions"
+    )
+
+
+def phrase(sub_task: SubTask) -> str:
+    """A sub-task in words, as an instruction: "put the bowl in the top drawer of the cabinet"."""
+    if not sub_task.landmark:
+        return f"{sub_task.operation} {_noun(sub_task.target, sub_task.part, sub_task.target_where)}"
+    preposition = _PREPOSITIONS.get(sub_task.relation, sub_task.relation)
+    target = _noun(sub_task.target, "", sub_task.target_where)
+    landmark = _noun(sub_task.landmark, sub_task.part, sub_task.landmark_where)
+    return f"{sub_task.operation} {target} {preposition} {landmark}"
+
+
+def _noun(name: str, part: str, where: Reference | None) -> str:
+    told = f"the {name}"
+    if where is not None and not where.landmarks:
+        told = f"the {where.relation} {name}"
+    elif where is not None:
+        preposition = _PREPOSITIONS.get(where.relation, where.relation)
+        told = f"the {name} {preposition} {' and '.join(f'the {landmark}' for landmark in where.landmarks)}"
+    return f"the {part} of {told}" if part else told

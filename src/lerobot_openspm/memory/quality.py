@@ -1,0 +1,33 @@
+"""The paper's reliability ``r`` of an entry, and how outcomes at deployment change it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from lerobot_openspm.memory.entry import MemoryEntry
+
+# How well a demonstration agrees with the others of its task counts as much as so many trials: one failure of
+# a good entry lets others of its task be tried first, and after five trials what happened weighs more.
+PRIOR_TRIALS = 5
+
+
+def with_outcome(entry: MemoryEntry, success: bool) -> MemoryEntry:
+    """An entry after it was acted by once more.
+
+    ``r`` is the mean of a Beta distribution whose prior has the demonstrations' agreement as its mean and
+    :data:`PRIOR_TRIALS` as its weight; each outcome is one more observation.
+    """
+    weight = PRIOR_TRIALS + entry.trials
+    quality = (entry.quality * weight + success) / (weight + 1)
+    return replace(entry, quality=quality, trials=entry.trials + 1, successes=entry.successes + bool(success))
+
+
+def prior_quality(entry: MemoryEntry) -> float:
+    """What ``r`` was before any outcome was known: how well the demonstration agrees with others."""
+    weight = PRIOR_TRIALS + entry.trials
+    return min(max((entry.quality * weight - entry.successes) / PRIOR_TRIALS, 0.0), 1.0)
+
+
+def pooled_quality(prior: float, trials: int, successes: int) -> float:
+    """``r`` of a prior and all outcomes since."""
+    return (prior * PRIOR_TRIALS + successes) / (PRIOR_TRIALS + trials)

@@ -1,0 +1,171 @@
+"""Teaching by memory alone: a task's demonstrations become memory entries, and no weight changes."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from lerobot_openspm.configuration_openspm import OpenSPMConfig, feature_names
+from lerobot_openspm.errors import DatasetError, InstructionError, LayoutError
+from lerobot_openspm.experience import Experience, check_labels
+from lerobot_openspm.geometry.camera import load_cameras
+from lerobot_openspm.memory.entry import MemoryEntry
+from lerobot_openspm.memory.instruction import parse_instruction
+from lerobot_openspm.perception.types import Segmenter
+from lerobot_openspm.training import mine
+
+# Beside a dataset's own metadata, where `openspm collect` writes the cameras that recorded it.
+DATASET_CAMERAS = "openspm_cameras.json"
+
+
+@dataclass(frozen=True)
+class Lesson:
+    """What a memory was taught.
+
+    Attributes:
+        entries: The new entries.
+        known_before: How many entries each taught instruction had in the memory before.
+        skipped: Episodes that gave no entry.
+        objects_learned: Objects that were not known before.
+        objects_recognised: Objects of the taught tasks that were.
+    """
+
+    entries: tuple[MemoryEntry, ...]
+    known_before: dict[str, int]
+    skipped: tuple[int, ...]
+    objects_learned: tuple[str, ...]
+    objects_recognised: tuple[str, ...]
+
+    @property
+    def instructions(self) -> tuple[str, ...]:
+        """The taught instructions, each once."""
+        return tuple(dict.fromkeys(entry.language for entry in self.entries))
+
+
+def teach(
+    experience: Experience,
+    config: OpenSPMConfig,
+    dataset_meta: Any,
+    episodes: Sequence[int] | None = None,
+    segmenter: Segmenter | None = None,
+) -> tuple[Experience, Lesson]:
+    """Append a dataset's demonstrations to an experience.
+
+    Objects that are known are recognised by what is known of them; others are learned from these episodes.
+    Where the configuration names no calibration, the dataset's own is used, else the experience's.
+
+    Args:
+        experience: What is known. It stays as it is.
+        config: The configuration of the policy that knows it.
+        dataset_meta: LeRobot's metadata of the dataset.
+        episodes: The episodes to teach; all if not given.
+        segmenter: Finds the objects' masks, where the configuration's segmentation is not "demonstrations".
+
+    Returns:
+        The experience with the new entries and objects, and what is new in it.
+
+    Raises:
+        DatasetError: There is no such episode, or an instruction's episodes show no key poses, or none of
+            them shows all objects of it where it begins.
+        InstructionError: An instruction cannot be parsed.
+        LayoutError: The dataset's state or action is not laid out as the policy's.
+        CalibrationError, MemoryFormatError: The cameras or the robot are others.
+    """
+    wanted = _episodes(dataset_meta, episodes)
+    _check_layouts(dataset_meta, config)
+    tasks = _tasks(dataset_meta, wanted)
+    settings = replace(config, memory_episodes=wanted)
+    own = Path(dataset_meta.root) / "meta" / DATASET_CAMERAS
+    cameras = load_cameras(own) if own.is_file() else experience.cameras
+    mined = mine(dataset_meta, settings, experience, cameras, segmenter)
+    # An object that was not found cannot be an anchor, and with few demonstrations nothing shows that the one
+    # taken instead is wrong.
+    added = tuple(entry for entry in mined.entries if not _unseen(entry))
+    taught = {entry.language for entry in added}
+    for task in dict.fromkeys(tasks.values()):
+        if task not in taught:
+            raise DatasetError(_nothing_learned(dataset_meta.repo_id, task, tasks, mined))
+    named = dict.fromkeys(name for entry in added for name in entry.layout)
+    objects = {name: mined.objects[name] for name in named if name in mined.objects}
+    result = experience.appended(replace(mined, entries=added, objects=objects))
+    check_labels(result, config.mask_labels, f"the checkpoint of {config.type}")
+    before = Counter(entry.language for entry in experience.entries)
+    used = {entry.source for entry in added}
+    lesson = Lesson(
+        entries=added,
+        known_before={task: before[task] for task in dict.fromkeys(entry.language for entry in added)},
+        skipped=tuple(i for i in wanted if f"{dataset_meta.repo_id}#{i}" not in used),
+        objects_learned=tuple(name for name in named if name not in experience.objects),
+        objects_recognised=tuple(name for name in named if name in experience.objects),
+    )
+    return result, lesson
+
+
+def _episodes(dataset_meta: Any, episodes: Sequence[int] | None) -> list[int]:
+    """The episodes to teach, each once."""
+    total = int(dataset_meta.total_episodes)
+    wanted = list(dict.fromkeys(range(total) if episodes is None else episodes))
+    if bad := [index for index in wanted if not 0 <= index < total]:
+        raise DatasetError(f"dataset {dataset_meta.repo_id} has episodes 0 to {total - 1}, got {bad}")
+    if not wanted:
+        raise DatasetError(f"no episode of dataset {dataset_meta.repo_id} is asked for; name some to teach")
+    return wanted
+
+
+def _check_layouts(dataset_meta: Any, config: OpenSPMConfig) -> None:
+    """The dataset's numbers have to mean what the policy's do."""
+    for what, key, ours in (
+        ("state", "observation.state", config.state_layout),
+        ("action", "action", config.action_layout),
+    ):
+        feature = dataset_meta.features.get(key)
+        if feature is None:
+            raise DatasetError(
+                f"dataset {dataset_meta.repo_id} lacks {key!r}; it has {sorted(dataset_meta.features)}"
+            )
+        theirs = feature_names(feature.get("names")) or ours
+        if theirs != ours or feature["shape"][0] != len(ours or ()):
+            raise LayoutError(
+                f"the {what} of dataset {dataset_meta.repo_id} is {theirs} ({feature['shape'][0]} numbers), "
+                f"the checkpoint's is {ours}: it was recorded with another robot, or its features have other "
+                "names; teach demonstrations of the checkpoint's robot, or rename the features in the "
+                "dataset's meta/info.json"
+            )
+
+
+def _tasks(dataset_meta: Any, wanted: Sequence[int]) -> dict[int, str]:
+    """Instruction by episode; each can be parsed."""
+    tasks = {}
+    for index in wanted:
+        told = dataset_meta.episodes[index]["tasks"]
+        tasks[index] = str(told if isinstance(told, str) else told[0])
+        try:
+            parse_instruction(tasks[index])
+        except InstructionError as error:
+            raise InstructionError(f"episode {index} of dataset {dataset_meta.repo_id}: {error}") from error
+    return tasks
+
+
+def _unseen(entry: MemoryEntry) -> list[str]:
+    """Objects of an entry's instruction that were not found in the first frame."""
+    named = dict.fromkeys(name for sub_task in entry.key.sub_tasks for name in sub_task.objects)
+    return [name for name in named if name not in entry.layout]
+
+
+def _nothing_learned(name: str, task: str, tasks: dict[int, str], mined: Experience) -> str:
+    """Why an instruction has no entry."""
+    episodes = [index for index, told in tasks.items() if told == task]
+    own = [entry for entry in mined.entries if entry.language == task]
+    unseen = sorted({name for entry in own for name in _unseen(entry)})
+    if not unseen:
+        named = (one for sub_task in parse_instruction(task) for one in sub_task.objects)
+        unseen = sorted(set(named) - set(mined.objects))
+    why = f"could not find {' and '.join(unseen)}" if unseen else "found no key poses with all their anchors"
+    return (
+        f"{task!r} was not learned from episodes {episodes} of dataset {name}: {why} in their first frames; "
+        "check --policy.cameras, record with the hand away from the objects at the start, or teach more "
+        "episodes"
+    )

@@ -1,0 +1,116 @@
+"""The known instructions, their paraphrases, and instructions that the memory must refuse."""
+
+import importlib.util
+import json
+import re
+from pathlib import Path
+
+import pytest
+
+from lerobot_openspm.bench import language
+from lerobot_openspm.cli import bench
+from lerobot_openspm.envs.tasks import TASKS
+from lerobot_openspm.errors import OpenSPMError
+from lerobot_openspm.memory.instruction import parse_instruction
+
+KNOWN = language.known_instructions()
+PARAPHRASES = language.read_rows(language.PARAPHRASES)
+STRANGERS = language.read_rows(language.OUT_OF_DOMAIN)
+SPLITS = sorted({row["split"] for row in PARAPHRASES})
+
+
+@pytest.mark.parametrize("known", KNOWN, ids=lambda known: known.instruction)
+def test_every_known_instruction_has_its_elements(known: language.Known):
+    assert parse_instruction(known.instruction) == known.elements
+
+
+def test_the_list_is_complete():
+    tasks = [task for known in KNOWN for task in known.tasks]
+    assert len(tasks) == len(set(tasks)) == 130 + len(TASKS)
+    told = {known.instruction for known in KNOWN if any(t.startswith("tabletop/") for t in known.tasks)}
+    assert told == {task.instruction for task in TASKS.values()}
+
+
+@pytest.mark.skipif(importlib.util.find_spec("libero") is None, reason="needs LIBERO's task files")
+def test_the_list_is_that_of_libero():
+    (package,) = importlib.util.find_spec("libero").submodule_search_locations
+    told, named = {}, {}
+    for path in Path(package).rglob("*.bddl"):
+        task = f"{path.parent.name}/{path.stem}"
+        told[task] = re.search(r"\(:language\s+(.*?)\)", path.read_text(), re.S)[1]
+        name = re.sub(r"^[A-Z_]+SCENE\d+_", "", path.stem).replace("_", " ")
+        if name != told[task]:  # LIBERO's benchmark makes its instructions of the names
+            named[task] = name
+    assert told == {t: k.instruction for k in KNOWN for t in k.tasks if not t.startswith("tabletop/")}
+    assert named == {t: k.instruction for k in KNOWN for t in k.names}
+
+
+def test_paraphrases_are_of_known_instructions_and_none_stands_twice():
+    known = {one.instruction for one in KNOWN}
+    assert {row["of"] for row in PARAPHRASES} <= known
+    assert not {row["paraphrase"] for row in PARAPHRASES} & known
+    for rows, key in ((PARAPHRASES, "paraphrase"), (STRANGERS, "instruction")):
+        assert len({row[key] for row in rows}) == len(rows)
+        assert {row["split"] for row in rows} <= {"dev", "held_out"}
+
+
+@pytest.mark.parametrize("split", SPLITS)
+def test_the_rates_asked_for_are_reached(split: str):
+    paraphrases = [row for row in PARAPHRASES if row["split"] == split]
+    strangers = [row for row in STRANGERS if row["split"] == split]
+    assert len(paraphrases) >= 100
+    assert len(strangers) >= 80
+    missed = [row for row in paraphrases if not language.is_parsed(row)]
+    assert len(missed) <= 0.05 * len(paraphrases), missed
+    everything, demonstrated = language.bank(), language.bank(language.SUITES)
+    taken = [row for row in strangers if not language.is_refused(row, everything)]
+    assert len(taken) <= 0.01 * len(strangers), taken
+    of_demonstrated = {entry.language for entry in demonstrated}
+    to_find = [row for row in paraphrases if row["of"] in of_demonstrated]
+    lost = [row for row in to_find if not language.is_first(row, demonstrated)]
+    assert len(lost) <= 0.01 * len(to_find), lost
+
+
+def test_the_measures_can_fail():
+    bank = language.bank()
+    wrong = {"paraphrase": "put the bowl on the stove", "of": "put the bowl on the plate"}
+    assert not language.is_parsed(wrong)
+    assert not language.is_first(wrong, bank)
+    assert not language.is_parsed({"paraphrase": "sing", "of": "put the bowl on the plate"})
+    assert not language.is_refused({"instruction": "put the bowl on the plate"}, bank)
+
+
+def test_bench_language_prints_the_rates(capsys: pytest.CaptureFixture[str], tmp_path: Path):
+    rows = [
+        {
+            "paraphrase": "set the bowl on the plate",
+            "of": "put the bowl on the plate",
+            "split": "held_out",
+        },
+        {"paraphrase": "turn the stove off", "of": "turn on the stove", "split": "held_out"},
+        {"paraphrase": "switch on the stove", "of": "turn on the stove", "split": "dev"},
+    ]
+    (tmp_path / language.PARAPHRASES).write_text(json.dumps(rows))
+    strangers = [
+        {"instruction": "sing", "split": "held_out"},
+        {"instruction": "turn on the stove", "split": "dev"},
+    ]
+    (tmp_path / language.OUT_OF_DOMAIN).write_text(json.dumps(strangers))
+    bench.main(["language", f"--folder={tmp_path}", "--failures=true"])
+    printed = json.loads(capsys.readouterr().out.splitlines()[-1])
+    # The held-out half is what counts.
+    headline = ("libero_parsed", "paraphrases_parsed", "out_of_domain_refused", "retrieved_first", "n")
+    assert [printed[key] for key in headline] == [1.0, 0.5, 1.0, 0.5, 2]
+    assert printed["splits"]["dev"]["paraphrases_parsed"] == 1.0
+    assert printed["splits"]["dev"]["out_of_domain_refused"] == 0.0
+    assert printed["failures"]["held_out_paraphrases_parsed"] == ["turn the stove off"]
+    with pytest.raises(OpenSPMError, match=r"no paraphrases\.json"):
+        bench.main(["language", f"--folder={tmp_path / 'nowhere'}"])
+
+
+def test_without_out_of_domain_rows_there_is_no_rate(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    row = {"paraphrase": "switch on the stove", "of": "turn on the stove", "split": "dev"}
+    (tmp_path / language.PARAPHRASES).write_text(json.dumps([row]))
+    (tmp_path / language.OUT_OF_DOMAIN).write_text("[]")
+    bench.main(["language", f"--folder={tmp_path}"])
+    assert json.loads(capsys.readouterr().out.splitlines()[-1])["out_of_domain_refused"] is None

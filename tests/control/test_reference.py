@@ -1,0 +1,157 @@
+"""Which of several objects is meant: by hand, in LIBERO's scenes, and however a scene is moved or turned."""
+
+import pytest
+from hypothesis import assume, given, settings
+from hypothesis import strategies as st
+
+from lerobot_openspm.control.reference import MARGIN_M, OPPOSITE_THE_ROBOT, choose
+from lerobot_openspm.errors import InstructionError
+from lerobot_openspm.geometry import se3
+from lerobot_openspm.memory.entry import Reference
+
+PLACES = st.lists(st.tuples(st.floats(-0.5, 0.5), st.floats(-0.5, 0.5)), min_size=2, max_size=5)
+AMONG = ["left", "right", "front", "back"]
+RELATIONS = [
+    Reference("between", ("plate", "cup")),
+    *(Reference(name, ("plate",)) for name in ("next to", "on", "in", "under", *AMONG)),
+    *(Reference(name) for name in ("middle", *AMONG)),
+]
+MARKS = {"plate": (0.1, 0.2), "cup": (-0.1, -0.1)}
+
+
+def at(x, y, z=0.0, yaw=0.3):
+    return se3.from_yaw([x, y, z], yaw)
+
+
+def scene(places, marks=MARKS):
+    return [at(*place) for place in places], {name: at(*place) for name, place in marks.items()}
+
+
+# The regions of LIBERO's scenes, world x and y in metres, and which of the objects its goal names.
+SPATIAL = {"plate": (0.06, 0.2), "cookie box": (0.07, 0.03), "ramekin": (-0.2, 0.2), "stove": (-0.41, -0.14)}
+PLATES = [(0.0, -0.3), (0.0, 0.3)]
+BOWLS = [(0.1, 0.15), (-0.05, 0.2), (-0.15, 0.05)]
+BY_THE_PLATE, BY_THE_RAMEKIN = (0.01, 0.31), (-0.18, 0.32)
+BETWEEN, BY_THE_BOX = (-0.05, 0.2), (0.13, -0.07)
+ON_THE_STOVE, ON_THE_CABINET = (-0.41, -0.14, 0.03), (0.03, -0.27, 0.22)
+ON_THE_RAMEKIN, ON_THE_BOX = (-0.2, 0.2, 0.05), (0.07, 0.03, 0.05)
+LIBERO = {
+    "the left plate": (Reference("left"), PLATES, 0),
+    "the right plate": (Reference("right"), PLATES, 1),
+    "the black bowl on the left": (Reference("left"), [(-0.1, -0.15), (-0.1, 0.05)], 0),
+    "the right moka pot": (Reference("right"), [(-0.05, 0.25), (0.05, 0.05)], 0),
+    "the book on the left": (Reference("left"), [(0.0, 0.0), (-0.05, -0.25)], 1),
+    "the black bowl at the front": (Reference("front"), BOWLS, 0),
+    "the middle black bowl": (Reference("middle"), BOWLS, 1),
+    "the black bowl at the back": (Reference("back"), BOWLS, 2),
+    "the butter at the front": (Reference("front"), [(0.0, 0.2), (-0.1, 0.2)], 0),
+    "the butter at the back": (Reference("back"), [(0.0, 0.2), (-0.1, 0.2)], 1),
+    "between": (Reference("between", ("plate", "ramekin")), [BETWEEN, BY_THE_RAMEKIN], 0),
+    "next to the box": (Reference("next to", ("cookie box",)), [BY_THE_BOX, ON_THE_STOVE], 0),
+    "next to the plate": (Reference("next to", ("plate",)), [BY_THE_PLATE, BY_THE_RAMEKIN], 0),
+    "next to the ramekin": (Reference("next to", ("ramekin",)), [BY_THE_RAMEKIN, BY_THE_PLATE], 0),
+    "on the stove": (Reference("on", ("stove",)), [ON_THE_STOVE, ON_THE_CABINET], 0),
+    "on the ramekin": (Reference("on", ("ramekin",)), [ON_THE_RAMEKIN, ON_THE_BOX], 0),
+}
+
+
+@pytest.mark.parametrize(("reference", "places", "expected"), LIBERO.values(), ids=LIBERO)
+def test_liberos_scenes_mean_what_their_goals_say(reference, places, expected):
+    candidates, landmarks = scene(places, SPATIAL)
+    assert choose(reference, candidates, landmarks) == expected
+    assert choose(reference, candidates[::-1], landmarks) == len(places) - 1 - expected
+
+
+@pytest.mark.parametrize(
+    ("relation", "place"),
+    [("left", (0.1, 0.05)), ("right", (0.1, 0.35)), ("front", (0.25, 0.2)), ("back", (-0.05, 0.2))],
+)
+def test_sides_of_a_landmark_as_liberos_regions_lie(relation, place):
+    # LIBERO's plate_left_region is at a smaller y than its plate, stove_front_region at a larger x.
+    others = [xy for xy in ((0.1, 0.05), (0.1, 0.35), (0.25, 0.2), (-0.05, 0.2)) if xy != place]
+    candidates, landmarks = scene([*others, place])
+    assert choose(Reference(relation, ("plate",)), candidates, landmarks) == 3
+    assert choose(Reference(relation, ("plate",)), candidates[:3], landmarks) is None, "none is there"
+
+
+def test_under_and_on_are_told_apart_by_height():
+    shelf = {"shelf": at(0.0, 0.0, 0.2)}
+    candidates = [at(0.0, 0.03, 0.0), at(0.02, 0.0, 0.26)]
+    assert choose(Reference("under", ("shelf",)), candidates, shelf) == 0
+    assert choose(Reference("on", ("shelf",)), candidates, shelf) == 1
+
+
+def test_what_stands_on_a_thing_is_not_next_to_it():
+    candidates, landmarks = scene([(0.11, 0.2, 0.01), (0.1, 0.35)])
+    assert choose(Reference("next to", ("plate",)), candidates, landmarks) == 1
+    assert choose(Reference("on", ("plate",)), candidates, landmarks) == 0
+
+
+@pytest.mark.parametrize("reference", RELATIONS, ids=str)
+def test_one_place_for_two_is_ambiguous_and_a_missing_landmark_decides_nothing(reference):
+    candidates, landmarks = scene([(0.1, 0.22), (0.1, 0.22 + 0.4 * MARGIN_M)])
+    assert choose(reference, candidates, landmarks) is None
+    if reference.landmarks:
+        assert choose(reference, scene([(0.1, 0.05), (0.3, 0.3)])[0], {}) is None
+    assert choose(reference, [], landmarks) is None
+    assert choose(reference, candidates[:1], landmarks) == 0
+
+
+def test_a_relation_that_cannot_be_told_is_an_error():
+    for reference in (Reference("around", ("plate",)), Reference("between", ("plate",)), Reference("on")):
+        with pytest.raises(InstructionError, match="expected one of back"):
+            choose(reference, *scene([(0, 0), (1, 1)]))
+
+
+@pytest.mark.parametrize("alias", [("left of", "left"), ("behind", "back"), ("in front of", "front")])
+def test_relations_go_by_several_names(alias):
+    candidates, landmarks = scene([(0.1, 0.05), (0.1, 0.35), (0.25, 0.2), (-0.05, 0.2)])
+    first, second = (choose(Reference(name, ("plate",)), candidates, landmarks) for name in alias)
+    assert first == second is not None
+
+
+def costs_are_clear(reference, candidates, landmarks):
+    """Whether rounding cannot decide: a scene that is a little larger or smaller means the same."""
+    answers = set()
+    for scale in (0.999, 1.0, 1.001):
+        sized = [se3.transform(T[:3, :3], scale * T[:3, 3]) for T in candidates]
+        marks = {name: se3.transform(T[:3, :3], scale * T[:3, 3]) for name, T in landmarks.items()}
+        answers.add(choose(reference, sized, marks))
+    return len(answers) == 1
+
+
+@pytest.mark.parametrize("reference", RELATIONS, ids=str)
+@settings(max_examples=30)
+@given(places=PLACES, yaw=st.floats(-3, 3), x=st.floats(-1, 1), y=st.floats(-1, 1))
+def test_a_scene_that_is_moved_and_turned_with_its_speaker_means_the_same(reference, places, yaw, x, y):
+    candidates, landmarks = scene(places)
+    assume(costs_are_clear(reference, candidates, landmarks))
+    G = se3.from_yaw([x, y, 0.1], yaw)
+    moved, marks = [G @ T for T in candidates], {name: G @ T for name, T in landmarks.items()}
+    expected = choose(reference, candidates, landmarks)
+    assert choose(reference, moved, marks, G[:2, :2] @ OPPOSITE_THE_ROBOT) == expected
+    if reference.relation not in AMONG:  # where the speaker stands does not matter
+        assert choose(reference, moved, marks) == expected
+
+
+@pytest.mark.parametrize("reference", RELATIONS, ids=str)
+@settings(max_examples=30)
+@given(places=PLACES, order=st.randoms())
+def test_the_order_of_the_candidates_does_not_matter(reference, places, order):
+    candidates, landmarks = scene(places)
+    shuffled = list(range(len(places)))
+    order.shuffle(shuffled)
+    chosen = choose(reference, [candidates[i] for i in shuffled], landmarks)
+    expected = choose(reference, candidates, landmarks)
+    assert (None if chosen is None else shuffled[chosen]) == expected
+
+
+@settings(max_examples=30)
+@given(places=PLACES)
+def test_left_is_right_for_who_stands_on_the_other_side(places):
+    candidates, landmarks = scene(places)
+    for one, other in (("left", "right"), ("front", "back")):
+        for names in ((), ("plate",)):
+            here = choose(Reference(one, names), candidates, landmarks)
+            there = choose(Reference(other, names), candidates, landmarks, -OPPOSITE_THE_ROBOT)
+            assert here == there

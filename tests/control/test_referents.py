@@ -1,0 +1,86 @@
+import numpy as np
+import pytest
+
+from lerobot_openspm.control.referents import Referents, references
+from lerobot_openspm.geometry import se3
+from lerobot_openspm.memory.compound import Candidate
+from lerobot_openspm.memory.entry import MemoryEntry, Reference, RetrievalKey, SubTask
+from lerobot_openspm.perception.types import PoseEstimate
+
+NEXT_TO_RACK = Reference("next to", ("rack",))
+
+
+def at(x, y):
+    return se3.from_yaw([x, y, 0.0], 0.0)
+
+
+RACK = at(0.3, 0.3)
+NEAR, FAR = at(0.3, 0.18), at(0.0, -0.2)
+
+
+def seen(T, *others, status=None):
+    status = status or ("ambiguous" if others else "found")
+    return PoseEstimate(status, T, 1e-6 * np.eye(4), 1.0, {}, others=tuple(others))
+
+
+def look(referents, bowl, layout=None):
+    return referents.sort_out({"bowl": bowl, "rack": seen(RACK)}, layout or {})["bowl"]
+
+
+@pytest.mark.parametrize("bowl", [seen(NEAR, FAR), seen(FAR, NEAR), seen(FAR, NEAR, status="found")])
+def test_the_one_that_the_instruction_tells_is_meant(bowl):
+    meant = look(Referents({"bowl": NEXT_TO_RACK}), bowl)
+    assert meant.status == "found"
+    np.testing.assert_array_equal(meant.T_world_obj, NEAR)
+
+
+def test_a_landmark_may_have_been_seen_before():
+    estimates = {"bowl": seen(FAR, NEAR)}
+    meant = Referents({"bowl": NEXT_TO_RACK}).sort_out(estimates, {"rack": RACK})["bowl"]
+    np.testing.assert_array_equal(meant.T_world_obj, NEAR)
+
+
+def test_without_a_word_about_it_or_its_landmark_it_stays_ambiguous():
+    assert look(Referents(), seen(FAR, NEAR)).status == "ambiguous"
+    assert look(Referents(), seen(FAR, NEAR, status="found")).status == "ambiguous"
+    assert look(Referents(), seen(FAR)).status == "found"
+    estimates = {"bowl": seen(FAR, NEAR)}
+    assert Referents({"bowl": NEXT_TO_RACK}).sort_out(estimates, {})["bowl"].status == "ambiguous"
+
+
+def test_two_that_fit_as_well_as_one_another_stay_ambiguous():
+    mirrored = at(0.3, 0.42)
+    assert look(Referents({"bowl": NEXT_TO_RACK}), seen(NEAR, mirrored)).status == "ambiguous"
+
+
+def test_the_other_one_is_never_taken_for_it_afterwards():
+    referents = Referents({"bowl": NEXT_TO_RACK})
+    look(referents, seen(NEAR, FAR))
+    assert look(referents, seen(FAR)).status == "not_found"  # the meant one is behind the hand
+    moved = at(0.1, 0.1)
+    for bowl in (seen(moved), seen(FAR, moved), seen(moved, FAR)):
+        again = look(referents, bowl)
+        assert again.status == "found"
+        np.testing.assert_array_equal(again.T_world_obj, moved)
+
+
+def test_what_the_next_part_means_is_told_anew():
+    referents = Referents()
+    assert referents.hear({"bowl": NEXT_TO_RACK}) == frozenset()
+    look(referents, seen(NEAR, FAR))
+    assert referents.hear({"bowl": NEXT_TO_RACK}) == frozenset()
+    assert look(referents, seen(FAR)).status == "not_found"
+    assert referents.hear({"bowl": Reference("left")}) == {"bowl"}
+    left = look(referents, seen(NEAR, FAR))
+    np.testing.assert_array_equal(left.T_world_obj, FAR)  # -y is left, seen from opposite the robot
+
+
+def test_references_are_told_by_the_names_of_the_entry():
+    asked = SubTask("put", "bowl", "", "on", "dish", NEXT_TO_RACK, Reference("left"))
+    entry = MemoryEntry(
+        RetrievalKey((SubTask("put", "black bowl", "", "on", "plate"),), ()), "", (), 1.0, 1, ""
+    )
+    assert references(Candidate(entry, 1.0, entry, (asked,))) == {
+        "black bowl": NEXT_TO_RACK,
+        "plate": Reference("left"),
+    }

@@ -1,0 +1,269 @@
+"""Mining a dataset with each source of evidence; whatever a server does, mining goes on."""
+
+import logging
+import shutil
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from lerobot.annotations.steerable_pipeline.executor import Executor
+from lerobot.annotations.steerable_pipeline.reader import iter_episodes
+from lerobot.annotations.steerable_pipeline.staging import EpisodeStaging
+from lerobot.annotations.steerable_pipeline.writer import LanguageColumnsWriter
+from lerobot.datasets import LeRobotDatasetMetadata
+from tests.judgement.loopback_chat import LoopbackChat, Reply, question_of, say
+from tests.policy.lerobot_commands import CALIBRATION
+
+from lerobot_openspm.configuration_openspm import OpenSPMConfig
+from lerobot_openspm.errors import DatasetError, PerceptionError
+from lerobot_openspm.judgement.judging import MAX_FAILURES
+from lerobot_openspm.judgement.structure import check_sequence
+from lerobot_openspm.mining.dataset import Demonstrations
+from lerobot_openspm.mining.key_poses import KeyPose
+from lerobot_openspm.mining.mine import MinedEpisode, mine_key_poses
+from lerobot_openspm.mining.signals import observe_robot
+from lerobot_openspm.training import judged, mine_experience, open_demonstrations
+
+NAME = "local/openspm_tabletop"
+
+
+def config(**options) -> OpenSPMConfig:
+    return OpenSPMConfig(device="cpu", push_to_hub=False, cameras=str(CALIBRATION), **options)
+
+
+def unsure(pose: KeyPose) -> KeyPose:
+    return replace(pose, confidence=min(pose.confidence, 0.7))
+
+
+class Mined:
+    """The key poses of a dataset before they are judged, some of them less sure than they are."""
+
+    def __init__(self, root: Path) -> None:
+        self.meta = LeRobotDatasetMetadata(NAME, root=root)
+        self.demonstrations: Demonstrations = open_demonstrations(self.meta, config())
+        self.robot = observe_robot(self.demonstrations.episodes())
+        self.episodes = tuple(
+            replace(
+                item, key_poses=tuple(replace(p, confidence=min(p.confidence, 0.7)) for p in item.key_poses)
+            )
+            for item in mine_key_poses(self.demonstrations, self.robot).mined
+        )
+
+    def judged(self, first: int = 6, **options) -> tuple[MinedEpisode, ...]:
+        return judged(self.demonstrations, self.episodes[:first], self.robot, config(**options))
+
+
+@pytest.fixture(scope="module")
+def mined(tiny_dataset: Path) -> Mined:
+    return Mined(tiny_dataset)
+
+
+@pytest.fixture
+def asked(mined: Mined, tmp_path: Path) -> Callable[..., tuple[MinedEpisode, ...]]:
+    """Ask a server about the tiny dataset."""
+
+    def asked(chat: LoopbackChat, **options) -> tuple[MinedEpisode, ...]:
+        endpoint = {"phase_judge": "openai", "phase_judge_api_base": chat.api_base}
+        folder = {"phase_judge_cache": str(tmp_path / "cache")}
+        return mined.judged(phase_judge_model_id="tiny-vl", **endpoint, **folder, **options)
+
+    return asked
+
+
+def confidences(episodes) -> list[float]:
+    return [pose.confidence for item in episodes for pose in item.key_poses]
+
+
+def phases(episodes) -> list[list[str]]:
+    return [[pose.phase for pose in item.key_poses] for item in episodes]
+
+
+def knowing(mined: Mined, confidence: float = 0.8) -> Callable[..., Reply]:
+    """A server that agrees with motion and gripper: it knows the episodes by the candidates' times."""
+    fps = mined.demonstrations.fps
+    known = {
+        tuple(round(pose.frame / fps, 3) for pose in item.key_poses): [pose.phase for pose in item.key_poses]
+        for item in mined.episodes
+    }
+
+    def answer(request) -> Reply:
+        times = tuple(c["time_s"] for c in question_of(request)["candidates"])
+        return Reply(say(known[times], confidence))
+
+    return answer
+
+
+def test_agreement_makes_every_key_pose_surer(mined: Mined, asked, caplog: pytest.LogCaptureFixture):
+    caplog.set_level(logging.INFO)
+    with LoopbackChat(knowing(mined)).running() as chat:
+        found = asked(chat)
+    assert phases(found) == phases(mined.episodes)
+    assert all(
+        after > before for before, after in zip(confidences(mined.episodes), confidences(found), strict=True)
+    )
+    assert len(chat.requests) == len(mined.episodes) == 6
+    pictures = [p for p in chat.requests[0]["messages"][0]["content"] if p["type"] == "image_url"]
+    assert len(pictures) == 3
+    assert "openai tiny-vl v1 judged the phases of 6 of 6 episodes" in caplog.text
+
+
+def test_nothing_is_asked_twice(mined: Mined, asked):
+    with LoopbackChat(knowing(mined)).running() as chat:
+        first = asked(chat)
+        second = asked(chat)
+    assert len(chat.requests) == 6
+    assert confidences(first) == confidences(second)
+    assert confidences(asked(chat)) == confidences(first), "the server is gone now"
+
+
+def test_below_its_threshold_a_server_changes_nothing(mined: Mined, asked):
+    with LoopbackChat(knowing(mined, 0.8)).running() as chat:
+        assert asked(chat, phase_judge_confidence=0.85) == mined.episodes
+
+
+def test_a_server_that_says_the_same_of_everything_breaks_nothing(mined: Mined, asked):
+    def answer(request) -> Reply:
+        return Reply(say(["pre-place"] * len(question_of(request)["candidates"]), 0.99))
+
+    with LoopbackChat(answer).running() as chat:
+        found = asked(chat)
+    for names in phases(found):
+        check_sequence(names)
+    assert phases(found) != phases(mined.episodes), "lifts are called pre-places now"
+    assert [p.count("grasp") for p in phases(found)] == [p.count("grasp") for p in phases(mined.episodes)]
+
+
+@pytest.mark.parametrize(
+    "reply",
+    [
+        Reply(b"", 500),
+        Reply(b"garbage"),
+        Reply(say(["levitate"] * 20)),
+        Reply(b"x" * 1_100_000),
+        Reply(say(["lift"]), promised=10_000),
+        Reply(say(["lift"]), wait_s=1.0),
+    ],
+)
+def test_a_server_that_fails_is_asked_no_more_after_some_episodes(mined: Mined, asked, caplog, reply: Reply):
+    with LoopbackChat(lambda _: reply).running() as chat:
+        assert asked(chat, phase_judge_timeout_s=0.5) == mined.episodes
+    assert MAX_FAILURES <= len(chat.requests) <= 3 * MAX_FAILURES
+    assert caplog.text.count("gave no answer, mining goes on") == 1
+    assert caplog.text.count("is asked no more") == 1
+
+
+def test_a_server_that_is_gone_costs_seconds(mined: Mined, asked, caplog: pytest.LogCaptureFixture):
+    with LoopbackChat(lambda _: Reply(b"")).running() as chat:
+        pass
+    begin = time.monotonic()
+    assert asked(chat) == mined.episodes
+    assert time.monotonic() - begin < 20
+    assert "is asked no more" in caplog.text
+
+
+def test_a_server_that_fails_now_and_then_is_asked_on(mined: Mined, asked, caplog: pytest.LogCaptureFixture):
+    agree, seen = knowing(mined), []
+
+    def answer(request) -> Reply:
+        seen.append(request)
+        return Reply(b"no", 404) if len(seen) % 2 else agree(request)
+
+    with LoopbackChat(answer).running() as chat:
+        found = asked(chat)
+    assert [after == before for before, after in zip(mined.episodes, found, strict=True)] == [True, False] * 3
+    assert "is asked no more" not in caplog.text
+
+
+def test_qwen3vl_judges_in_this_process(mined: Mined, tiny_qwen3vl_folder: Path, tmp_path: Path):
+    found = mined.judged(
+        first=1,
+        phase_judge="qwen3vl",
+        phase_judge_model_id=str(tiny_qwen3vl_folder),
+        phase_judge_confidence=0.0,
+        phase_judge_cache=str(tmp_path),
+    )
+    for names in phases(found):
+        check_sequence(names)
+    assert len(list(tmp_path.rglob("*.json"))) == len(found) == 1
+    assert all(0 <= c <= 1 for c in confidences(found))
+    assert confidences(found) != confidences(mined.episodes[:1])
+
+
+def test_weights_that_are_not_there_are_an_error(mined: Mined, tmp_path: Path):
+    with pytest.raises(PerceptionError, match="config"):
+        mined.judged(phase_judge="qwen3vl", phase_judge_model_id=str(tmp_path))
+
+
+@pytest.fixture(scope="module")
+def annotated(make_once: Callable[..., Path], tiny_dataset: Path, mined: Mined) -> Path:
+    """The tiny dataset with sub-tasks in all episodes but the last, written by LeRobot itself."""
+    frames = {item.episode.index: {p.phase: p.frame for p in item.key_poses} for item in mined.episodes}
+
+    def annotate(root: Path) -> None:
+        shutil.copytree(tiny_dataset, root)
+        records, staging = list(iter_episodes(root)), root / ".annotate_staging"
+        for record in records[:-1]:
+            at = frames[record.episode_index]
+            second = at.get("lift", at["grasp"])
+            words = "put the bowl on the plate" if record.episode_index < 3 else "turn the knob"
+            rows = [
+                (0, "pick up the bowl" if record.episode_index < 3 else "grasp the knob"),
+                (second, words),
+            ]
+            EpisodeStaging(staging, record.episode_index).write(
+                "plan",
+                [
+                    {
+                        "role": "assistant", "content": text, "style": "subtask", "tool_calls": None,
+                        "timestamp": record.frame_timestamps[frame],
+                    }
+                    for frame, text in rows
+                ],
+            )  # fmt: skip
+        LanguageColumnsWriter().write_all(records, staging, root)
+        Executor._ensure_annotation_metadata_in_info(root)
+
+    return make_once("annotated_dataset", annotate)
+
+
+def test_annotations_are_evidence(annotated: Path):
+    with_rows = Mined(annotated)
+    rows = with_rows.demonstrations.subtask_rows(0)
+    assert [words for _, words in rows] == ["pick up the bowl", "put the bowl on the plate"]
+    assert with_rows.demonstrations.subtask_rows(5) == []
+    found = with_rows.judged(phase_judge="annotations")
+    assert phases(found) == phases(with_rows.episodes)
+    for before, after in zip(with_rows.episodes[:3], found[:3], strict=True):
+        grown = [b.confidence < a.confidence for b, a in zip(before.key_poses, after.key_poses, strict=True)]
+        assert sum(grown) >= 0.8 * len(grown)
+    assert found[5] == with_rows.episodes[5]
+
+
+def test_a_dataset_without_annotations_is_an_error_with_the_command(mined: Mined):
+    with pytest.raises(DatasetError, match="lerobot-annotate --root="):
+        mined.judged(phase_judge="annotations")
+
+
+def test_an_experience_keeps_what_was_judged(mined: Mined, tmp_path: Path):
+    """From the configuration to the memory, through everything in between."""
+    with LoopbackChat(knowing(mined, 0.9)).running() as chat:
+        judged_by = {"phase_judge": "openai", "phase_judge_model_id": "tiny-vl", "memory_episodes": [0, 1]}
+        places = {"phase_judge_api_base": chat.api_base, "phase_judge_cache": str(tmp_path)}
+        plain = mine_experience(mined.meta, config(memory_episodes=[0, 1]))
+        sure = mine_experience(mined.meta, config(**judged_by, **places))
+    assert len(chat.requests) == 2
+    for before, after in zip(plain.entries, sure.entries, strict=True):
+        assert before.key == after.key
+        lower = [
+            p for p, q in zip(before.key_poses, after.key_poses, strict=True) if q.confidence < p.confidence
+        ]
+        higher = [
+            p for p, q in zip(before.key_poses, after.key_poses, strict=True) if q.confidence > p.confidence
+        ]
+        assert higher
+        assert not lower
+        assert all(p.confidence < 1 for p in higher)
+        np.testing.assert_array_equal(before.key_poses[0].T_obj_ee, after.key_poses[0].T_obj_ee)

@@ -1,0 +1,156 @@
+"""What an entry teaches by its parts, and by which entries an instruction is carried out."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from tests.memory.builders import entry, hand_pose, key_pose, pick_and_place
+
+from lerobot_openspm.envs.tasks import ANY_TASK
+from lerobot_openspm.errors import InstructionError
+from lerobot_openspm.geometry import se3
+from lerobot_openspm.memory.compound import parts, phrase, plan_parts, sub_task_index
+from lerobot_openspm.memory.entry import SubTask
+from lerobot_openspm.memory.instruction import parse_instruction
+
+DRAWER = "open the top drawer and put the bowl inside"
+
+
+def opened(sub_task=0):
+    """Approach a handle, take it, pull, let go, leave."""
+    T = hand_pose(0.15, 0.0, 0.1)
+    phases = (("approach", False), ("grasp", True), ("open", True), ("release", False), ("retreat", False))
+    return [key_pose("cabinet", T, phase, closed, sub_task=sub_task) for phase, closed in phases]
+
+
+def drawer_entry(**changes):
+    key_poses = (*opened(), *(replace(pose, sub_task=1) for pose in pick_and_place("bowl", "cabinet")))
+    return entry(DRAWER, **{"key_poses": key_poses, **changes})
+
+
+def test_an_entry_with_two_sub_tasks_teaches_both():
+    whole = drawer_entry(quality=0.7, source="local/demos#3")
+    opening, putting = parts(whole)
+    assert opening.key.sub_tasks == (SubTask("open", "cabinet", "top drawer"),)
+    assert putting.key.sub_tasks == (SubTask("put", "bowl", "top drawer", "in", "cabinet"),)
+    assert opening.key.phases == ("approach", "grasp", "open", "release", "retreat")
+    assert [pose.phase for pose in putting.key_poses] == [p.phase for p in whole.key_poses[5:]]
+    for part, objects in ((opening, ["cabinet"]), (putting, ["bowl", "cabinet"])):
+        assert sorted(part.layout) == objects
+        assert set(part.objects) <= set(part.layout)
+        assert {pose.sub_task for pose in part.key_poses} == {0}
+        assert (part.quality, part.source) == (0.7, "local/demos#3")
+    for part, poses in ((opening, whole.key_poses[:5]), (putting, whole.key_poses[5:])):
+        for own, pose in zip(part.key_poses, poses, strict=True):
+            np.testing.assert_array_equal(own.T_obj_ee, pose.T_obj_ee)
+
+
+def test_an_entry_with_one_sub_task_is_its_own_part():
+    one = entry()
+    assert parts(one) == (one,)
+    assert parts(one)[0] is one
+
+
+def test_an_older_memory_that_does_not_say_the_sub_tasks_is_told_by_its_gripper():
+    new = drawer_entry()
+    old = drawer_entry(key_poses=tuple(replace(pose, sub_task=0) for pose in new.key_poses))
+    assert [part.key for part in parts(old)] == [part.key for part in parts(new)]
+    assert [len(part.key_poses) for part in parts(old)] == [5, 8]
+
+
+def test_contacts_at_an_object_that_is_not_named_make_no_part():
+    T = hand_pose(0.0, 0.0, 0.1)
+    elsewhere = [replace(pose, anchor=key_pose("bowl", T, "open").anchor) for pose in opened()]
+    whole = drawer_entry()
+    odd = drawer_entry(key_poses=(*elsewhere, *whole.key_poses[5:]))
+    assert [part.key.sub_tasks[0].operation for part in parts(odd)] == ["put"]
+    # A way through free space is left out instead.
+    leaving = (*whole.key_poses[:4], elsewhere[4], *whole.key_poses[5:])
+    opening, _ = parts(drawer_entry(key_poses=leaving))
+    assert opening.key.phases == ("approach", "grasp", "open", "release")
+    assert opening.objects == ("cabinet",)
+
+
+@pytest.mark.parametrize(
+    ("contact", "phase", "expected"),
+    [
+        (0, "approach", 0),
+        (1, "release", 0),
+        (2, "retreat", 0),
+        (2, "approach", 1),
+        (3, "release", 1),
+        (4, "retreat", 1),
+        (5, "grasp", 1),
+        (0, "retreat", 0),
+    ],
+)
+def test_a_sub_task_takes_two_transitions_and_leaving_is_part_of_it(contact, phase, expected):
+    assert sub_task_index(contact, phase, 2) == expected
+
+
+@pytest.mark.parametrize("task", ANY_TASK)
+def test_a_phrase_says_the_sub_task(task):
+    for sub_task in parse_instruction(ANY_TASK[task].instruction):
+        assert parse_instruction(phrase(sub_task)) == (sub_task,)
+
+
+def languages(instruction, *entries):
+    return [[one.entry.language for one in part] for part in plan_parts(instruction, entries)]
+
+
+PLATE, STOVE = (
+    entry("put the bowl on the plate"),
+    entry("turn on the stove", opened(), {"cabinet": np.eye(4)}),
+)
+
+
+def test_an_instruction_is_carried_out_by_entries_of_its_parts_in_its_order():
+    both = "put the bowl on the plate and turn on the stove"
+    assert languages(both, STOVE, PLATE) == [["put the bowl on the plate"], ["turn on the stove"]]
+    other = "turn on the stove and put the bowl on the plate"
+    assert languages(other, STOVE, PLATE) == [["turn on the stove"], ["put the bowl on the plate"]]
+
+
+def test_what_was_demonstrated_as_a_whole_wins():
+    whole = drawer_entry()
+    alone = entry("open the top drawer", opened(), {"cabinet": np.eye(4)})
+    assert languages(DRAWER, alone, whole) == [[DRAWER]]
+    # So does the longest run of an instruction that goes on.
+    longer = f"{DRAWER}, and then turn on the stove"
+    assert languages(longer, alone, whole, STOVE) == [[DRAWER], ["turn on the stove"]]
+
+
+def test_a_part_of_something_else_is_experience_too_and_remembers_its_source():
+    whole = drawer_entry()
+    ((only,),) = plan_parts("open the top drawer of the cabinet", [whole, PLATE])
+    assert only.source is whole
+    assert only.semantic == pytest.approx(1)
+    assert only.entry.key.phases == ("approach", "grasp", "open", "release", "retreat")
+    first, second = plan_parts("open the top drawer and put the bowl on the plate", [whole, PLATE])
+    assert first[0].source is whole
+    assert second[0].source is second[0].entry is PLATE
+
+
+def test_a_part_without_experience_is_named():
+    with pytest.raises(InstructionError) as caught:
+        plan_parts("put the bowl on the plate and put the mug on the plate", [PLATE, drawer_entry()])
+    message = str(caught.value)
+    assert "'put the mug on the plate'" in message
+    assert "open the top drawer of the cabinet; put the bowl in the top drawer of the cabinet" in message
+
+
+@pytest.mark.parametrize("instruction", ["put the mug on the plate", "dance"])
+def test_a_single_instruction_without_experience_is_refused_as_ever(instruction):
+    with pytest.raises(InstructionError, match=instruction):
+        plan_parts(instruction, [PLATE])
+    with pytest.raises(InstructionError):
+        plan_parts("put the bowl on the plate and turn on the stove", [])
+
+
+def test_parts_can_be_carried_over_to_a_scene():
+    from lerobot_openspm.control.transfer import transfer
+
+    opening, _ = parts(drawer_entry())
+    layout = {"cabinet": se3.from_yaw([0.3, 0.1, 0.0], 0.4)}
+    targets = transfer(opening, layout, {}, hand_pose(0, 0, 0.3))
+    np.testing.assert_allclose(targets[0].T_world_ee, layout["cabinet"] @ opening.key_poses[0].T_obj_ee)

@@ -1,0 +1,87 @@
+"""A policy is taught in Python, also while it runs."""
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from lerobot.datasets import LeRobotDatasetMetadata
+from tests.policy.conftest import NAME, Frame, batch_of
+
+from lerobot_openspm import teaching
+from lerobot_openspm.errors import DatasetError, InstructionError, MemoryFormatError
+from lerobot_openspm.experience import Experience
+from lerobot_openspm.modeling_openspm import OpenSPMPolicy
+
+PUSH = "push the plate to the front of the stove"
+
+
+@pytest.fixture(scope="session")
+def push_meta(other_dataset: Path) -> LeRobotDatasetMetadata:
+    """Two demonstrations of a task that the checkpoint does not know."""
+    return LeRobotDatasetMetadata(NAME, root=other_dataset)
+
+
+def test_a_running_policy_can_be_taught(
+    policy: OpenSPMPolicy, recorded: list[list[Frame]], push_meta: LeRobotDatasetMetadata
+):
+    running, asked = batch_of([recorded[0][0]]), batch_of([recorded[0][0] | {"task": PUSH}])
+    with pytest.raises(InstructionError, match="it knows"):
+        policy.select_action(asked)
+    policy.select_action(running)
+    row, weights = policy.rows[0], {k: v.clone() for k, v in policy.state_dict().items()}
+    lesson = policy.teach(push_meta, [0])
+    assert lesson.instructions == (PUSH,)
+    assert (lesson.known_before, lesson.skipped, lesson.objects_learned) == ({PUSH: 0}, (), ())
+    assert all(torch.equal(value, weights[key]) for key, value in policy.state_dict().items())
+    policy.select_action(running)
+    assert policy.rows[0] is row  # the running episode goes on
+    assert torch.isfinite(policy.select_action(asked)).all()
+    assert policy.rows[0].instruction == PUSH
+
+
+def test_a_taught_memory_travels_with_the_checkpoint(
+    policy: OpenSPMPolicy, load: Callable[..., OpenSPMPolicy], push_meta: Any, tmp_path: Path
+):
+    lesson = policy.teach(push_meta)
+    policy.save_pretrained(tmp_path)
+    entries = load(tmp_path).require_experience().entries
+    assert [entry.source for entry in entries[-2:]] == [entry.source for entry in lesson.entries]
+    assert len(entries) == 8
+
+
+def without_stove(experience: Experience, episodes: tuple[int, ...]) -> Experience:
+    """The same where the stove was not found in some of the episodes."""
+    unseen = {f"{NAME}#{index}" for index in episodes}
+    entries = [
+        replace(e, layout={"plate": e.layout["plate"]}) if e.source in unseen else e
+        for e in experience.entries
+    ]
+    return replace(experience, entries=tuple(entries))
+
+
+@pytest.mark.parametrize("hidden", [(1,), (0, 1)])
+def test_demonstrations_that_do_not_show_an_object_are_not_believed(
+    policy: OpenSPMPolicy, push_meta: Any, monkeypatch: pytest.MonkeyPatch, hidden: tuple[int, ...]
+):
+    mine = teaching.mine
+    monkeypatch.setattr(teaching, "mine", lambda *given: without_stove(mine(*given), hidden))
+    before = policy.experience
+    if len(hidden) == 2:
+        with pytest.raises(DatasetError, match=r"not learned from episodes \[0, 1\].*could not find stove"):
+            policy.teach(push_meta)
+        assert policy.experience is before
+    else:
+        lesson = policy.teach(push_meta)
+        assert (len(lesson.entries), lesson.skipped) == (1, (1,))
+
+
+def test_demonstrations_of_another_robot_are_refused(policy: OpenSPMPolicy, push_meta: Any):
+    known = policy.require_experience()
+    robot = replace(known.robot, close_command=known.robot.close_command * 2)
+    policy.experience = before = replace(known, robot=robot)
+    with pytest.raises(MemoryFormatError, match="another robot or controller"):
+        policy.teach(push_meta)
+    assert policy.experience is before

@@ -1,0 +1,184 @@
+"""Whatever interrupts a save, the memory before or the new one is there, whole."""
+
+import errno
+import os
+import random
+import signal
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+from tests.memory.builders import entry
+from tests.memory.experiences import experience, same
+from tests.memory.memory_files import names
+from tests.memory.old_format import save_version_4
+
+from lerobot_openspm import files
+from lerobot_openspm.errors import MemoryFormatError, OpenSPMError
+from lerobot_openspm.experience import load_experience, save_experience
+from lerobot_openspm.experience_files import LOCK, changing
+
+OLD = experience()
+CAMERAS = {key: replace(camera, fx=77.5) for key, camera in OLD.cameras.items()}
+NEWER = replace(OLD, entries=(entry(quality=0.1, source="new#1"),), cameras=CAMERAS)
+SOURCES = [e.source for e in OLD.entries]
+# What a save asks the system for.
+CALLS = {"os": ("replace", "fsync", "open"), "pathlib.Path": ("open", "unlink", "mkdir")}
+
+
+class Fault:
+    """Lets the n-th system call of a save fail, or counts them."""
+
+    def __init__(self, monkeypatch, at=None):
+        self.count, self._at = 0, at
+        for owner, functions in ((os, CALLS["os"]), (Path, CALLS["pathlib.Path"])):
+            for name in functions:
+                monkeypatch.setattr(owner, name, self._failing(getattr(owner, name)))
+
+    def _failing(self, function):
+        def call(*args, **kwargs):
+            self.count += 1
+            if self.count == self._at:
+                raise OSError(errno.ENOSPC, "no space left")
+            return function(*args, **kwargs)
+
+        return call
+
+
+def visible(folder):
+    return sorted(path.name for path in folder.iterdir() if path.name != LOCK)
+
+
+def n_calls(tmp_path, make):
+    make(OLD, tmp_path / "counted")
+    with pytest.MonkeyPatch.context() as patched:
+        fault = Fault(patched)
+        save_experience(NEWER, tmp_path / "counted")
+    return fault.count
+
+
+@pytest.mark.parametrize("make", [save_experience, save_version_4])
+def test_a_save_that_fails_at_any_call_leaves_the_old_memory_or_the_new_one(tmp_path, make):
+    outcomes = []
+    for at in range(1, n_calls(tmp_path, make) + 1):
+        folder = tmp_path / str(at)
+        make(OLD, folder)
+        with pytest.MonkeyPatch.context() as patched:
+            Fault(patched, at)
+            try:
+                save_experience(NEWER, folder)
+            except OSError as error:
+                outcomes.append(error.errno)
+        loaded = load_experience(folder)
+        assert same(loaded, OLD) or same(loaded, NEWER)
+        outcomes.append("old" if same(loaded, OLD) else "new")
+        # The next save is not disturbed by what is left, and leaves nothing of it.
+        save_experience(NEWER, folder)
+        assert same(load_experience(folder), NEWER)
+        assert visible(folder) == sorted(names(folder))
+    assert {"old", "new", errno.ENOSPC} <= set(outcomes)
+    assert len(outcomes) > 20
+
+
+def test_a_first_save_that_fails_is_no_memory(tmp_path):
+    with pytest.MonkeyPatch.context() as patched:
+        Fault(patched, 6)
+        with pytest.raises(OSError, match="no space"):
+            save_experience(OLD, tmp_path)
+    with pytest.raises(MemoryFormatError, match=r"no memory at .*memory\.json"):
+        load_experience(tmp_path)
+
+
+def in_another_process(function):
+    """Run a function in a fork of this process, which ends with it; returns its process id."""
+    pid = os.fork()
+    if pid == 0:
+        try:
+            function()
+        finally:
+            os._exit(0)
+    return pid
+
+
+def test_the_memory_survives_kill_9_at_any_moment(tmp_path):
+    rng, seen = random.Random(0), set()
+    save_experience(OLD, tmp_path)
+
+    def save_for_ever():
+        while True:
+            save_experience(NEWER, tmp_path)
+            save_experience(OLD, tmp_path)
+
+    for _ in range(100):
+        pid = in_another_process(save_for_ever)
+        time.sleep(rng.uniform(0.001, 0.06))
+        os.kill(pid, signal.SIGKILL)
+        os.waitpid(pid, 0)
+        loaded = load_experience(tmp_path)
+        is_old = same(loaded, OLD)
+        assert is_old or same(loaded, NEWER)
+        seen.add((is_old, len(visible(tmp_path))))
+    save_experience(NEWER, tmp_path)
+    assert visible(tmp_path) == sorted(names(tmp_path))
+    # It was cut off after the one and after the other, and in the middle.
+    assert {is_old for is_old, _ in seen} == {True, False}
+    assert len({n_files for _, n_files in seen}) > 1
+
+
+def test_two_processes_that_add_at_once_lose_nothing_of_each_other(tmp_path):
+    save_experience(OLD, tmp_path)
+
+    def add(name):
+        for i in range(10):
+            with changing(tmp_path):
+                experience = load_experience(tmp_path)
+                added = replace(experience, entries=(entry(source=f"{name}#{i}"),))
+                save_experience(experience.appended(added), tmp_path)
+
+    for pid in [in_another_process(lambda name=name: add(name)) for name in ("one", "two")]:
+        os.waitpid(pid, 0)
+    found = [e.source for e in load_experience(tmp_path).entries]
+    assert sorted(found) == sorted([f"{n}#{i}" for n in ("one", "two") for i in range(10)] + SOURCES)
+
+
+def test_a_memory_can_be_read_while_another_process_saves(tmp_path):
+    save_experience(OLD, tmp_path)
+
+    def numbered(i):
+        cameras = {key: replace(camera, fx=50.1 + i) for key, camera in OLD.cameras.items()}
+        return replace(OLD, entries=(*OLD.entries, entry(version=1 + i)), cameras=cameras)
+
+    def save():
+        for i in range(1, 60):
+            save_experience(numbered(i), tmp_path)
+
+    save_experience(numbered(0), tmp_path)
+    pid = in_another_process(save)
+    seen = set()
+    while os.waitpid(pid, os.WNOHANG) == (0, 0):
+        loaded = load_experience(tmp_path)
+        seen.add(loaded.entries[-1].version)
+        assert same(loaded, numbered(loaded.entries[-1].version - 1))
+    assert len(seen) > 2
+
+
+def test_who_waits_too_long_for_another_process_is_told(tmp_path, monkeypatch):
+    save_experience(OLD, tmp_path)
+    read, write = os.pipe()
+
+    def hold():
+        with changing(tmp_path):
+            os.write(write, b"held")
+            time.sleep(30)
+
+    pid = in_another_process(hold)
+    assert os.read(read, 4) == b"held"
+    monkeypatch.setattr(files, "LOCK_WAIT_S", 0.1)
+    with pytest.raises(OpenSPMError, match="another process has been changing this"):
+        save_experience(NEWER, tmp_path)
+    os.kill(pid, signal.SIGKILL)
+    os.waitpid(pid, 0)
+    # Whoever holds it and is killed holds it no more.
+    save_experience(NEWER, tmp_path)
+    assert same(load_experience(tmp_path), NEWER)
