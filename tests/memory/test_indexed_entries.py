@@ -7,21 +7,21 @@ from tests.memory.builders import entry
 from lerobot_openspm.bench.synthetic_keys import distinct_keys, said_otherwise
 from lerobot_openspm.errors import InstructionError
 from lerobot_openspm.memory import indexed_entries as module
-from lerobot_openspm.memory.entry import RetrievalKey
+from lerobot_openspm.memory.columns import columns_of, key_digest
+from lerobot_openspm.memory.entry import RetrievalKey, SubTask
 from lerobot_openspm.memory.indexed_entries import (
     ENTRIES_IN_ALL,
     ENTRIES_PER_KEY,
     INDEX_FROM,
     IndexedEntries,
-    equal_rows,
     indexed,
     near,
 )
 from lerobot_openspm.memory.instruction import parse_instruction
-from lerobot_openspm.memory.key_vector import key_vectors
 from lerobot_openspm.memory.retrieval import MIN_SEMANTIC, semantic_candidates, semantic_score
 
 BOWL, STOVE = "put the bowl on the plate", "turn on the stove"
+DIGEST_OF_BOWL = 13536161139241641483
 DRAWER = "open the top drawer and put the bowl inside"
 
 
@@ -44,18 +44,15 @@ def many():
     return bank_of(distinct_keys(INDEX_FROM + 500, np.random.default_rng(0)))
 
 
-class Columns(list):
+class Bank(list):
     """A bank with columns, which remembers which entries were read."""
 
-    def __init__(self, entries):
+    def __init__(self, entries, kept=None):
         super().__init__(entries)
-        self.read = []
+        self.read, self.kept = [], kept
 
-    def key_vectors(self):
-        return key_vectors([one.key.sub_tasks for one in self])
-
-    def qualities(self):
-        return np.array([one.quality for one in list.__iter__(self)])
+    def columns(self):
+        return self.kept
 
     def __getitem__(self, i):
         self.read.append(i)
@@ -122,10 +119,18 @@ def test_of_equal_keys_the_best_are_handed_on(many):
 
 def test_no_more_than_so_many_in_all_but_one_of_every_key():
     keys = [key for key in distinct_keys(40, np.random.default_rng(0)) if len(key) == 1]
-    found = IndexedEntries(bank_of(keys * 100)).near(keys[3], semantic_score)
+    bank = IndexedEntries(bank_of(keys * 100))
+    found = bank.near(keys[3], lambda asked, known: 1.0 if asked == known else 0.5)
     assert len(found) == ENTRIES_IN_ALL
     assert {one.key.sub_tasks for one in found} == set(keys)
     assert [one.key.sub_tasks for one in found[:ENTRIES_PER_KEY]] == [keys[3]] * ENTRIES_PER_KEY
+
+
+def test_of_keys_about_something_else_one_entry_is_handed_on():
+    keys = [key for key in distinct_keys(40, np.random.default_rng(0)) if len(key) == 1]
+    found = IndexedEntries(bank_of(keys * 100)).near(keys[3], lambda asked, known: float(asked == known))
+    assert len(found) == ENTRIES_PER_KEY + len(keys) - 1
+    assert {one.key.sub_tasks for one in found} == set(keys)
 
 
 def test_parts_are_found_in_either_direction():
@@ -142,28 +147,41 @@ def test_parts_are_found_in_either_direction():
 
 
 def test_of_a_bank_with_columns_one_entry_of_each_key_is_read(many):
-    bank = Columns(many[:20] * 30)
+    plain = many[:20] * 30
+    bank = Bank(plain, columns_of(plain))
     made = IndexedEntries(bank)
     assert sorted(bank.read) == list(range(20))
-    asked = many[7].key.sub_tasks
-    plain = IndexedEntries(many[:20] * 30)
-    assert sources(made.near(asked, semantic_score)) == sources(plain.near(asked, semantic_score))
+    for asked in (many[7].key.sub_tasks, many[11].key.sub_tasks):
+        found = made.near(asked, semantic_score)
+        assert sources(found) == sources(IndexedEntries(plain).near(asked, semantic_score))
+
+
+def test_a_bank_may_have_no_columns_yet(many):
+    found = IndexedEntries(Bank(many[:20])).near(many[2].key.sub_tasks, semantic_score)
+    assert found[0] is many[2]
 
 
 def test_columns_of_other_entries_are_not_believed(many, caplog):
-    bank = Columns(many[:20])
-    bank.key_vectors = lambda: key_vectors([one.key.sub_tasks for one in many[5:25]])
-    found = IndexedEntries(bank, "bank").near(many[2].key.sub_tasks, semantic_score)
+    found = IndexedEntries(Bank(many[:20], columns_of(many[5:25])), "bank").near(
+        many[2].key.sub_tasks, semantic_score
+    )
     assert found[0] is many[2]
-    assert caplog.text.count("bank: its key vectors are not those of its entries") == 1
+    assert caplog.text.count("bank: its digests are not those of its keys") == 1
 
 
-def test_equal_rows_are_numbered_by_first_appearance():
-    rows = np.array([[1, 2], [3, 4], [1, 2], [0, 0], [3, 4]], np.float32)
-    numbers, firsts = equal_rows(rows)
-    assert numbers.tolist() == [0, 1, 0, 2, 1]
-    assert firsts.tolist() == [0, 1, 3]
-    assert [part.tolist() for part in equal_rows(rows[:0])] == [[], []]
+def test_columns_are_those_that_were_kept_or_made(many):
+    made = columns_of(many[:5])
+    assert (made.digests.dtype, made.qualities.dtype) == (np.uint64, np.float64)
+    assert made.digests.tolist() == [key_digest(one.key.sub_tasks) for one in many[:5]]
+    assert made.qualities.tolist() == [one.quality for one in many[:5]]
+    assert made[1:3].digests.tolist() == made.digests[1:3].tolist()
+    assert columns_of(Bank(many[:5], made)) is made
+    assert columns_of(()).digests.shape == (0,)
+
+
+def test_digests_tell_keys_apart_and_are_the_same_everywhere(many):
+    assert len({key_digest(one.key.sub_tasks) for one in many}) == len(many)
+    assert key_digest([SubTask("put", "bowl", "", "on", "plate")]) == DIGEST_OF_BOWL
 
 
 def test_the_gate_of_retrieval_holds_for_what_is_near(many):

@@ -7,16 +7,16 @@ keys, they are scored exactly, and of the best keys the best entries are handed 
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from typing import Protocol, overload, runtime_checkable
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from typing import overload
 
 import numpy as np
 from numpy.typing import NDArray
 
-from lerobot_openspm.geometry.se3 import Array
+from lerobot_openspm.memory.columns import HasColumns, Key, key_digest
 from lerobot_openspm.memory.entry import MemoryEntry, SubTask
-from lerobot_openspm.memory.index import Indices, make_index
-from lerobot_openspm.memory.key_vector import Vectors, key_vectors
+from lerobot_openspm.memory.index import make_index
+from lerobot_openspm.memory.key_vector import key_vectors
 
 logger = logging.getLogger(__name__)
 
@@ -27,33 +27,15 @@ NEAREST_KEYS = 64
 # Of the entries of one key, so many are handed on, the best by quality; and so many in all.
 ENTRIES_PER_KEY, ENTRIES_IN_ALL = 64, 256
 
-Key = tuple[SubTask, ...]
 # S_sem of what is asked and what is known.
 Score = Callable[[Sequence[SubTask], Sequence[SubTask]], float]
-
-
-@runtime_checkable
-class HasColumns(Protocol):
-    """A bank that keeps vectors and qualities as columns, so that its entries need not be read for them.
-
-    The vectors only tell which entries have equal keys; one of each is read and compared with its vector, and
-    vectors of another release or another bank are not used.
-    """
-
-    def key_vectors(self) -> Vectors:
-        """:func:`lerobot_openspm.memory.key_vector.key_vector` of every entry, ``(n, 64)``."""
-        ...
-
-    def qualities(self) -> Array:
-        """Quality of every entry ``(n,)``."""
-        ...
 
 
 class IndexedEntries(Sequence[MemoryEntry]):
     """Entries with an index over their keys, and over the sub-tasks of keys that have several.
 
     Args:
-        entries: The bank. If it :class:`HasColumns`, one entry of every different key is read, else all are.
+        entries: The bank. If it :class:`HasColumns`, one entry of every different key is read, else all.
         where: Names the bank in errors.
 
     Raises:
@@ -62,7 +44,7 @@ class IndexedEntries(Sequence[MemoryEntry]):
 
     def __init__(self, entries: Sequence[MemoryEntry], where: str = "the memory"):
         self._entries = entries
-        keys, numbers, qualities = _columns(entries, where)
+        keys, numbers, qualities = _numbered_keys(entries, where)
         # Entries by key, the best of each first.
         self._order = np.lexsort((np.arange(len(entries)), -qualities, numbers))
         self._ends = np.searchsorted(numbers[self._order], np.arange(len(keys) + 1))
@@ -88,8 +70,9 @@ class IndexedEntries(Sequence[MemoryEntry]):
         """The entries of the keys nearest to what is asked, and to every part of it; the best key first.
 
         For each part these are entries whose whole key is near, and entries of which one sub-task is: of
-        either about :data:`ENTRIES_IN_ALL` at most, and of one key the best by quality, at least one and at
-        most :data:`ENTRIES_PER_KEY`.
+        either about :data:`ENTRIES_IN_ALL` at most. Of a key these are the best by quality: of one that has a
+        score at most :data:`ENTRIES_PER_KEY`, of any other one, to be named where nothing is known of what is
+        asked.
 
         Args:
             asked: The sub-tasks of an instruction.
@@ -100,19 +83,23 @@ class IndexedEntries(Sequence[MemoryEntry]):
         entries: dict[int, None] = {}
         for run, rows in zip(runs, found, strict=True):
             keys = [self._row_keys[int(row)] for row in rows[rows >= 0]]
-            keys = sorted(keys, key=lambda key: -score(run, key))
-            owners = [(key, number) for key in keys for number in self._rows[key][:NEAREST_KEYS]]
-            wholes = [number for key, number in owners if len(self._keys[number]) == len(key)]
-            parts = [number for key, number in owners if len(self._keys[number]) > len(key) == len(run)]
+            scores = {key: score(run, key) for key in keys}
+            wholes: dict[int, float] = {}
+            parts: dict[int, float] = {}
+            for key in sorted(keys, key=lambda key: -scores[key]):
+                for number in self._rows[key][:NEAREST_KEYS]:
+                    is_whole = len(self._keys[number]) == len(key)
+                    if is_whole or len(key) == len(run):
+                        (wholes if is_whole else parts).setdefault(number, scores[key])
             entries |= dict.fromkeys([*self._best_entries(wholes), *self._best_entries(parts)])
         return [self._entries[i] for i in entries]
 
-    def _best_entries(self, ranked: Sequence[int]) -> Iterator[int]:
-        """The best entry of each key, and as many more as there is room for, of the first keys first."""
-        left = max(0, ENTRIES_IN_ALL - len(ranked))
-        for number in ranked:
+    def _best_entries(self, scores: Mapping[int, float]) -> Iterator[int]:
+        """The best entry of each key, and as many more of those with a score as there is room for."""
+        left = max(0, ENTRIES_IN_ALL - len(scores))
+        for number, score in scores.items():
             begin, end = self._ends[number], self._ends[number + 1]
-            more = min(end - begin, ENTRIES_PER_KEY, 1 + left) - 1
+            more = min(end - begin, ENTRIES_PER_KEY, 1 + left) - 1 if score > 0 else 0
             left -= more
             yield from (int(i) for i in self._order[begin : begin + 1 + more])
 
@@ -135,45 +122,23 @@ def near(asked: Sequence[SubTask], entries: Sequence[MemoryEntry], score: Score)
     return entries.near(asked, score) if isinstance(entries, IndexedEntries) else entries
 
 
-def _columns(
+def _numbered_keys(
     entries: Sequence[MemoryEntry], where: str
 ) -> tuple[list[Key], NDArray[np.int64], NDArray[np.float64]]:
     """The different keys, which of them each entry has ``(n,)``, and the entries' qualities ``(n,)``."""
-    if not isinstance(entries, HasColumns):
-        return _read_columns(entries)
-    vectors, qualities = entries.key_vectors(), np.asarray(entries.qualities(), float)
-    numbers, firsts = equal_rows(vectors)
-    keys = [entries[int(i)].key.sub_tasks for i in firsts]
-    # Up to the rounding of another machine's arithmetic.
-    if np.allclose(key_vectors(keys), vectors[firsts], atol=1e-5):
-        return keys, numbers, qualities
-    logger.warning(
-        "%s: its key vectors are not those of its entries, so all %d are read; write it again with this "
-        "release to load it quicker",
-        where,
-        len(entries),
-    )
-    return _read_columns(entries)
-
-
-def _read_columns(
-    entries: Iterable[MemoryEntry],
-) -> tuple[list[Key], NDArray[np.int64], NDArray[np.float64]]:
+    kept = entries.columns() if isinstance(entries, HasColumns) else None
+    if kept is not None:
+        digests, firsts, numbers = np.unique(kept.digests, return_index=True, return_inverse=True)
+        keys = [entries[int(i)].key.sub_tasks for i in firsts]
+        if [key_digest(key) for key in keys] == digests.tolist():
+            return keys, np.asarray(numbers, np.int64), kept.qualities
+        logger.warning(
+            "%s: its digests are not those of its keys, so all %d entries are read; write it again with this "
+            "release to load it quicker",
+            where,
+            len(entries),
+        )
     table: dict[Key, int] = {}
     rows = [(table.setdefault(entry.key.sub_tasks, len(table)), entry.quality) for entry in entries]
     numbers, qualities = np.array(rows, float).reshape(-1, 2).T
     return list(table), numbers.astype(np.int64), qualities
-
-
-def equal_rows(vectors: Vectors) -> tuple[Indices, Indices]:
-    """Number the different rows of ``(n, 64)`` by first appearance.
-
-    Returns:
-        Number of every row's value ``(n,)``, and the first row ``(u,)`` of every value.
-    """
-    blob, width = np.ascontiguousarray(vectors).tobytes(), vectors.shape[1] * vectors.itemsize
-    table: dict[bytes, int] = {}
-    rows = (blob[i * width : (i + 1) * width] for i in range(len(vectors)))
-    numbers = np.fromiter((table.setdefault(row, len(table)) for row in rows), np.int64, len(vectors))
-    firsts = np.unique(numbers, return_index=True)[1] if len(numbers) else np.zeros(0, np.int64)
-    return numbers, np.asarray(firsts, np.int64)
