@@ -186,7 +186,7 @@ def _part(words: Words) -> str:
     found[-1] = v.singular(found[-1])
     if found[-1] in v.PART_SYNONYMS:
         found[-1] = v.PART_SYNONYMS[found[-1]]
-    return " ".join(word for word in found if word != "hand")
+    return " ".join(word for word in found if word not in ("hand", "side"))
 
 
 def _places(words: Words) -> tuple[Reference | None, Words]:
