@@ -298,6 +298,8 @@ def _part_and_place(words: Words, preposition: Preposition, following: Words) ->
     ):
         return (*words, "of", *following)
     place = v.PLACE_OF_RELATION.get(preposition.relation, "")
+    if preposition.relation == "on" and not following and not has_place:
+        return (*words[:-1], "top", words[-1])  # "the drawer on top"
     if place and following and not has_place and head != "shelf":
         return (*words[:-1], place, words[-1], "of", *following)
     return None
