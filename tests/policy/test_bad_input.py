@@ -15,6 +15,7 @@ from tests.policy.conftest import Frame, batch_of
 from tests.policy.lerobot_commands import lerobot_train, training_options
 from tests.policy.test_learning import new_config
 
+from lerobot_openspm.configuration_openspm import OpenSPMConfig
 from lerobot_openspm.errors import (
     CalibrationError,
     DatasetError,

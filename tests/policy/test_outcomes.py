@@ -43,15 +43,14 @@ def test_outcomes_change_the_entries_that_were_acted_by_and_are_saved(
 def test_the_next_episodes_choose_by_what_was_learned(policy: OpenSPMPolicy, recorded: list[list[Frame]]):
     frame = batch_of([recorded[0][0]])
     chosen = []
-    for _ in range(3):
+    for _ in range(12):
         policy.reset()
         policy.select_action(frame)
         chosen.append(policy.rows[0].used_entries[0].source)
-        for _ in range(8):
-            policy.report_outcomes([False])
-            policy.reset()
-            policy.select_action(frame)
-    assert len(set(chosen)) == 3
+        policy.report_outcomes([False])
+    # What goes on failing is left for another demonstration of the same task.
+    assert len(set(chosen)) > 1
+    assert sum(tried for tried, _ in trials(policy).values()) == 12
 
 
 def test_outcomes_of_episodes_that_do_not_run_are_refused(
