@@ -33,7 +33,8 @@ def test_outcomes_change_the_entries_that_were_acted_by_and_are_saved(
     policy.report_outcomes([True, False, False])
     third = used[2][0].source
     expected = {bowl.source: (1, 0), stove.source: (1, 1)}
-    expected[third] = tuple(a + 1 for a in expected.get(third, (0, 0)))
+    tried, succeeded = expected.get(third, (0, 0))
+    expected[third] = (tried + 1, succeeded + 1)
     assert trials(policy) == expected
     policy.save_pretrained(tmp_path)
     saved = {e.source: (e.trials, e.successes) for e in load_experience(tmp_path).entries if e.trials}
