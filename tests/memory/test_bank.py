@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 from tests.memory.builders import entry
 from tests.memory.experiences import experience, same
-from tests.memory.memory_files import edit_entries, name_of
+from tests.memory.memory_files import edit_arrays, edit_entries
 
 from lerobot_openspm import experience as module
-from lerobot_openspm.bench.synthetic_memory import save_synthetic_memory
 from lerobot_openspm.errors import MemoryFormatError
 from lerobot_openspm.experience import load_experience, save_experience
 from lerobot_openspm.memory.bank import EntryBank
+from lerobot_openspm.memory.columns import HasColumns, columns_of
 
 MANY = tuple(entry(source=f"local/demos#{i}", quality=i / 10) for i in range(10))
 
@@ -69,12 +69,35 @@ def test_an_entry_at_an_object_that_the_header_does_not_list_is_refused(tmp_path
         tuple(entries)
 
 
-def test_a_synthetic_memory_is_one_like_any_other(tmp_path):
-    save_synthetic_memory(tmp_path, 50, np.random.default_rng(0))
-    loaded = load_experience(tmp_path)
-    assert [e.source for e in loaded.entries] == [f"synthetic#{i}" for i in range(50)]
-    assert len({e.language for e in loaded.entries}) == 50
-    assert {len(e.key_poses) for e in loaded.entries} == {7}
-    save_experience(loaded, tmp_path / "again")
-    for kind in ("entries",):
-        assert name_of(tmp_path / "again", kind) == name_of(tmp_path, kind)
+def test_what_is_kept_to_find_entries_by_is_what_reading_them_would_say(tmp_path, monkeypatch):
+    monkeypatch.setattr(module, "READ_AT_LOAD", 5)
+    stove = entry("put the bowl on the stove", source="local/demos#10", quality=0.25)
+    save_experience(experience(entries=(*MANY, stove), superseded=MANY[:1]), tmp_path)
+    bank = load_experience(tmp_path).entries
+    assert isinstance(bank, HasColumns)
+    for some, entries in (
+        (bank, (*MANY, stove)),
+        (bank[8:], (*MANY[8:], stove)),
+        (bank[::-2], [*MANY, stove][::-2]),
+    ):
+        kept, made = columns_of(some), columns_of(entries)
+        assert kept.digests.tolist() == made.digests.tolist()
+        assert kept.qualities.tolist() == made.qualities.tolist()
+
+
+@pytest.mark.parametrize("name", ["entries.keys", "entries.qualities"])
+def test_columns_of_another_kind_are_refused(tmp_path, name):
+    save_experience(experience(), tmp_path)
+    edit_arrays(tmp_path, lambda arrays: arrays.update({name: arrays[name].astype(np.float32)}))
+    with pytest.raises(MemoryFormatError, match=f"array '{name}' is float32"):
+        load_experience(tmp_path)
+    edit_arrays(tmp_path, lambda arrays: arrays.pop(name))
+    with pytest.raises(MemoryFormatError, match=f"array '{name}' is missing"):
+        load_experience(tmp_path)
+
+
+def test_another_quality_than_the_entrys_is_refused(tmp_path):
+    save_experience(experience(), tmp_path)
+    edit_arrays(tmp_path, lambda arrays: arrays.update({"entries.qualities": np.array([0.9, 0.1])}))
+    with pytest.raises(MemoryFormatError, match=r"entries\[1\] has another quality"):
+        load_experience(tmp_path)
