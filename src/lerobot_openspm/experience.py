@@ -111,6 +111,15 @@ class Experience:
             superseded=(*self.superseded, *replaced),
         )
 
+    def restored(self, entry: MemoryEntry) -> Experience:
+        """This experience with a superseded entry in use again, in the place of what came after it."""
+        task = (entry.source, entry.language)
+        replaced = [e for e in self.entries if (e.source, e.language) == task]
+        old = [e for e in self.superseded if e is not entry]
+        version = max(e.version for e in (entry, *replaced, *old) if (e.source, e.language) == task) + 1
+        kept = [e for e in self.entries if (e.source, e.language) != task]
+        return replace(self, entries=(*kept, replace(entry, version=version)), superseded=(*old, *replaced))
+
     def with_outcomes(self, outcomes: Iterable[tuple[MemoryEntry, bool]]) -> Experience:
         """This experience after some of its entries were acted by, each with whether it succeeded."""
         entries = list(self.entries)

@@ -206,6 +206,23 @@ def test_an_exported_folder_is_a_memory(openspm: Openspm, memory: Path, tmp_path
     assert "holds no such entry" in error
 
 
+def test_what_was_removed_or_edited_is_restored(openspm: Openspm, memory: Path):
+    edited = replace(entry(BOWL, source="local/demos#2", quality=0.1), version=2)
+    save_experience(
+        replace(made(), entries=(*made().entries[:2], edited), superseded=made().entries[2:]), memory
+    )
+    restored = run(openspm, memory, "restore", "--source=local/demos#2")
+    assert restored == {"entries": 3, "superseded": 1, "restored": "local/demos#2", "version": 3}
+    after = load_experience(memory)
+    assert same(after.entries[-1], replace(made().entries[2], version=3))
+    assert same(after.superseded[0], edited)
+    run(openspm, memory, "remove", "--source=local/demos#2")
+    error = refused(openspm, memory, "restore", "--source=local/demos#2", "--version=1")
+    assert "no such superseded entry of 'local/demos#2', of its versions: 2, 3" in error
+    assert run(openspm, memory, "restore", "--source=local/demos#2", "--version=2")["version"] == 4
+    assert load_experience(memory).entries[-1].quality == 0.1
+
+
 def test_merge(openspm: Openspm, memory: Path):
     assert run(openspm, memory, "merge") == {"entries": 2, "superseded": 2, "merged": 2, "into": 1}
     assert sources(memory) == ["local/demos#0, local/demos#2", "local/demos#1"]
