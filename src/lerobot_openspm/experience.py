@@ -18,6 +18,8 @@ from lerobot_openspm.experience_files import (
     VERSION,
     Arrays,
     Fields,
+    columns_from_arrays,
+    columns_to_arrays,
     file_field,
     lines_from_arrays,
     read_arrays,
@@ -29,6 +31,7 @@ from lerobot_openspm.experience_header import Header, check_layouts, header_from
 from lerobot_openspm.geometry.camera import Camera, load_cameras
 from lerobot_openspm.geometry.layout import VectorLayout
 from lerobot_openspm.memory.bank import EntryBank, anchored_objects, texts_of
+from lerobot_openspm.memory.columns import columns_of
 from lerobot_openspm.memory.entry import MemoryEntry
 from lerobot_openspm.memory.old_versions import entries_from_parts
 from lerobot_openspm.memory.quality import with_outcome
@@ -108,6 +111,15 @@ class Experience:
             superseded=(*self.superseded, *replaced),
         )
 
+    def restored(self, entry: MemoryEntry) -> Experience:
+        """This experience with a superseded entry in use again, in the place of what came after it."""
+        task = (entry.source, entry.language)
+        replaced = [e for e in self.entries if (e.source, e.language) == task]
+        old = [e for e in self.superseded if e is not entry]
+        version = max(e.version for e in (entry, *replaced, *old) if (e.source, e.language) == task) + 1
+        kept = [e for e in self.entries if (e.source, e.language) != task]
+        return replace(self, entries=(*kept, replace(entry, version=version)), superseded=(*old, *replaced))
+
     def with_outcomes(self, outcomes: Iterable[tuple[MemoryEntry, bool]]) -> Experience:
         """This experience after some of its entries were acted by, each with whether it succeeded."""
         entries = list(self.entries)
@@ -139,8 +151,10 @@ def save_experience(experience: Experience, directory: Path) -> None:
         fields, own = object_to_parts(model)
         objects.append(fields)
         arrays |= {f"objects.{model.name}.{key}": value for key, value in own.items()}
+    groups = (experience.entries, experience.superseded)
+    arrays |= columns_to_arrays([columns_of(group) for group in groups])
     header = header_to_fields(header_of(experience, objects))
-    texts = chain(texts_of(experience.entries), texts_of(experience.superseded))
+    texts = chain.from_iterable(map(texts_of, groups))
     write_files(directory, header, texts, arrays, experience.cameras)
 
 
@@ -207,7 +221,8 @@ def _entries_of(
 ) -> tuple[Sequence[MemoryEntry], Sequence[MemoryEntry]]:
     """The entries, and those that were superseded."""
     file = directory / file_field(fields, "entries", directory)["file"]
-    bank = EntryBank(file, lines_from_arrays(arrays, str(file)), frozenset(header.anchored))
+    lines, columns = lines_from_arrays(arrays, str(file)), columns_from_arrays(arrays, str(file))
+    bank = EntryBank(file, lines, columns, frozenset(header.anchored))
     if header.n_entries > len(bank):
         raise MemoryFormatError(
             f"{directory / MEMORY_JSON}: 'n_entries' is {header.n_entries}, but {file.name} holds {len(bank)}"

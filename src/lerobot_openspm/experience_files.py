@@ -9,7 +9,7 @@ from __future__ import annotations
 import hashlib
 import json
 import re
-from collections.abc import Generator, Iterable, Mapping
+from collections.abc import Generator, Iterable, Mapping, Sequence
 from contextlib import contextmanager, nullcontext, suppress
 from pathlib import Path
 from typing import Any
@@ -24,6 +24,7 @@ from lerobot_openspm.errors import CalibrationError, MemoryFormatError
 from lerobot_openspm.files import locked, rename, write_beside, written
 from lerobot_openspm.geometry.camera import Camera, cameras_from_dict, cameras_to_dict, load_cameras
 from lerobot_openspm.memory.bank import Lines, write_texts
+from lerobot_openspm.memory.columns import Columns
 from lerobot_openspm.memory.strict_json import loads
 
 # Version 2: objects known by patches. Version 3: key poses with the axis of their constraint. Version 4:
@@ -218,12 +219,31 @@ def lines_to_arrays(lines: Lines) -> Arrays:
 
 def lines_from_arrays(arrays: Mapping[str, NDArray[Any]], where: str) -> Lines:
     """Inverse of :func:`lines_to_arrays`. Raises MemoryFormatError naming file and array."""
-    for name in ("entries.ends", "entries.digests"):
-        if name not in arrays:
-            raise MemoryFormatError(f"{where}: array {name!r} is missing, got {sorted(arrays)}; {AGAIN}")
-    lines = Lines(arrays["entries.ends"], arrays["entries.digests"])
+    lines = Lines(*_named(arrays, ("entries.ends", "entries.digests"), where))
     lines.check(where)
     return lines
+
+
+def columns_to_arrays(groups: Sequence[Columns]) -> Arrays:
+    """The arrays that entries are found by, of several groups one after the other."""
+    return {
+        "entries.keys": np.concatenate([columns.digests for columns in groups]),
+        "entries.qualities": np.concatenate([columns.qualities for columns in groups]),
+    }
+
+
+def columns_from_arrays(arrays: Mapping[str, NDArray[Any]], where: str) -> Columns:
+    """Inverse of :func:`columns_to_arrays`. Raises MemoryFormatError naming file and array."""
+    return Columns(*_named(arrays, ("entries.keys", "entries.qualities"), where))
+
+
+def _named(
+    arrays: Mapping[str, NDArray[Any]], names: tuple[str, str], where: str
+) -> tuple[NDArray[Any], NDArray[Any]]:
+    for name in names:
+        if name not in arrays:
+            raise MemoryFormatError(f"{where}: array {name!r} is missing, got {sorted(arrays)}; {AGAIN}")
+    return arrays[names[0]], arrays[names[1]]
 
 
 def read_bytes(path: Path, limit: int) -> bytes:
