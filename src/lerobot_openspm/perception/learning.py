@@ -34,7 +34,7 @@ from lerobot_openspm.perception.patch_learning import learn_patches
 from lerobot_openspm.perception.shape import Posed, Votes
 from lerobot_openspm.perception.sightings import segmented
 from lerobot_openspm.perception.types import Scene, Segmenter
-from lerobot_openspm.perception.yaw import yaw_range
+from lerobot_openspm.perception.yaw import search_range, yaw_range
 
 log = logging.getLogger(__name__)
 
@@ -361,7 +361,7 @@ def _model(
     yaws = (
         np.array([se3.yaw_of(scene.T_world_obj) for scene in posed])[scores > 0.8 * np.median(scores)] + turn
     )
-    yaw_centre, halfwidth = yaw_range(yaws, period)
+    yaw_centre, halfwidth = search_range(yaws, period)
     height = float(np.median([scene.T_world_obj[2, 3] for scene in posed])) + bottom
     return ObjectModel(
         name, log_odds, points.astype(np.float32), cloud.spacing, height, period, yaw_centre, halfwidth,
