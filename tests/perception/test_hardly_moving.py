@@ -32,13 +32,8 @@ def scenes(sides_m: dict[str, float], touches: int, places: int = 1) -> list[Sce
 
 
 def test_a_few_scenes_that_agree_are_not_believed_where_everything_else_moves():
-    sides_m: dict[str, float] = {
-        "cabinet": NEAR_M,
-        "bowl": FAR_M,
-        "plate": FAR_M,
-        "box": FAR_M,
-        "rack": FAR_M,
-    }
+    others: dict[str, float] = dict.fromkeys(["bowl", "plate", "box", "rack"], FAR_M)
+    sides_m = {"cabinet": NEAR_M, **others}
     few = hardly_moving(list(sides_m), scenes(sides_m, touches=2))
     assert max(few.values()) == few["cabinet"] < 0.5
     many = hardly_moving(list(sides_m), scenes(sides_m, touches=10))

@@ -72,7 +72,7 @@ def learn_objects(
     shape_source: Shape = "demonstrations",
     shapes: ShapeBackend | None = None,
 ) -> dict[str, KnownObject]:
-    """Learn every object that some scene hints at.
+    """Learn every object that some scene hints at and that is not known.
 
     Args:
         scenes: First frames and hints of the demonstrations of all tasks.
@@ -91,14 +91,15 @@ def learn_objects(
     Raises:
         DatasetError: No scene has a hint.
     """
-    names = sorted({hint.name for scene in scenes for hint in scene.hints})
-    if not names:
+    hints = [hint for scene in scenes for hint in scene.hints]
+    names = sorted({hint.name for hint in hints} - {model.name for model in known})
+    if not hints:
         raise DatasetError(
             "no demonstration shows a grasp, contact or release; perception has nothing to learn from"
         )
     if segmenter is not None and shape_source != "demonstrations":
         return {**learn_boxes(names, scenes, segmenter, shapes)}
-    floor = min(float(hint.point_world[2]) for scene in scenes for hint in scene.hints) - 0.02
+    floor = min([float(hint.point_world[2]) - 0.02 for hint in hints] + [model.height for model in known])
     if segmenter is not None:
         return _learn_masked(names, scenes, floor, segmenter)
     models: dict[str, KnownObject] = {**learn_patches(names, scenes, known)}
