@@ -210,6 +210,10 @@ def test_sub_tasks_come_in_the_order_of_execution(instruction):
             [SubTask("close", "cabinet", "bottom drawer"), OPEN_TOP],
         ),
         (
+            "put the moka pot on the stove and turn it on",
+            [put("moka pot", "on", "stove"), SubTask("turn on", "stove")],
+        ),
+        (
             "put the bowl in the top drawer of the cabinet and push the drawer shut",
             [IN_TOP, SubTask("close", "cabinet", "top drawer")],
         ),
