@@ -1,7 +1,7 @@
 from dataclasses import replace
 
 import pytest
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 
 from lerobot_openspm.envs.tasks import TASKS
@@ -305,6 +305,7 @@ WORDS = (
 
 
 @given(st.lists(st.sampled_from(WORDS), max_size=14))
+@example(["it", "next", "put"])
 def test_any_words_are_read_or_refused(words):
     try:
         found = parse_instruction(" ".join(words))
@@ -312,3 +313,4 @@ def test_any_words_are_read_or_refused(words):
         return
     assert found
     assert all(sub_task.operation in VERBS and sub_task.target for sub_task in found)
+    assert all(bool(sub_task.relation) == bool(sub_task.landmark) for sub_task in found)
