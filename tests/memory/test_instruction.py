@@ -1,7 +1,7 @@
 from dataclasses import replace
 
 import pytest
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 
 from lerobot_openspm.envs.tasks import TASKS
@@ -210,6 +210,10 @@ def test_sub_tasks_come_in_the_order_of_execution(instruction):
             [SubTask("close", "cabinet", "bottom drawer"), OPEN_TOP],
         ),
         (
+            "put the moka pot on the stove and turn it on",
+            [put("moka pot", "on", "stove"), SubTask("turn on", "stove")],
+        ),
+        (
             "put the bowl in the top drawer of the cabinet and push the drawer shut",
             [IN_TOP, SubTask("close", "cabinet", "top drawer")],
         ),
@@ -301,6 +305,7 @@ WORDS = (
 
 
 @given(st.lists(st.sampled_from(WORDS), max_size=14))
+@example(["it", "next", "put"])
 def test_any_words_are_read_or_refused(words):
     try:
         found = parse_instruction(" ".join(words))
@@ -308,3 +313,4 @@ def test_any_words_are_read_or_refused(words):
         return
     assert found
     assert all(sub_task.operation in VERBS and sub_task.target for sub_task in found)
+    assert all(bool(sub_task.relation) == bool(sub_task.landmark) for sub_task in found)

@@ -166,6 +166,9 @@ def test_only_what_means_the_same_as_the_best_is_a_candidate():
     assert [item[0] for item in semantic_candidates("put the black bowl on the plate", [black, white])] == [
         black
     ]
+    red = entry("pick up the red bowl on the stove and put it on the plate")
+    # Where nothing is said of a stove the white one is meant, and the red one is none of it.
+    assert [item[0] for item in semantic_candidates("put the bowl on the plate", [red, white])] == [white]
     with pytest.raises(InstructionError, match="did you mean 'put the bowl on the plate'"):
         semantic_candidates("put the blue bowl on the plate", [bowl])
 

@@ -66,8 +66,8 @@ def read_clause(clause: Clause, before: Said | None) -> Said:
         return said
     if clause.is_seen or _is_statement(words):
         return _topic(words)
-    known = ", ".join(v.VERB_PHRASES)
-    raise InstructionError(f"has no verb I know in {' '.join(words)!r} ({known})")
+    known = ", ".join(v.USUAL_VERBS)
+    raise InstructionError(f"has no verb I know in {' '.join(words)!r} (such as {known})")
 
 
 def _verb_first(words: Words) -> Words:

@@ -65,8 +65,10 @@ def _parse(instruction: str) -> tuple[SubTask, ...]:
         said[-1] = replace(said[-2], targets=said[-1].targets)
     if not any(one.operation for one in said):
         raise InstructionError("states something; say what to do")
-    meant = _resolve_all(clauses, said)
-    return _merged(sorted(meant, key=lambda one: one.step))
+    sub_tasks = _merged(sorted(_resolve_all(clauses, said), key=lambda one: one.step))
+    if nameless := [s.operation for s in sub_tasks if not s.target or bool(s.relation) != bool(s.landmark)]:
+        raise InstructionError(f"names no object after {nameless[0]!r}")
+    return sub_tasks
 
 
 def _resolve_all(clauses: Sequence[Clause], said: Sequence[Said]) -> list[_Meant]:

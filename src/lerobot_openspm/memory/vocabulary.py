@@ -299,9 +299,8 @@ def _lexicon() -> dict[Form, dict[tuple[str, ...], Verb]]:
 
 _LEXICON = _lexicon()
 _LONGEST = 4
-VERB_PHRASES = tuple(
-    sorted({phrase for operation, verbs in VERBS.items() for phrase in verbs if operation != "push"})
-)
+# What errors name: one verb for each operation.
+USUAL_VERBS = ("pick up", "put", "open", "close", "push", "turn on", "turn off")
 
 
 def match_verb(words: tuple[str, ...], at: int, form: Form = "base") -> Verb | None:
