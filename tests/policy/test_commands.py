@@ -35,14 +35,13 @@ def evaluate(checkpoint: Path, output: Path, *options: str) -> tuple[dict, list[
 
 
 def test_training_leaves_a_whole_checkpoint(checkpoint: Path):
-    names = {path.name for path in checkpoint.iterdir()}
-    assert names >= {
+    found = {path.name for path in checkpoint.iterdir()}
+    assert found >= {
         "config.json", "model.safetensors", *names(checkpoint),
         "policy_preprocessor.json", "policy_postprocessor.json", "train_config.json",
     }  # fmt: skip
-    assert not [name for name in names if name.startswith(".") or name.endswith((".pkl", ".bin", ".pt"))]
-    found = sources(checkpoint)
-    assert sorted(found) == [(BOWL, f"local/openspm_tabletop#{i}") for i in (0, 1, 2)] + [
+    assert not [name for name in found if name.startswith(".") or name.endswith((".pkl", ".bin", ".pt"))]
+    assert sorted(sources(checkpoint)) == [(BOWL, f"local/openspm_tabletop#{i}") for i in (0, 1, 2)] + [
         (STOVE, f"local/openspm_tabletop#{i}") for i in (3, 4, 5)
     ]
 
