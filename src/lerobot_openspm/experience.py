@@ -18,6 +18,8 @@ from lerobot_openspm.experience_files import (
     VERSION,
     Arrays,
     Fields,
+    columns_from_arrays,
+    columns_to_arrays,
     file_field,
     lines_from_arrays,
     read_arrays,
@@ -29,6 +31,7 @@ from lerobot_openspm.experience_header import Header, check_layouts, header_from
 from lerobot_openspm.geometry.camera import Camera, load_cameras
 from lerobot_openspm.geometry.layout import VectorLayout
 from lerobot_openspm.memory.bank import EntryBank, anchored_objects, texts_of
+from lerobot_openspm.memory.columns import columns_of
 from lerobot_openspm.memory.entry import MemoryEntry
 from lerobot_openspm.memory.old_versions import entries_from_parts
 from lerobot_openspm.memory.quality import with_outcome
@@ -139,6 +142,7 @@ def save_experience(experience: Experience, directory: Path) -> None:
         fields, own = object_to_parts(model)
         objects.append(fields)
         arrays |= {f"objects.{model.name}.{key}": value for key, value in own.items()}
+    arrays |= columns_to_arrays([columns_of(experience.entries), columns_of(experience.superseded)])
     header = header_to_fields(header_of(experience, objects))
     texts = chain(texts_of(experience.entries), texts_of(experience.superseded))
     write_files(directory, header, texts, arrays, experience.cameras)
@@ -207,7 +211,9 @@ def _entries_of(
 ) -> tuple[Sequence[MemoryEntry], Sequence[MemoryEntry]]:
     """The entries, and those that were superseded."""
     file = directory / file_field(fields, "entries", directory)["file"]
-    bank = EntryBank(file, lines_from_arrays(arrays, str(file)), frozenset(header.anchored))
+    lines = lines_from_arrays(arrays, str(file))
+    columns = columns_from_arrays(arrays, len(lines.ends), str(file))
+    bank = EntryBank(file, lines, frozenset(header.anchored), columns=columns)
     if header.n_entries > len(bank):
         raise MemoryFormatError(
             f"{directory / MEMORY_JSON}: 'n_entries' is {header.n_entries}, but {file.name} holds {len(bank)}"

@@ -9,7 +9,7 @@ from __future__ import annotations
 import hashlib
 import json
 import re
-from collections.abc import Generator, Iterable, Mapping
+from collections.abc import Generator, Iterable, Mapping, Sequence
 from contextlib import contextmanager, nullcontext, suppress
 from pathlib import Path
 from typing import Any
@@ -24,6 +24,7 @@ from lerobot_openspm.errors import CalibrationError, MemoryFormatError
 from lerobot_openspm.files import locked, rename, write_beside, written
 from lerobot_openspm.geometry.camera import Camera, cameras_from_dict, cameras_to_dict, load_cameras
 from lerobot_openspm.memory.bank import Lines, write_texts
+from lerobot_openspm.memory.columns import Columns
 from lerobot_openspm.memory.strict_json import loads
 
 # Version 2: objects known by patches. Version 3: key poses with the axis of their constraint. Version 4:
@@ -35,6 +36,8 @@ OLD_ARRAYS = "memory.safetensors"
 ENTRIES, ARRAYS, CAMERAS = "memory.entries-{}.json", "memory.arrays-{}.safetensors", "memory.cameras-{}.json"
 DATA_NAME = re.compile(r"memory\.(entries-[0-9a-f]{16}\.json|arrays-[0-9a-f]{16}\.safetensors)")
 LEFTOVER = re.compile(rf"{DATA_NAME.pattern}|memory\.cameras-[0-9a-f]{{16}}\.json|\.memory\..*\.partial")
+# By what a large memory is searched.
+KEY_DIGESTS, QUALITIES = "entries.keys", "entries.qualities"
 LOCK = ".memory.lock"
 MAX_JSON_BYTES, MAX_ARRAY_BYTES = 512_000_000, 4_000_000_000
 AGAIN = "train or pull it again"
@@ -224,6 +227,31 @@ def lines_from_arrays(arrays: Mapping[str, NDArray[Any]], where: str) -> Lines:
     lines = Lines(arrays["entries.ends"], arrays["entries.digests"])
     lines.check(where)
     return lines
+
+
+def columns_to_arrays(columns: Sequence[Columns]) -> Arrays:
+    """The arrays that say what keys the entries have, those of the parts one after another."""
+    return {
+        KEY_DIGESTS: np.concatenate([part.digests for part in columns]),
+        QUALITIES: np.concatenate([part.qualities for part in columns]),
+    }
+
+
+def columns_from_arrays(arrays: Mapping[str, NDArray[Any]], n: int, where: str) -> Columns | None:
+    """Inverse of :func:`columns_to_arrays`; None where there are none.
+
+    Raises:
+        MemoryFormatError: They are of another type, or not as many as there are entries.
+    """
+    if KEY_DIGESTS not in arrays or QUALITIES not in arrays:
+        return None
+    for name, dtype in ((KEY_DIGESTS, np.uint64), (QUALITIES, np.float64)):
+        if arrays[name].dtype != dtype or arrays[name].shape != (n,):
+            raise MemoryFormatError(
+                f"{where}: array {name!r} is {arrays[name].dtype} of {arrays[name].shape}, expected "
+                f"{np.dtype(dtype)} of {(n,)}; {AGAIN}"
+            )
+    return Columns(arrays[KEY_DIGESTS], arrays[QUALITIES])
 
 
 def read_bytes(path: Path, limit: int) -> bytes:

@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lerobot_openspm.errors import MemoryFormatError
+from lerobot_openspm.memory.columns import Columns
 from lerobot_openspm.memory.entry import MemoryEntry
 from lerobot_openspm.memory.fields import MALFORMED
 from lerobot_openspm.memory.store import entry_from_fields, entry_to_fields
@@ -72,7 +73,14 @@ class EntryBank(Sequence[MemoryEntry]):
     stays readable. Reading raises MemoryFormatError for a line that is not what was written.
     """
 
-    def __init__(self, path: Path, lines: Lines, objects: frozenset[str], rows: range | None = None):
+    def __init__(
+        self,
+        path: Path,
+        lines: Lines,
+        objects: frozenset[str],
+        rows: range | None = None,
+        columns: Columns | None = None,
+    ):
         """Open a file.
 
         Args:
@@ -80,18 +88,22 @@ class EntryBank(Sequence[MemoryEntry]):
             lines: Where its lines are.
             objects: The objects that its entries have key poses at.
             rows: Which of them this is about; all if not given.
+            columns: Digests of keys and qualities of all its entries, where they were kept.
 
         Raises:
             MemoryFormatError: The file is missing, of another size, or the lines cannot be.
         """
         self._path, self._lines, self.objects = path, lines, objects
         self._rows = range(len(lines.ends)) if rows is None else rows
+        self._columns = columns
         lines.check(str(path))
         self._bytes = _mapped(path, lines.n_bytes)
         self._entry = lru_cache(KEPT_ENTRIES)(self._read)
 
-    def __reduce__(self) -> tuple[type[EntryBank], tuple[Path, Lines, frozenset[str], range]]:
-        return type(self), (self._path, self._lines, self.objects, self._rows)
+    def __reduce__(
+        self,
+    ) -> tuple[type[EntryBank], tuple[Path, Lines, frozenset[str], range, Columns | None]]:
+        return type(self), (self._path, self._lines, self.objects, self._rows, self._columns)
 
     def __len__(self) -> int:
         return len(self._rows)
@@ -102,12 +114,19 @@ class EntryBank(Sequence[MemoryEntry]):
     def __getitem__(self, index: slice) -> EntryBank: ...
     def __getitem__(self, index: int | slice) -> MemoryEntry | EntryBank:
         if isinstance(index, slice):
-            return EntryBank(self._path, self._lines, self.objects, self._rows[index])
+            return EntryBank(self._path, self._lines, self.objects, self._rows[index], self._columns)
         return self._entry(self._rows[index])
 
     def __iter__(self) -> Iterator[MemoryEntry]:
         # Past the cache: going through all entries must neither hold them all nor push out those in use.
         return (self._read(row) for row in self._rows)
+
+    def columns(self) -> Columns | None:
+        """See :class:`~lerobot_openspm.memory.columns.HasColumns`."""
+        if self._columns is None:
+            return None
+        rows = np.asarray(self._rows, np.int64)
+        return Columns(self._columns.digests[rows], self._columns.qualities[rows])
 
     def texts(self) -> Iterator[bytes]:
         """The entries' JSON, unread but known to be what was written."""
