@@ -6,7 +6,7 @@ import json
 import numpy as np
 from safetensors.numpy import load, save
 
-from lerobot_openspm.experience_files import lines_to_arrays, read_header, sealed
+from lerobot_openspm.experience_files import KEY_DIGESTS, QUALITIES, lines_to_arrays, read_header, sealed
 from lerobot_openspm.memory.bank import DIGEST_BYTES, HEAD, TAIL, Lines
 
 
@@ -60,4 +60,10 @@ def write_texts(directory, texts):
     digests = [hashlib.blake2b(text, digest_size=DIGEST_BYTES).digest() for text in texts]
     lines = Lines(np.array(ends), np.frombuffer(b"".join(digests), np.uint8).reshape(-1, DIGEST_BYTES))
     (directory / name_of(directory, "entries")).write_bytes(HEAD + b",\n".join(texts) + TAIL)
-    edit_arrays(directory, lambda arrays: arrays.update(lines_to_arrays(lines)))
+
+    def change(arrays):
+        arrays.update(lines_to_arrays(lines))
+        for name in (KEY_DIGESTS, QUALITIES):  # what was kept of the entries before
+            arrays.pop(name, None)
+
+    edit_arrays(directory, change)
