@@ -7,8 +7,13 @@ from pathlib import Path
 
 import pytest
 from filelock import FileLock
+from hypothesis import settings
 from tests.hub.loopback_hub import LoopbackHub
 from tests.policy.lerobot_commands import lerobot_train, pretrained, training_options
+
+# A busy machine is no failure.
+settings.register_profile("openspm", deadline=None)
+settings.load_profile("openspm")
 
 
 @pytest.fixture

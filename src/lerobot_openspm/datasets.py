@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Generator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -46,7 +46,7 @@ def open_dataset(dataset_meta: Any) -> LeRobotDataset:
 
 
 @contextmanager
-def _one_line(repo_id: str, root: object) -> Iterator[None]:
+def _one_line(repo_id: str, root: object) -> Generator[None]:
     """Say in one line that a dataset cannot be read: LeRobot asks the Hub for whatever it misses here."""
     try:
         yield

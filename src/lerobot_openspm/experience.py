@@ -111,6 +111,15 @@ class Experience:
             superseded=(*self.superseded, *replaced),
         )
 
+    def restored(self, entry: MemoryEntry) -> Experience:
+        """This experience with a superseded entry in use again, in the place of what came after it."""
+        task = (entry.source, entry.language)
+        replaced = [e for e in self.entries if (e.source, e.language) == task]
+        old = [e for e in self.superseded if e is not entry]
+        version = max(e.version for e in (entry, *replaced, *old) if (e.source, e.language) == task) + 1
+        kept = [e for e in self.entries if (e.source, e.language) != task]
+        return replace(self, entries=(*kept, replace(entry, version=version)), superseded=(*old, *replaced))
+
     def with_outcomes(self, outcomes: Iterable[tuple[MemoryEntry, bool]]) -> Experience:
         """This experience after some of its entries were acted by, each with whether it succeeded."""
         entries = list(self.entries)
@@ -142,9 +151,10 @@ def save_experience(experience: Experience, directory: Path) -> None:
         fields, own = object_to_parts(model)
         objects.append(fields)
         arrays |= {f"objects.{model.name}.{key}": value for key, value in own.items()}
-    arrays |= columns_to_arrays([columns_of(experience.entries), columns_of(experience.superseded)])
+    groups = (experience.entries, experience.superseded)
+    arrays |= columns_to_arrays([columns_of(group) for group in groups])
     header = header_to_fields(header_of(experience, objects))
-    texts = chain(texts_of(experience.entries), texts_of(experience.superseded))
+    texts = chain.from_iterable(map(texts_of, groups))
     write_files(directory, header, texts, arrays, experience.cameras)
 
 
@@ -211,9 +221,8 @@ def _entries_of(
 ) -> tuple[Sequence[MemoryEntry], Sequence[MemoryEntry]]:
     """The entries, and those that were superseded."""
     file = directory / file_field(fields, "entries", directory)["file"]
-    lines = lines_from_arrays(arrays, str(file))
-    columns = columns_from_arrays(arrays, len(lines.ends), str(file))
-    bank = EntryBank(file, lines, frozenset(header.anchored), columns=columns)
+    lines, columns = lines_from_arrays(arrays, str(file)), columns_from_arrays(arrays, str(file))
+    bank = EntryBank(file, lines, columns, frozenset(header.anchored))
     if header.n_entries > len(bank):
         raise MemoryFormatError(
             f"{directory / MEMORY_JSON}: 'n_entries' is {header.n_entries}, but {file.name} holds {len(bank)}"

@@ -36,8 +36,6 @@ OLD_ARRAYS = "memory.safetensors"
 ENTRIES, ARRAYS, CAMERAS = "memory.entries-{}.json", "memory.arrays-{}.safetensors", "memory.cameras-{}.json"
 DATA_NAME = re.compile(r"memory\.(entries-[0-9a-f]{16}\.json|arrays-[0-9a-f]{16}\.safetensors)")
 LEFTOVER = re.compile(rf"{DATA_NAME.pattern}|memory\.cameras-[0-9a-f]{{16}}\.json|\.memory\..*\.partial")
-# By what a large memory is searched.
-KEY_DIGESTS, QUALITIES = "entries.keys", "entries.qualities"
 LOCK = ".memory.lock"
 MAX_JSON_BYTES, MAX_ARRAY_BYTES = 512_000_000, 4_000_000_000
 AGAIN = "train or pull it again"
@@ -221,37 +219,31 @@ def lines_to_arrays(lines: Lines) -> Arrays:
 
 def lines_from_arrays(arrays: Mapping[str, NDArray[Any]], where: str) -> Lines:
     """Inverse of :func:`lines_to_arrays`. Raises MemoryFormatError naming file and array."""
-    for name in ("entries.ends", "entries.digests"):
-        if name not in arrays:
-            raise MemoryFormatError(f"{where}: array {name!r} is missing, got {sorted(arrays)}; {AGAIN}")
-    lines = Lines(arrays["entries.ends"], arrays["entries.digests"])
+    lines = Lines(*_named(arrays, ("entries.ends", "entries.digests"), where))
     lines.check(where)
     return lines
 
 
-def columns_to_arrays(columns: Sequence[Columns]) -> Arrays:
-    """The arrays that say what keys the entries have, those of the parts one after another."""
+def columns_to_arrays(groups: Sequence[Columns]) -> Arrays:
+    """The arrays that entries are found by, of several groups one after the other."""
     return {
-        KEY_DIGESTS: np.concatenate([part.digests for part in columns]),
-        QUALITIES: np.concatenate([part.qualities for part in columns]),
+        "entries.keys": np.concatenate([columns.digests for columns in groups]),
+        "entries.qualities": np.concatenate([columns.qualities for columns in groups]),
     }
 
 
-def columns_from_arrays(arrays: Mapping[str, NDArray[Any]], n: int, where: str) -> Columns | None:
-    """Inverse of :func:`columns_to_arrays`; None where there are none.
+def columns_from_arrays(arrays: Mapping[str, NDArray[Any]], where: str) -> Columns:
+    """Inverse of :func:`columns_to_arrays`. Raises MemoryFormatError naming file and array."""
+    return Columns(*_named(arrays, ("entries.keys", "entries.qualities"), where))
 
-    Raises:
-        MemoryFormatError: They are of another type, or not as many as there are entries.
-    """
-    if KEY_DIGESTS not in arrays or QUALITIES not in arrays:
-        return None
-    for name, dtype in ((KEY_DIGESTS, np.uint64), (QUALITIES, np.float64)):
-        if arrays[name].dtype != dtype or arrays[name].shape != (n,):
-            raise MemoryFormatError(
-                f"{where}: array {name!r} is {arrays[name].dtype} of {arrays[name].shape}, expected "
-                f"{np.dtype(dtype)} of {(n,)}; {AGAIN}"
-            )
-    return Columns(arrays[KEY_DIGESTS], arrays[QUALITIES])
+
+def _named(
+    arrays: Mapping[str, NDArray[Any]], names: tuple[str, str], where: str
+) -> tuple[NDArray[Any], NDArray[Any]]:
+    for name in names:
+        if name not in arrays:
+            raise MemoryFormatError(f"{where}: array {name!r} is missing, got {sorted(arrays)}; {AGAIN}")
+    return arrays[names[0]], arrays[names[1]]
 
 
 def read_bytes(path: Path, limit: int) -> bytes:

@@ -278,7 +278,7 @@ class OpenSPMPolicy(PreTrainedPolicy):
         experience = self.require_experience()  # before anything is written
         super()._save_pretrained(save_directory, state_dict=state_dict)
         # What exists on one machine alone stays there; the calibration travels as a file of the checkpoint.
-        here = dict.fromkeys(ON_ONE_MACHINE)
+        here: dict[str, None] = dict.fromkeys(ON_ONE_MACHINE)
         if self.config.name_embeddings and Path(self.config.name_embeddings).is_dir():
             here["name_embeddings"] = None
         replace(self.config, **here)._save_pretrained(Path(save_directory))

@@ -6,6 +6,8 @@ from pathlib import Path
 import pytest
 from tests.cli.conftest import Openspm
 
+from lerobot_openspm.experience_files import data_files
+
 BOWL = "put the bowl on the plate"
 
 
@@ -61,8 +63,8 @@ def test_what_the_policy_refuses_says_why_and_what_is_nearest(
 
 
 def test_a_mined_memory_can_be_searched_too(openspm: Openspm, checkpoint: Path, tmp_path: Path):
-    for file in (*checkpoint.glob("memory*"), checkpoint / "cameras.json"):
-        (tmp_path / file.name).write_bytes(file.read_bytes())
+    for file in ("memory.json", "cameras.json", *data_files(checkpoint)):
+        (tmp_path / file).write_bytes((checkpoint / file).read_bytes())
     assert search(openspm, BOWL, f"--path={tmp_path}") == search(openspm, BOWL, f"--path={checkpoint}")
 
 

@@ -13,7 +13,7 @@ PLACES = st.lists(st.tuples(st.floats(-0.5, 0.5), st.floats(-0.5, 0.5)), min_siz
 AMONG = ["left", "right", "front", "back"]
 RELATIONS = [
     Reference("between", ("plate", "cup")),
-    *(Reference(name, ("plate",)) for name in ("next to", "on", "in", "under", *AMONG)),
+    *(Reference(name, ("plate",)) for name in ("next to", "center", "on", "in", "under", *AMONG)),
     *(Reference(name) for name in ("middle", *AMONG)),
 ]
 MARKS = {"plate": (0.1, 0.2), "cup": (-0.1, -0.1)}

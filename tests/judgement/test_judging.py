@@ -1,5 +1,6 @@
 """Mining a dataset with each source of evidence; whatever a server does, mining goes on."""
 
+import json
 import logging
 import shutil
 import time
@@ -14,13 +15,16 @@ from lerobot.annotations.steerable_pipeline.reader import iter_episodes
 from lerobot.annotations.steerable_pipeline.staging import EpisodeStaging
 from lerobot.annotations.steerable_pipeline.writer import LanguageColumnsWriter
 from lerobot.datasets import LeRobotDatasetMetadata
+from lerobot.policies.factory import make_policy
 from tests.judgement.loopback_chat import LoopbackChat, Reply, question_of, say
 from tests.policy.lerobot_commands import CALIBRATION
 
 from lerobot_openspm.configuration_openspm import OpenSPMConfig
 from lerobot_openspm.errors import DatasetError, PerceptionError
+from lerobot_openspm.experience import load_experience
 from lerobot_openspm.judgement.judging import MAX_FAILURES
 from lerobot_openspm.judgement.structure import check_sequence
+from lerobot_openspm.memory.entry import PHASES
 from lerobot_openspm.mining.dataset import Demonstrations
 from lerobot_openspm.mining.key_poses import KeyPose
 from lerobot_openspm.mining.mine import MinedEpisode, mine_key_poses
@@ -39,7 +43,10 @@ def unsure(pose: KeyPose) -> KeyPose:
 
 
 class Mined:
-    """The key poses of a dataset before they are judged, some of them less sure than they are."""
+    """Key poses of the first four episodes before they are judged, some of them less sure than they are.
+
+    Pictures are decoded once, however often they are asked about.
+    """
 
     def __init__(self, root: Path) -> None:
         self.meta = LeRobotDatasetMetadata(NAME, root=root)
@@ -49,10 +56,18 @@ class Mined:
             replace(
                 item, key_poses=tuple(replace(p, confidence=min(p.confidence, 0.7)) for p in item.key_poses)
             )
-            for item in mine_key_poses(self.demonstrations, self.robot).mined
+            for item in mine_key_poses(self.demonstrations, self.robot, range(4)).mined
         )
+        decode, decoded = self.demonstrations.pictures, {}
 
-    def judged(self, first: int = 6, **options) -> tuple[MinedEpisode, ...]:
+        def pictures(episode, frames, n_cameras):
+            if episode.index not in decoded:
+                decoded[episode.index] = decode(episode, frames, n_cameras)
+            return decoded[episode.index]
+
+        self.demonstrations.pictures = pictures
+
+    def judged(self, first: int = 4, **options) -> tuple[MinedEpisode, ...]:
         return judged(self.demonstrations, self.episodes[:first], self.robot, config(**options))
 
 
@@ -104,17 +119,17 @@ def test_agreement_makes_every_key_pose_surer(mined: Mined, asked, caplog: pytes
     assert all(
         after > before for before, after in zip(confidences(mined.episodes), confidences(found), strict=True)
     )
-    assert len(chat.requests) == len(mined.episodes) == 6
+    assert len(chat.requests) == len(mined.episodes) == 4
     pictures = [p for p in chat.requests[0]["messages"][0]["content"] if p["type"] == "image_url"]
     assert len(pictures) == 3
-    assert "openai tiny-vl v1 judged the phases of 6 of 6 episodes" in caplog.text
+    assert "openai tiny-vl v1 judged the phases of 4 of 4 episodes" in caplog.text
 
 
 def test_nothing_is_asked_twice(mined: Mined, asked):
     with LoopbackChat(knowing(mined)).running() as chat:
         first = asked(chat)
         second = asked(chat)
-    assert len(chat.requests) == 6
+    assert len(chat.requests) == 4
     assert confidences(first) == confidences(second)
     assert confidences(asked(chat)) == confidences(first), "the server is gone now"
 
@@ -173,7 +188,7 @@ def test_a_server_that_fails_now_and_then_is_asked_on(mined: Mined, asked, caplo
 
     with LoopbackChat(answer).running() as chat:
         found = asked(chat)
-    assert [after == before for before, after in zip(mined.episodes, found, strict=True)] == [True, False] * 3
+    assert [after == before for before, after in zip(mined.episodes, found, strict=True)] == [True, False] * 2
     assert "is asked no more" not in caplog.text
 
 
@@ -185,11 +200,13 @@ def test_qwen3vl_judges_in_this_process(mined: Mined, tiny_qwen3vl_folder: Path,
         phase_judge_confidence=0.0,
         phase_judge_cache=str(tmp_path),
     )
-    for names in phases(found):
-        check_sequence(names)
-    assert len(list(tmp_path.rglob("*.json"))) == len(found) == 1
-    assert all(0 <= c <= 1 for c in confidences(found))
-    assert confidences(found) != confidences(mined.episodes[:1])
+    (kept,) = (json.loads(path.read_text()) for path in tmp_path.rglob("*.json"))
+    assert kept["judge"] == f"qwen3vl {tiny_qwen3vl_folder} v1"
+    assert len(kept["answers"]) == len(found[0].key_poses)
+    assert {answer["phase"] for answer in kept["answers"]} <= set(PHASES)
+    # Random weights are sure of nothing, so there is nothing that they could change.
+    assert all(answer["confidence"] < 0.5 for answer in kept["answers"])
+    assert found == mined.episodes[:1]
 
 
 def test_weights_that_are_not_there_are_an_error(mined: Mined, tmp_path: Path):
@@ -199,20 +216,15 @@ def test_weights_that_are_not_there_are_an_error(mined: Mined, tmp_path: Path):
 
 @pytest.fixture(scope="module")
 def annotated(make_once: Callable[..., Path], tiny_dataset: Path, mined: Mined) -> Path:
-    """The tiny dataset with sub-tasks in all episodes but the last, written by LeRobot itself."""
+    """The tiny dataset with sub-tasks in its first three episodes, written by LeRobot itself."""
     frames = {item.episode.index: {p.phase: p.frame for p in item.key_poses} for item in mined.episodes}
 
     def annotate(root: Path) -> None:
         shutil.copytree(tiny_dataset, root)
         records, staging = list(iter_episodes(root)), root / ".annotate_staging"
-        for record in records[:-1]:
-            at = frames[record.episode_index]
-            second = at.get("lift", at["grasp"])
-            words = "put the bowl on the plate" if record.episode_index < 3 else "turn the knob"
-            rows = [
-                (0, "pick up the bowl" if record.episode_index < 3 else "grasp the knob"),
-                (second, words),
-            ]
+        for record in records[:3]:
+            begins = frames[record.episode_index]["lift"]
+            rows = [(0, "pick up the bowl"), (begins, "put the bowl on the plate")]
             EpisodeStaging(staging, record.episode_index).write(
                 "plan",
                 [
@@ -233,13 +245,13 @@ def test_annotations_are_evidence(annotated: Path):
     with_rows = Mined(annotated)
     rows = with_rows.demonstrations.subtask_rows(0)
     assert [words for _, words in rows] == ["pick up the bowl", "put the bowl on the plate"]
-    assert with_rows.demonstrations.subtask_rows(5) == []
+    assert with_rows.demonstrations.subtask_rows(3) == []
     found = with_rows.judged(phase_judge="annotations")
     assert phases(found) == phases(with_rows.episodes)
     for before, after in zip(with_rows.episodes[:3], found[:3], strict=True):
         grown = [b.confidence < a.confidence for b, a in zip(before.key_poses, after.key_poses, strict=True)]
         assert sum(grown) >= 0.8 * len(grown)
-    assert found[5] == with_rows.episodes[5]
+    assert found[3] == with_rows.episodes[3]
 
 
 def test_a_dataset_without_annotations_is_an_error_with_the_command(mined: Mined):
@@ -247,23 +259,24 @@ def test_a_dataset_without_annotations_is_an_error_with_the_command(mined: Mined
         mined.judged(phase_judge="annotations")
 
 
-def test_an_experience_keeps_what_was_judged(mined: Mined, tmp_path: Path):
-    """From the configuration to the memory, through everything in between."""
+def test_a_checkpoint_holds_what_was_judged_and_not_where_it_was_asked(mined: Mined, tmp_path: Path):
+    """From the options to the memory on disk, through everything in between."""
+    chosen = {"memory_episodes": [0, 1], "pretrained_path": None}
+    options = {"phase_judge": "openai", "phase_judge_model_id": "tiny-vl", **chosen}
     with LoopbackChat(knowing(mined, 0.9)).running() as chat:
-        judged_by = {"phase_judge": "openai", "phase_judge_model_id": "tiny-vl", "memory_episodes": [0, 1]}
-        places = {"phase_judge_api_base": chat.api_base, "phase_judge_cache": str(tmp_path)}
-        plain = mine_experience(mined.meta, config(memory_episodes=[0, 1]))
-        sure = mine_experience(mined.meta, config(**judged_by, **places))
+        places = {"phase_judge_api_base": chat.api_base, "phase_judge_cache": str(tmp_path / "cache")}
+        policy = make_policy(config(**options, **places), ds_meta=mined.meta)
+    policy.save_pretrained(tmp_path / "checkpoint")
     assert len(chat.requests) == 2
+
+    saved = json.loads((tmp_path / "checkpoint/config.json").read_text())
+    assert (saved["phase_judge"], saved["phase_judge_model_id"]) == ("openai", "tiny-vl")
+    assert (saved["phase_judge_api_base"], saved["phase_judge_cache"]) == (None, None)
+    plain = mine_experience(mined.meta, config(**chosen))
+    sure = load_experience(tmp_path / "checkpoint")
     for before, after in zip(plain.entries, sure.entries, strict=True):
         assert before.key == after.key
-        lower = [
-            p for p, q in zip(before.key_poses, after.key_poses, strict=True) if q.confidence < p.confidence
-        ]
-        higher = [
-            p for p, q in zip(before.key_poses, after.key_poses, strict=True) if q.confidence > p.confidence
-        ]
-        assert higher
-        assert not lower
-        assert all(p.confidence < 1 for p in higher)
-        np.testing.assert_array_equal(before.key_poses[0].T_obj_ee, after.key_poses[0].T_obj_ee)
+        pairs = list(zip(before.key_poses, after.key_poses, strict=True))
+        assert any(p.confidence < q.confidence for p, q in pairs)
+        assert all(p.confidence <= q.confidence for p, q in pairs)
+        assert all(np.array_equal(p.T_obj_ee, q.T_obj_ee) for p, q in pairs)

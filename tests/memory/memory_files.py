@@ -6,7 +6,7 @@ import json
 import numpy as np
 from safetensors.numpy import load, save
 
-from lerobot_openspm.experience_files import KEY_DIGESTS, QUALITIES, lines_to_arrays, read_header, sealed
+from lerobot_openspm.experience_files import lines_to_arrays, read_header, sealed
 from lerobot_openspm.memory.bank import DIGEST_BYTES, HEAD, TAIL, Lines
 
 
@@ -60,10 +60,16 @@ def write_texts(directory, texts):
     digests = [hashlib.blake2b(text, digest_size=DIGEST_BYTES).digest() for text in texts]
     lines = Lines(np.array(ends), np.frombuffer(b"".join(digests), np.uint8).reshape(-1, DIGEST_BYTES))
     (directory / name_of(directory, "entries")).write_bytes(HEAD + b",\n".join(texts) + TAIL)
+    columns = {
+        "entries.keys": np.zeros(len(texts), np.uint64),
+        "entries.qualities": np.array([_quality(text) for text in texts], float),
+    }
+    edit_arrays(directory, lambda arrays: arrays.update(lines_to_arrays(lines) | columns))
 
-    def change(arrays):
-        arrays.update(lines_to_arrays(lines))
-        for name in (KEY_DIGESTS, QUALITIES):  # what was kept of the entries before
-            arrays.pop(name, None)
 
-    edit_arrays(directory, change)
+def _quality(text):
+    """What a text says of the quality, as far as it can be read."""
+    try:
+        return float(json.loads(text)["quality"])
+    except (TypeError, ValueError, KeyError, RecursionError, OverflowError):
+        return 0.0

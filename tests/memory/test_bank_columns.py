@@ -5,11 +5,9 @@ import pickle
 import numpy as np
 import pytest
 from tests.memory.experiences import experience
-from tests.memory.memory_files import edit_arrays
 
 from lerobot_openspm import experience as module
 from lerobot_openspm.bench.synthetic_bank import synthetic_experience
-from lerobot_openspm.errors import MemoryFormatError
 from lerobot_openspm.experience import load_experience, save_experience
 from lerobot_openspm.memory.bank import EntryBank
 from lerobot_openspm.memory.columns import columns_of
@@ -67,23 +65,3 @@ def test_one_entry_of_each_key_is_read_to_index_them(large, monkeypatch):
     expected = IndexedEntries(made.entries).near(asked, semantic_score)
     assert [entry.source for entry in found] == [entry.source for entry in expected]
     assert len(read) < 300
-
-
-@pytest.mark.parametrize("name", ["entries.keys", "entries.qualities"])
-def test_columns_of_another_type_or_number_are_refused(large, name):
-    _, folder = large
-    for change in (lambda column: column.astype(np.float32), lambda column: column[:-1].copy()):
-        save_experience(load_experience(folder), folder)
-        edit_arrays(folder, lambda arrays, change=change: arrays.update({name: change(arrays[name])}))
-        with pytest.raises(MemoryFormatError, match=f"array '{name}' is"):
-            load_experience(folder)
-        save_experience(large[0], folder)
-
-
-def test_without_columns_all_entries_are_read(large):
-    made, folder = large
-    edit_arrays(folder, lambda arrays: arrays.pop("entries.keys"))
-    bank = load_experience(folder).entries
-    assert bank.columns() is None
-    asked = made.entries[150].key.sub_tasks
-    assert IndexedEntries(bank).near(asked, semantic_score)[0].key.sub_tasks == asked

@@ -10,7 +10,7 @@ from lerobot_openspm.envs.tasks import ANY_TASK
 from lerobot_openspm.errors import InstructionError
 from lerobot_openspm.geometry import se3
 from lerobot_openspm.memory.compound import parts, phrase, plan_parts, sub_task_index
-from lerobot_openspm.memory.entry import SubTask
+from lerobot_openspm.memory.entry import Reference, SubTask
 from lerobot_openspm.memory.instruction import parse_instruction
 
 DRAWER = "open the top drawer and put the bowl inside"
@@ -94,6 +94,31 @@ def test_a_phrase_says_the_sub_task(task):
         assert parse_instruction(phrase(sub_task)) == (sub_task,)
 
 
+ON_PLATE = ("put", "bowl", "", "on", "plate")
+
+
+@pytest.mark.parametrize(
+    ("sub_task", "words"),
+    [
+        (SubTask(*ON_PLATE, None, Reference("left")), "put the bowl on the left plate"),
+        (
+            SubTask(*ON_PLATE, Reference("between", ("cup", "ramekin"))),
+            "put the bowl between the cup and the ramekin on the plate",
+        ),
+        (
+            SubTask("pick", "mug", target_where=Reference("front", ("box",))),
+            "pick up the mug in front of the box",
+        ),
+        (
+            SubTask("open", "cabinet", "top drawer", target_where=Reference("left")),
+            "open the top drawer of the left cabinet",
+        ),
+    ],
+)
+def test_a_phrase_says_which_is_meant(sub_task, words):
+    assert phrase(sub_task) == words
+
+
 def languages(instruction, *entries):
     return [[one.entry.language for one in part] for part in plan_parts(instruction, entries)]
 
@@ -135,7 +160,7 @@ def test_a_part_without_experience_is_named():
     with pytest.raises(InstructionError) as caught:
         plan_parts("put the bowl on the plate and put the mug on the plate", [PLATE, drawer_entry()])
     message = str(caught.value)
-    assert "'put the mug on the plate'" in message
+    assert message.startswith("'put the mug on the plate' is a part of")
     assert "open the top drawer of the cabinet; put the bowl in the top drawer of the cabinet" in message
 
 
@@ -145,6 +170,16 @@ def test_a_single_instruction_without_experience_is_refused_as_ever(instruction)
         plan_parts(instruction, [PLATE])
     with pytest.raises(InstructionError):
         plan_parts("put the bowl on the plate and turn on the stove", [])
+
+
+def test_what_may_mean_different_things_is_asked_back_alone_and_as_a_part():
+    cabinet = {"cabinet": np.eye(4)}
+    top = entry("open the top drawer of the cabinet", opened(), cabinet)
+    middle = entry("open the middle drawer of the cabinet", opened(), cabinet)
+    for instruction in ("open the drawer", "open the drawer and turn on the stove"):
+        with pytest.raises(InstructionError, match="did you mean"):
+            plan_parts(instruction, [top, middle, STOVE])
+        assert plan_parts(instruction, [top, STOVE])[0][0].source is top
 
 
 def test_parts_can_be_carried_over_to_a_scene():

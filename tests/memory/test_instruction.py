@@ -1,11 +1,15 @@
 from dataclasses import replace
 
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from lerobot_openspm.envs.tasks import TASKS
 from lerobot_openspm.errors import InstructionError
 from lerobot_openspm.memory.entry import Reference, SubTask
 from lerobot_openspm.memory.instruction import parse_instruction
+from lerobot_openspm.memory.meaning import same_meaning
+from lerobot_openspm.memory.vocabulary import VERBS
 
 TABLETOP = {
     "bowl_on_plate": [SubTask("put", "bowl", "", "on", "plate")],
@@ -119,3 +123,188 @@ def test_what_cannot_be_read_is_repeated_in_the_error(instruction, words):
     with pytest.raises(InstructionError, match=words) as caught:
         parse_instruction(instruction)
     assert repr(instruction) in str(caught.value)
+
+
+def put(target, relation, landmark, part="", where=None, landmark_where=None):
+    return SubTask("put", target, part, relation, landmark, where, landmark_where)
+
+
+OPEN_TOP = SubTask("open", "cabinet", "top drawer")
+IN_TOP = put("bowl", "in", "cabinet", "top drawer")
+
+
+@pytest.mark.parametrize(
+    "instruction",
+    [
+        "Would you mind putting the bowl on the plate?",
+        "Hey robot, could you please carefully set the bowl down on the plate for me? Thanks!",
+        "Don't forget to put the bowl on the plate",
+        "Your task: place the bowl on the plate",
+        "I'd like the bowl on the plate",
+        "the bowl should be placed on the plate",
+        "The bowl goes on the plate.",
+        "Could the bowl go on the plate, please?",
+        "on the plate, put the bowl",
+        "make sure the bowl is on the plate",
+        "The plate is where I want the bowl.",
+        "Bowl onto the plate, please",
+        "The bowl, put it on the plate",
+        "Take the bowl. Place it on the plate.",
+    ],
+)
+def test_a_thing_is_asked_for_in_many_ways(instruction):
+    assert same_meaning(parse_instruction(instruction), [BOWL_ON_PLATE])
+
+
+@pytest.mark.parametrize(
+    "instruction",
+    [
+        "After opening the top drawer, put the bowl inside",
+        "Put the bowl in the top drawer after opening it",
+        "put the bowl in the top drawer once you have opened it",
+        "Before putting the bowl inside, open the top drawer",
+        "Place the bowl in the top drawer, but open it first.",
+        "First open the drawer on top, then drop the bowl in.",
+        "the top drawer needs to be opened and the bowl placed inside",
+        "Open the cabinet's top drawer to put the bowl in",
+        "Open the top drawer. Once it is open, put the bowl in there.",
+        "With the top drawer open, put the bowl in it.",
+    ],
+)
+def test_sub_tasks_come_in_the_order_of_execution(instruction):
+    assert list(parse_instruction(instruction)) == [OPEN_TOP, IN_TOP]
+
+
+@pytest.mark.parametrize(
+    ("instruction", "expected"),
+    [
+        (
+            "put both the soup and the sauce in the basket",
+            [put("soup", "in", "basket"), put("sauce", "in", "basket")],
+        ),
+        (
+            "the soup goes in the basket, and so does the sauce",
+            [put("soup", "in", "basket"), put("sauce", "in", "basket")],
+        ),
+        ("put the two moka pots on the stove", [put("moka pot", "on", "stove")] * 2),
+        (
+            "put the bowl on the plate and the bottle on the rack",
+            [BOWL_ON_PLATE, put("bottle", "on", "rack")],
+        ),
+        (
+            "put the white mug on the left plate and the yellow and white one on the right one",
+            [
+                put("white mug", "on", "plate", landmark_where=Reference("left")),
+                put("yellow and white mug", "on", "plate", landmark_where=Reference("right")),
+            ],
+        ),
+        (
+            "stack the left bowl on the right bowl and place them in the tray",
+            [
+                put("bowl", "on", "bowl", "", Reference("left"), Reference("right")),
+                put("bowl", "in", "tray", "", Reference("right")),
+            ],
+        ),
+        (
+            "close the lower drawer of the cupboard, then pull open its upper one",
+            [SubTask("close", "cabinet", "bottom drawer"), OPEN_TOP],
+        ),
+        (
+            "put the bowl in the top drawer of the cabinet and push the drawer shut",
+            [IN_TOP, SubTask("close", "cabinet", "top drawer")],
+        ),
+    ],
+)
+def test_what_is_left_out_is_taken_from_what_was_said(instruction, expected):
+    assert list(parse_instruction(instruction)) == expected
+
+
+@pytest.mark.parametrize(
+    ("instruction", "expected"),
+    [
+        (
+            "put the black bowl at the front on the plate",
+            put("black bowl", "on", "plate", "", Reference("front")),
+        ),
+        (
+            "put the red mug on the plate on the left",
+            put("red mug", "on", "plate", landmark_where=Reference("left")),
+        ),
+        ("put the bowl next to the box on the plate", taken("next to", "box")),
+        (
+            "put the bowl on the plate next to the box",
+            put("bowl", "on", "plate", landmark_where=Reference("next to", ("box",))),
+        ),
+        ("move the bowl that is on the stove to the plate", replace(taken("on", "stove"), relation="at")),
+        ("take the bowl out of the drawer and put it on the plate", taken("in", "cabinet")),
+        ("put the bowl from the centre of the table on the plate", taken("center", "table")),
+        ("the bowl is standing behind the plate. Put it on the plate", taken("back", "plate")),
+        ("put the bowl to the right of the plate", put("bowl", "right of", "plate")),
+        ("put the book in the slot at the back of the caddy", put("book", "in", "caddy", "back compartment")),
+        ("put the book in the front of the caddy", put("book", "in", "caddy", "front compartment")),
+        ("put the pan on the shelf in the cabinet", put("pan", "on", "cabinet", "shelf")),
+        ("put the book on top of the shelf", put("book", "on", "shelf")),
+        ("put a can of soup in the basket", put("soup", "in", "basket")),
+        ("put the bottle of wine on the rack", put("wine bottle", "on", "rack")),
+        ("put the white and yellow mug on the plate", put("yellow and white mug", "on", "plate")),
+    ],
+)
+def test_phrases_say_which_is_meant_or_where_it_goes(instruction, expected):
+    assert parse_instruction(instruction) == (expected,)
+
+
+@pytest.mark.parametrize(
+    ("instruction", "reason"),
+    [
+        ("don't put the bowl on the plate", "what not to do"),
+        ("put the bowl on the plate without touching the stove", "what not to do"),
+        ("if the drawer is open, close it", "depends on a condition"),
+        ("put the bowl on the plate or on the stove", "leaves a choice"),
+        ("turn on the stove in five minutes", "says when"),
+        ("open the top drawer three times", "how often"),
+        ("Is the bowl on the plate?", "is a question"),
+        ("How do I open the drawer?", "is a question"),
+        ("The bowl is on the plate.", "states something"),
+        ("the robot opened the drawer", "cannot read"),
+        ("good morning", "no verb I know"),
+        ("leave the bowl on the plate", "to leave something as it is"),
+        ("put the bowl the plate", "cannot read"),
+        ("turn the stove", "no verb I know"),
+        ("put the bowl " * 100, "1300 characters"),
+    ],
+)
+def test_what_is_no_instruction_is_refused_with_the_reason(instruction, reason):
+    with pytest.raises(InstructionError, match=reason):
+        parse_instruction(instruction)
+
+
+WORDS = (
+    *("put", "pick", "take", "open", "close", "turn", "push", "bowl", "plate", "drawer", "cabinet", "stove"),
+    *("it", "them", "there", "one", "its", "the", "a", "both", "top", "left", "on", "in", "to", "from", "of"),
+    *(
+        "next",
+        "and",
+        "then",
+        "after",
+        "before",
+        "once",
+        "first",
+        "is",
+        "should",
+        "goes",
+        "that",
+        "which",
+        "off",
+    ),
+    *(",", ".", "?", ";", "'", "'s", "please", "i", "want", "up"),
+)
+
+
+@given(st.lists(st.sampled_from(WORDS), max_size=14))
+def test_any_words_are_read_or_refused(words):
+    try:
+        found = parse_instruction(" ".join(words))
+    except InstructionError:
+        return
+    assert found
+    assert all(sub_task.operation in VERBS and sub_task.target for sub_task in found)

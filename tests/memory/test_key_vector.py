@@ -50,7 +50,7 @@ def test_every_element_counts():
         SubTask("push", "bowl", "top drawer", "in", "cabinet"),
         SubTask("put", "plate", "top drawer", "in", "cabinet"),
         SubTask("put", "bowl", "", "in", "cabinet"),
-        SubTask("put", "bowl", "top drawer", "behind", "cabinet"),
+        SubTask("put", "bowl", "top drawer", "under", "cabinet"),
         SubTask("put", "bowl", "top drawer", "in", "rack"),
         SubTask("put", "bowl", "top drawer", "in", "cabinet", near),
         SubTask("put", "bowl", "top drawer", "in", "cabinet", None, near),

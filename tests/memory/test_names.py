@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from tests.memory.builders import entry
+from tests.memory.text_model import make_model
 
 from lerobot_openspm.errors import InstructionError
 from lerobot_openspm.memory.instruction import parse_instruction
@@ -20,24 +21,9 @@ VECTORS = {
 }  # fmt: skip
 
 
-def make_model(folder: Path) -> Path:
-    """A model2vec model of a few words with chosen vectors."""
-    from model2vec import StaticModel
-    from tokenizers import Tokenizer
-    from tokenizers.models import WordLevel
-    from tokenizers.pre_tokenizers import Whitespace
-
-    words = {"[UNK]": 0, **{word: i for i, word in enumerate(VECTORS, start=1)}}
-    tokenizer = Tokenizer(WordLevel(words, unk_token="[UNK]"))
-    tokenizer.pre_tokenizer = Whitespace()
-    vectors = np.array([(0.0, 0.0, 1e-6), *VECTORS.values()], dtype=np.float32)
-    StaticModel(vectors, tokenizer, config={}).save_pretrained(str(folder))
-    return folder
-
-
 @pytest.fixture(scope="module")
 def embedded(tmp_path_factory: pytest.TempPathFactory) -> Model2VecNames:
-    return Model2VecNames(str(make_model(tmp_path_factory.mktemp("model"))))
+    return Model2VecNames(str(make_model(tmp_path_factory.mktemp("model"), VECTORS)))
 
 
 @pytest.mark.parametrize(

@@ -109,3 +109,77 @@ def test_an_entry_that_cannot_be_executed_comes_last_whatever_the_weights(weight
     assert ranked[-1].entry.source == best
     assert ranked[-1].geometric == 0
     assert [scored.total for scored in ranked[:2]] == sorted((s.total for s in ranked[:2]), reverse=True)
+
+
+def first(instruction, entries):
+    found = semantic_candidates(instruction, entries)
+    return max(found, key=lambda item: item[1])[0]
+
+
+def test_the_entry_with_the_same_reference_comes_first_but_the_others_may_serve():
+    stove, box, plain = (
+        entry(f"pick up the bowl {where}and put it on the plate")
+        for where in ("on the stove ", "next to the box ", "")
+    )
+    for asked, best in (
+        ("the bowl on the stove", stove),
+        ("the bowl beside the box", box),
+        ("the bowl", plain),
+    ):
+        instruction = f"put {asked} onto the plate"
+        assert first(instruction, [stove, box, plain]) is best
+        assert len(semantic_candidates(instruction, [stove, box, plain])) == 3
+
+
+def test_another_reference_is_a_smaller_loss_than_another_relation_or_object():
+    known = "pick up the bowl on the stove and put it on the plate"
+    other_where = score("pick up the bowl on the rack and put it on the plate", known)
+    other_relation = score("pick up the bowl on the stove and put it next to the plate", known)
+    other_object = score("pick up the box on the stove and put it on the plate", known)
+    assert 1 > other_where > 0.75 > other_relation > other_object == 0
+
+
+@pytest.mark.parametrize(
+    ("instruction", "known"),
+    [
+        ("open the drawer", ["open the top drawer", "open the middle drawer"]),
+        ("put the mug on the plate", ["put the red mug on the plate", "put the white mug on the plate"]),
+        (
+            "put the sauce in the basket",
+            ["put the bbq sauce in the basket", "put the tomato sauce in the basket"],
+        ),
+    ],
+)
+def test_what_may_mean_two_things_is_not_guessed(instruction, known):
+    entries = [entry(language) for language in known]
+    with pytest.raises(InstructionError, match="may mean different things") as caught:
+        semantic_candidates(instruction, entries)
+    assert all(repr(language) in str(caught.value) for language in known)
+    # Where only one of them is known it is meant, and so is what is said in its very words.
+    assert first(instruction, [entries[0], entries[0]]) is entries[0]
+    assert first(known[1], entries) is entries[1]
+
+
+def test_only_what_means_the_same_as_the_best_is_a_candidate():
+    bowl, black = entry("put the bowl on the plate"), entry("put the black bowl on the plate")
+    white = entry("put the white bowl on the plate")
+    assert [item[0] for item in semantic_candidates("put the black bowl on the plate", [black, white])] == [
+        black
+    ]
+    with pytest.raises(InstructionError, match="did you mean 'put the bowl on the plate'"):
+        semantic_candidates("put the blue bowl on the plate", [bowl])
+
+
+def test_the_order_counts_where_it_matters():
+    soup, sauce = "put the soup in the basket", "put the sauce in the basket"
+    assert 0.9 < score(f"{sauce} and {soup}", f"{soup} and {sauce}") < 1
+    opened, filled = "open the microwave", "put the cup in the microwave"
+    assert score(f"{filled} and {opened}", f"{opened} and {filled}") == 0
+    assert score("put the bowl on the plate and put the plate on the stove", "put the plate on the stove "
+                 "and put the bowl on the plate") == 0  # fmt: skip
+
+
+def test_what_was_pushed_somewhere_may_be_asked_to_be_put_there_but_not_the_other_way_round():
+    pushed, was_put = "push the plate in front of the stove", "put the plate in front of the stove"
+    assert 0.75 < score(was_put, pushed) < 1
+    assert score(pushed, was_put) == 0

@@ -15,6 +15,7 @@ from tests.policy.conftest import Frame, batch_of
 from tests.policy.lerobot_commands import lerobot_train, training_options
 from tests.policy.test_learning import new_config
 
+from lerobot_openspm.configuration_openspm import OpenSPMConfig
 from lerobot_openspm.errors import (
     CalibrationError,
     DatasetError,
@@ -276,8 +277,23 @@ def test_a_calibration_that_cannot_be_is_refused_when_it_is_loaded(
     data = json.loads(file.read_text())
     data["cameras"][FRONT] |= change
     file.write_text(json.dumps(data))
+    config = OpenSPMConfig.from_pretrained(checkpoint)
+    config.cameras = str(file)
     with pytest.raises(CalibrationError, match=r"changed/cameras\.json: .*" + message):
-        OpenSPMPolicy.from_pretrained(tmp_path / "changed")
+        OpenSPMPolicy.from_pretrained(tmp_path / "changed", config=config)
+
+
+def test_a_calibration_that_was_changed_is_refused_until_somebody_means_it(
+    load: Callable[..., OpenSPMPolicy], copy: Path
+):
+    file = copy / "cameras.json"
+    data = json.loads(file.read_text())
+    data["cameras"][FRONT]["fx"] += 1.0
+    file.write_text(json.dumps(data))
+    with pytest.raises(CalibrationError, match=r"cameras\.json: its checksum.*--policy\.cameras="):
+        load(copy, cameras=None)
+    experience = load(copy, cameras=str(file)).require_experience()
+    assert experience.cameras[FRONT].fx == data["cameras"][FRONT]["fx"]
 
 
 def test_an_object_that_perception_does_not_know_is_refused_when_it_is_loaded(

@@ -78,10 +78,17 @@ def test_demonstrations_that_do_not_show_an_object_are_not_believed(
         assert (len(lesson.entries), lesson.skipped) == (1, (1,))
 
 
-def test_demonstrations_of_another_robot_are_refused(policy: OpenSPMPolicy, push_meta: Any):
-    known = policy.require_experience()
-    robot = replace(known.robot, close_command=known.robot.close_command * 2)
-    policy.experience = before = replace(known, robot=robot)
+def test_demonstrations_of_another_robot_are_refused(
+    policy: OpenSPMPolicy, push_meta: Any, monkeypatch: pytest.MonkeyPatch
+):
+    mine = teaching.mine
+
+    def mine_of_another(*given: Any) -> Experience:
+        mined = mine(*given)
+        return replace(mined, robot=replace(mined.robot, close_command=-mined.robot.close_command))
+
+    monkeypatch.setattr(teaching, "mine", mine_of_another)
+    before = policy.experience
     with pytest.raises(MemoryFormatError, match="another robot or controller"):
         policy.teach(push_meta)
     assert policy.experience is before

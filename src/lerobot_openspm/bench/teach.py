@@ -77,7 +77,7 @@ def demonstrations(options: Options) -> Demonstrations:
     root = options.dataset.root or f"{DEFAULTS[options.env.type][0]}/dataset"
     repo_id = options.dataset.repo_id or DEFAULTS[options.env.type][1]
     meta = dataset_metadata(repo_id, root)
-    told = [str(tasks[0]) for tasks in meta.episodes["tasks"]]
+    told = [str(tasks[0]) for tasks in meta.episodes["tasks"]]  # pyright: ignore[reportOptionalSubscript]
     numbers = {
         name: [i for i, one in enumerate(told) if one == task.instruction] for name, task in TASKS.items()
     }

@@ -14,6 +14,7 @@ COMMANDS = {
     "search": ("lerobot_openspm.cli.memory_search", "search", "what an instruction finds, with its scores"),
     "add": (CHANGE, "add", "add entries of another memory or of an exported file"),
     "remove": (CHANGE, "remove", "remove entries; they are kept as superseded"),
+    "restore": (CHANGE, "restore", "put a superseded entry into use again"),
     "merge": (CHANGE, "merge", "merge near-duplicates, their spread kept as covariance"),
     "rate": (CHANGE, "rate", "say how acting by an entry ended"),
     "cameras": (CHANGE, "cameras", "give a memory another calibration"),

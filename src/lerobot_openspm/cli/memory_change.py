@@ -1,4 +1,4 @@
-"""`openspm memory add | remove | merge | rate | cameras`: commands that change a memory, each as a whole."""
+"""`openspm memory add | remove | restore | merge | rate | cameras`: each changes a memory as a whole."""
 
 from __future__ import annotations
 
@@ -46,6 +46,21 @@ class RemoveConfig:
     path: str = "outputs/memory"
     source: str = ""
     instruction: str = ""
+
+
+@dataclass
+class RestoreConfig:
+    """Put a superseded entry into use again; what is in use of the same source and instruction is superseded.
+
+    Args:
+        path: Folder of the checkpoint or memory.
+        source: Dataset and episode of the entry, as ``list --all=true`` names them.
+        version: Which version; the newest superseded one if not given.
+    """
+
+    path: str = "outputs/memory"
+    source: str = ""
+    version: int | None = None
 
 
 @dataclass
@@ -133,6 +148,27 @@ def remove(args: list[str]) -> None:
     for entry in gone.values():
         print(f"removed version {entry.version} of {entry.source}: {entry.language!r}")
     _report(after, removed=len(gone))
+
+
+def restore(args: list[str]) -> None:
+    """Put a superseded entry into use again, as the newest version."""
+    config = draccus.parse(RestoreConfig, args=args)
+    _required(config.source, "--source=DATASET#EPISODE")
+    folder = Path(config.path)
+    with changing(folder):
+        before = load_experience(folder)
+        old = [e for e in before.superseded if e.source == config.source]
+        found = [e for e in old if config.version in (None, e.version)]
+        if not found:
+            versions = ", ".join(str(e.version) for e in old) or "none"
+            raise OpenSPMError(
+                f"the memory at {config.path} holds no such superseded entry of {config.source!r}, of its "
+                f"versions: {versions}; `openspm memory list --path={config.path} --all=true` lists them"
+            )
+        entry = max(found, key=lambda e: e.version)
+        after = before.restored(entry)
+        save_experience(after, folder)
+    _report(after, restored=config.source, version=after.entries[-1].version)
 
 
 def merge(args: list[str]) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections import Counter
+from collections import defaultdict
 from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
@@ -57,18 +57,28 @@ def list_entries(args: list[str]) -> None:
     """Print a line for every entry or task, then one JSON object."""
     config = draccus.parse(ListConfig, args=args)
     experience = load_experience(Path(config.path))
-    listed = [entry for entry in experience.entries if config.instruction in entry.language]
-    lines = _task_lines(listed) if config.tasks else [_line(entry) for entry in listed]
+    tasks: dict[str, list[float]] = defaultdict(list)
+    lines: list[str] = []  # as many as are printed: a memory may hold a million entries
+    for entry in experience.entries:
+        if config.instruction in entry.language:
+            tasks[entry.language].append(entry.quality)
+            if not config.tasks and len(lines) < config.limit:
+                lines.append(_line(entry))
+    n_listed = sum(map(len, tasks.values()))
+    n_lines = len(tasks) if config.tasks else n_listed
+    if config.tasks:
+        lines = [_task_line(language, qualities) for language, qualities in tasks.items()]
     if config.all:
         old = [entry for entry in experience.superseded if config.instruction in entry.language]
         lines += [f"{_line(entry)}  superseded" for entry in old]
+        n_lines += len(old)
     for line in lines[: config.limit]:
         print(line)
-    if len(lines) > config.limit:
-        print(f"... {len(lines) - config.limit} more; --limit={len(lines)} lists all")
-    per_task = Counter(entry.language for entry in listed)
+    if n_lines > config.limit:
+        print(f"... {n_lines - config.limit} more; --limit={n_lines} lists all")
     counts = {"entries": len(experience.entries), "superseded": len(experience.superseded)}
-    print(json.dumps({**counts, "listed": len(listed), "per_task": per_task}))
+    per_task = {language: len(qualities) for language, qualities in tasks.items()}
+    print(json.dumps({**counts, "listed": n_listed, "per_task": per_task}))
 
 
 def show(args: list[str]) -> None:
@@ -99,14 +109,8 @@ def _line(entry: MemoryEntry) -> str:
     )
 
 
-def _task_lines(entries: list[MemoryEntry]) -> list[str]:
-    tasks: dict[str, list[MemoryEntry]] = {}
-    for entry in entries:
-        tasks.setdefault(entry.language, []).append(entry)
-    return [
-        f"{len(members):6d} entries  mean quality {np.mean([e.quality for e in members]):.2f}  {language!r}"
-        for language, members in tasks.items()
-    ]
+def _task_line(language: str, qualities: list[float]) -> str:
+    return f"{len(qualities):6d} entries  mean quality {np.mean(qualities):.2f}  {language!r}"
 
 
 def table(entry: MemoryEntry) -> list[str]:

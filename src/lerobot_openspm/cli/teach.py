@@ -13,7 +13,7 @@ import draccus
 
 from lerobot_openspm.datasets import dataset_metadata
 from lerobot_openspm.errors import OpenSPMError
-from lerobot_openspm.experience import FILES, Experience, save_experience
+from lerobot_openspm.experience import MEMORY_JSON, Experience, save_experience
 from lerobot_openspm.teaching import Lesson
 
 
@@ -72,7 +72,7 @@ def main(args: list[str]) -> None:
 
 
 def _check_folders(into: Path, output: Path | None) -> None:
-    for name in ("config.json", *FILES):
+    for name in ("config.json", MEMORY_JSON):
         if not (into / name).is_file():
             raise FileNotFoundError(
                 f"no checkpoint of this policy at {into}: it has no {name}; pass --into=FOLDER, in a "

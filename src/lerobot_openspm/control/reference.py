@@ -34,7 +34,7 @@ _Cost = Callable[[Array, Array, float], Array]
 
 _ALIASES = {
     "left of": "left", "right of": "right", "front of": "front", "in front of": "front", "behind": "back",
-    "inside": "in", "beside": "next to", "center": "middle",
+    "center": "middle",
 }  # fmt: skip
 
 
@@ -94,6 +94,7 @@ def _costs(looking: Array) -> dict[tuple[str, int], _Cost]:
         **among,
         **beside,
         ("middle", 0): _middle,
+        ("middle", 1): _near_middle,
         ("between", 2): _between,
         ("next to", 1): _next_to,
         ("on", 1): _above,
@@ -128,6 +129,11 @@ def _middle(places: Array, *_: object) -> Array:
     """The one that is nearest to all others; of two, neither."""
     apart = np.linalg.norm(places[:, None, :2] - places[None, :, :2], axis=-1)
     return apart.sum(axis=1)
+
+
+def _near_middle(places: Array, marks: Array, _: float) -> Array:
+    """The one that is nearest to the middle of the landmark, as seen from above."""
+    return np.linalg.norm(places[:, :2] - marks[0, :2], axis=1)
 
 
 def _between(places: Array, marks: Array, _: float) -> Array:

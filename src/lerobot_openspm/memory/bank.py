@@ -77,33 +77,31 @@ class EntryBank(Sequence[MemoryEntry]):
         self,
         path: Path,
         lines: Lines,
+        columns: Columns,
         objects: frozenset[str],
         rows: range | None = None,
-        columns: Columns | None = None,
     ):
         """Open a file.
 
         Args:
             path: The file.
             lines: Where its lines are.
+            columns: What is kept of all its entries, to find one by.
             objects: The objects that its entries have key poses at.
             rows: Which of them this is about; all if not given.
-            columns: Digests of keys and qualities of all its entries, where they were kept.
 
         Raises:
             MemoryFormatError: The file is missing, of another size, or the lines cannot be.
         """
-        self._path, self._lines, self.objects = path, lines, objects
+        self._path, self._lines, self._columns, self.objects = path, lines, columns, objects
         self._rows = range(len(lines.ends)) if rows is None else rows
-        self._columns = columns
         lines.check(str(path))
+        _check_columns(columns, len(lines.ends), str(path))
         self._bytes = _mapped(path, lines.n_bytes)
         self._entry = lru_cache(KEPT_ENTRIES)(self._read)
 
-    def __reduce__(
-        self,
-    ) -> tuple[type[EntryBank], tuple[Path, Lines, frozenset[str], range, Columns | None]]:
-        return type(self), (self._path, self._lines, self.objects, self._rows, self._columns)
+    def __reduce__(self) -> tuple[type[EntryBank], tuple[Path, Lines, Columns, frozenset[str], range]]:
+        return type(self), (self._path, self._lines, self._columns, self.objects, self._rows)
 
     def __len__(self) -> int:
         return len(self._rows)
@@ -114,18 +112,16 @@ class EntryBank(Sequence[MemoryEntry]):
     def __getitem__(self, index: slice) -> EntryBank: ...
     def __getitem__(self, index: int | slice) -> MemoryEntry | EntryBank:
         if isinstance(index, slice):
-            return EntryBank(self._path, self._lines, self.objects, self._rows[index], self._columns)
+            return EntryBank(self._path, self._lines, self._columns, self.objects, self._rows[index])
         return self._entry(self._rows[index])
 
     def __iter__(self) -> Iterator[MemoryEntry]:
         # Past the cache: going through all entries must neither hold them all nor push out those in use.
         return (self._read(row) for row in self._rows)
 
-    def columns(self) -> Columns | None:
-        """See :class:`~lerobot_openspm.memory.columns.HasColumns`."""
-        if self._columns is None:
-            return None
-        rows = np.asarray(self._rows, np.int64)
+    def columns(self) -> Columns:
+        """What is kept of the entries, to find one without reading all."""
+        rows = np.arange(self._rows.start, self._rows.stop, self._rows.step)
         return Columns(self._columns.digests[rows], self._columns.qualities[rows])
 
     def texts(self) -> Iterator[bytes]:
@@ -149,7 +145,18 @@ class EntryBank(Sequence[MemoryEntry]):
             raise MemoryFormatError(
                 f"{where} has key poses at {sorted(unknown)}, which memory.json does not list"
             )
+        if entry.quality != self._columns.qualities[row]:
+            raise MemoryFormatError(f"{where} has another quality than array 'entries.qualities' says")
         return entry
+
+
+def _check_columns(columns: Columns, n: int, where: str) -> None:
+    for name, array, dtype in (("keys", columns.digests, np.uint64), ("qualities", columns.qualities, float)):
+        if array.dtype != dtype or array.shape != (n,):
+            raise MemoryFormatError(
+                f"{where}: array 'entries.{name}' is {array.dtype} of {array.shape}, expected "
+                f"{np.dtype(dtype)} of {(n,)}; train or pull it again"
+            )
 
 
 def anchored_objects(entries: Sequence[MemoryEntry]) -> frozenset[str]:

@@ -115,20 +115,11 @@ def _checked(said: Said, verb: v.Verb) -> Said:
 
 def _without_verb(clause: Clause, words: Words, before: Said | None) -> Said | None:
     """Read "the soup goes in the basket", "the bowl should be put on the plate", "the stove on"."""
-    if words[0] in ("could", "would"):
+    if words[0] in ("could", "would") and words[1:]:
         words = words[1:]
     at = next((i for i, word in enumerate(words) if i and word in PREDICATES), 0)
     if at:
-        end = at
-        while end < len(words) and words[end] in _AUXILIARIES and words[end + 1 : end + 2] != ("the",):
-            end += 1
-        while at > 1 and words[at - 1] in _AUXILIARIES:
-            at -= 1
-        is_told = bool(set(words[at:end]) & _MODALS) or clause.is_done or clause.is_wanted
-        subject, rest = words[:at], words[end:]
-        if rest[:1] and rest[0] in _GOES:
-            return _read("put", subject, rest[1:])
-        return _state(subject, rest) if is_told and rest else None
+        return _predicate(clause, words, at)
     for i in range(1, len(words)):  # "the pudding set down on the plate", "and the bowl placed inside"
         if (clause.is_wanted or before is not None) and _is_participle(words, i):
             return _state(words[:i], words[i:])
@@ -136,17 +127,35 @@ def _without_verb(clause: Clause, words: Words, before: Said | None) -> Said | N
             return _state(words[:i], words[i:])
     if clause.is_wanted and words[-1] in ("on", "off", "open", "shut", "closed"):
         return _state(words[:-1], words[-1:])
+    return _verbless(clause, words, before)
+
+
+def _predicate(clause: Clause, words: Words, at: int) -> Said | None:
+    """Read a subject and, from a word on, what it is to be: "the bowl | should be put on the plate"."""
+    end = at
+    while end < len(words) and words[end] in _AUXILIARIES and words[end + 1 : end + 2] != ("the",):
+        end += 1
+    while at > 1 and words[at - 1] in _AUXILIARIES:
+        at -= 1
+    is_told = bool(set(words[at:end]) & _MODALS) or clause.is_done or clause.is_wanted
+    subject, rest = words[:at], words[end:]
+    if rest[:1] and rest[0] in _GOES:
+        return _read("put", subject, rest[1:])
+    return _state(subject, rest) if is_told and rest else None
+
+
+def _verbless(clause: Clause, words: Words, before: Said | None) -> Said | None:
+    """Read a thing and where it goes: "and the bottle on the rack", "ketchup into the basket"."""
     relations = [i for i in range(1, len(words)) if match_preposition(words, i)]
     if not relations:
         return None
-    is_elided = before is not None and before.operation in ("put", "push")
-    first = match_preposition(words, relations[-1])
-    is_directed = first is not None and first.is_goal and (words[0] in v.DETERMINERS or relations[0] == 1)
-    if clause.is_wanted or is_elided or (is_directed and not _has_inner_determiner(words[: relations[0]])):
-        if not is_elided or before is None:
-            return _read("put", words, ())
+    if before is not None and before.operation in ("put", "push"):
         return _of_other_place(_read(before.operation, words, ()), before)
-    return None
+    last = match_preposition(words, relations[-1])
+    head = words[: relations[0]]
+    is_thing = len(head) == 1 or (head[0] in v.DETERMINERS and not set(head[1:]) & v.DETERMINERS)
+    is_directed = last is not None and last.is_goal and is_thing
+    return _read("put", words, ()) if clause.is_wanted or is_directed else None
 
 
 def _is_participle(words: Words, at: int) -> bool:
@@ -167,10 +176,6 @@ def _of_other_place(said: Said, before: Said) -> Said:
     return replace(
         said, targets=targets, relation=before.relation, landmark=replace(before.landmark, where=where)
     )
-
-
-def _has_inner_determiner(words: Words) -> bool:
-    return any(word in v.DETERMINERS for word in words[1:])
 
 
 def _state(subject: Words, rest: Words) -> Said | None:
@@ -221,17 +226,16 @@ def _read(operation: str, words: Words, more: Words) -> Said:
     targets = (*targets[:-1], _which(targets[-1], where))
     if goal is None:
         return Said(operation, targets)
-    relation = goal.preposition.relation or RELATION_OF_SOURCE
-    relation = "on" if relation == "center" else relation
+    relation = goal.preposition.relation
+    relation = "on" if relation == "center" else relation  # "in the middle of the plate"
     if relation == "at" and read_noun(goal.words).part:
         relation = "in"  # "to the right compartment"
     noun = read_noun(goal.words)
     noun = replace(noun, pronoun="there") if not goal.words else noun
+    if goal.preposition.is_inside and (part := v.PART_BY_PLACE.get(noun.name)):
+        noun, relation = replace(noun, part=f"{v.PLACE_OF_RELATION[relation]} {part}"), "in"
     landmark = _which(noun, landmark_where)
     return Said(operation, targets, relation, landmark)
-
-
-RELATION_OF_SOURCE = "on"
 
 
 def _without_particles(words: Words) -> Words:
@@ -294,6 +298,8 @@ def _part_and_place(words: Words, preposition: Preposition, following: Words) ->
     ):
         return (*words, "of", *following)
     place = v.PLACE_OF_RELATION.get(preposition.relation, "")
+    if preposition.relation == "on" and not following and not has_place:
+        return (*words[:-1], "top", words[-1])  # "the drawer on top"
     if place and following and not has_place and head != "shelf":
         return (*words[:-1], place, words[-1], "of", *following)
     return None

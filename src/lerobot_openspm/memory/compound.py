@@ -7,6 +7,7 @@ demonstration shows as a whole is carried out by entries of its parts, one after
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 
 from lerobot_openspm.errors import InstructionError
@@ -15,15 +16,19 @@ from lerobot_openspm.memory.indexed_entries import near
 from lerobot_openspm.memory.instruction import parse_instruction
 from lerobot_openspm.memory.meaning import semantic_score
 from lerobot_openspm.memory.names import TABLE_NAMES, NameSimilarity
-from lerobot_openspm.memory.retrieval import MIN_SEMANTIC, semantic_candidates
+from lerobot_openspm.memory.retrieval import candidates_for
 
 # A sub-task takes hold of something and lets it go again.
 TRANSITIONS_PER_SUB_TASK = 2
 # Ways through free space; without the objects they are relative to, the hand finds another way.
 FREE_PHASES = ("approach", "lift", "pre-place", "retreat")
 # Relations that are not the preposition that one says.
-_PREPOSITIONS = {"front of": "to the front of", "left of": "to the left of", "right of": "to the right of",
-                 "at": "to", "center": "in the center of"}  # fmt: skip
+_PREPOSITIONS = {
+    "front of": "to the front of", "left of": "to the left of", "right of": "to the right of", "at": "to",
+    "front": "in front of", "back": "behind", "left": "to the left of", "right": "to the right of",
+    "center": "in the center of",
+}  # fmt: skip
+_VERBS = {"pick": "pick up"}
 
 
 @dataclass(frozen=True)
@@ -120,56 +125,58 @@ def plan_parts(
     """
     asked = parse_instruction(instruction)
     entries = near(asked, entries, semantic_score)
-    try:
-        whole = semantic_candidates(instruction, entries, names)
-    except InstructionError:
-        singles = [Candidate(part, 0.0, entry) for entry in entries for part in parts(entry)]
-        if len(asked) == 1 and not _about(asked, singles, names):
-            raise
-    else:
-        return (tuple(Candidate(entry, score, entry, asked) for entry, score in whole),)
-    runs = [Candidate(entry, 0.0, entry) for entry in entries]
     chain: list[tuple[Candidate, ...]] = []
-    i = 0
-    while i < len(asked):
-        for end in range(len(asked), i, -1):
-            if found := _about(asked[i:end], runs if end > i + 1 else singles, names):
-                break
-        else:
-            raise _no_experience(instruction, asked[i], singles)
+    left = asked
+    while left:
+        said = instruction if len(asked) == 1 else phrase(left[0])
+        try:
+            found = _longest_run(left, said, entries, names)
+        except InstructionError as error:
+            if len(asked) == 1:
+                raise
+            raise InstructionError(
+                f"{said!r} is a part of the instruction {instruction!r} that cannot be done: {error}"
+            ) from error
         chain.append(found)
-        i = end
+        left = left[len(found[0].asked) :]
     return tuple(chain)
 
 
-def _about(
-    asked: Sequence[SubTask], candidates: Sequence[Candidate], names: NameSimilarity
+def _longest_run(
+    asked: Sequence[SubTask], said: str, entries: Sequence[MemoryEntry], names: NameSimilarity
 ) -> tuple[Candidate, ...]:
-    """Those of some candidates that are about what is asked, with their score."""
-    scored = [
-        replace(one, semantic=semantic_score(asked, one.entry.key.sub_tasks, names), asked=tuple(asked))
-        for one in candidates
-    ]
-    return tuple(one for one in scored if one.semantic >= MIN_SEMANTIC)
+    """Candidates for the first sub-tasks, for as many as were demonstrated together.
+
+    Raises:
+        InstructionError: There are none for the first one, which is called as ``said``, or entries about
+            different things fit it as well.
+    """
+    whole = [Candidate(entry, 0.0, entry) for entry in entries]
+    for n_sub_tasks in range(len(asked), 0, -1):
+        with suppress(InstructionError):
+            return _about(asked[:n_sub_tasks], said, whole, names)
+    singles = [Candidate(part, 0.0, entry) for entry in entries for part in parts(entry)]
+    return _about(asked[:1], said, singles, names)
 
 
-def _no_experience(instruction: str, sub_task: SubTask, known: Sequence[Candidate]) -> InstructionError:
-    languages = "; ".join(sorted({one.entry.language for one in known})) or "nothing yet"
-    return InstructionError(
-        f"the memory holds no experience of {phrase(sub_task)!r}, which is a part of the instruction "
-        f"{instruction!r}; it knows: {languages}. Record demonstrations of that part and train again, or say "
-        "it by these instructions"
-    )
+def _about(
+    asked: Sequence[SubTask], said: str, candidates: Sequence[Candidate], names: NameSimilarity
+) -> tuple[Candidate, ...]:
+    """Those of some candidates that are about what is asked, with their score; InstructionError if none."""
+    by_entry = {id(one.entry): one for one in candidates}
+    found = candidates_for(asked, said, [one.entry for one in candidates], names)
+    return tuple(replace(by_entry[id(e)], semantic=score, asked=tuple(asked)) for e, score in found)
 
 
 def phrase(sub_task: SubTask) -> str:
     """A sub-task in words, as an instruction: "put the bowl in the top drawer of the cabinet"."""
+    verb = _VERBS.get(sub_task.operation, sub_task.operation)
     if not sub_task.landmark:
-        return f"{sub_task.operation} {_noun(sub_task.target, sub_task.part, sub_task.target_where)}"
+        return f"{verb} {_noun(sub_task.target, sub_task.part, sub_task.target_where)}"
     preposition = _PREPOSITIONS.get(sub_task.relation, sub_task.relation)
     target = _noun(sub_task.target, "", sub_task.target_where)
     landmark = _noun(sub_task.landmark, sub_task.part, sub_task.landmark_where)
-    return f"{sub_task.operation} {target} {preposition} {landmark}"
+    return f"{verb} {target} {preposition} {landmark}"
 
 
 def _noun(name: str, part: str, where: Reference | None) -> str:

@@ -14,7 +14,7 @@ from lerobot_openspm.memory import vocabulary as v
 from lerobot_openspm.memory.clauses import Said, read_clause
 from lerobot_openspm.memory.entry import SubTask
 from lerobot_openspm.memory.nouns import Noun
-from lerobot_openspm.memory.sentences import Clause, read_clauses
+from lerobot_openspm.memory.sentences import MAX_CHARACTERS, Clause, read_clauses
 
 PICK = "pick"
 
@@ -48,7 +48,8 @@ def parse_instruction(instruction: str) -> tuple[SubTask, ...]:
     try:
         return _parse(instruction)
     except InstructionError as error:
-        raise InstructionError(f"the instruction {instruction!r} {error}") from None
+        shown = instruction if len(instruction) <= MAX_CHARACTERS else f"{instruction[:60]} ..."
+        raise InstructionError(f"the instruction {shown!r} {error}") from None
 
 
 def _parse(instruction: str) -> tuple[SubTask, ...]:

@@ -33,7 +33,8 @@ def canonical_name(name: str) -> str:
     kept = " ".join(words) in v.ALIASES.values()
     if len(words) > 1 and words[-1] in v.CONTAINERS and not kept:
         words.pop()  # "ketchup bottle"
-    return v.replace_ending(" ".join(words), v.ALIASES) or name
+    short = " ".join(words)
+    return v.SHORT_NAMES.get(short) or v.replace_ending(short, v.ALIASES) or name
 
 
 class TableNames:

@@ -78,7 +78,8 @@ def read_noun(words: Words) -> Noun:
         pronoun = v.PRONOUNS.get(" ".join(words), "them" if count > 1 else "it")
         return Noun(pronoun="them" if count > 1 else pronoun, count=1)
     if words[0] == "its" and len(words) > 1:
-        return replace(_read_whole(words[1:], "its"), pronoun="its")
+        noun = _read_whole(words[1:], "its")
+        return replace(noun, pronoun=noun.pronoun or "its")
     words = tuple(word for word in words if word not in v.DETERMINERS)
     if "'s" in words:  # "the cabinet's top drawer" is "the top drawer of the cabinet"
         at = words.index("'s")
@@ -186,7 +187,7 @@ def _part(words: Words) -> str:
     found[-1] = v.singular(found[-1])
     if found[-1] in v.PART_SYNONYMS:
         found[-1] = v.PART_SYNONYMS[found[-1]]
-    return " ".join(word for word in found if word != "hand")
+    return " ".join(word for word in found if word not in ("hand", "side"))
 
 
 def _places(words: Words) -> tuple[Reference | None, Words]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from lerobot_openspm.memory import vocabulary as v
 from lerobot_openspm.memory.wording import WHICH
@@ -27,6 +27,7 @@ class Preposition:
         is_goal: Whether it says where to ("onto").
         is_source: Whether it says where from ("out of").
         is_relative: Whether it belongs to the noun before it ("that is on").
+        is_inside: Whether it says a place within its noun ("in the front of").
         length: How many words it has.
     """
 
@@ -35,6 +36,7 @@ class Preposition:
     is_goal: bool = False
     is_source: bool = False
     is_relative: bool = False
+    is_inside: bool = False
     length: int = 1
 
 
@@ -50,7 +52,13 @@ def match_preposition(words: Words, at: int) -> Preposition | None:
     if found is None:
         return None
     return Preposition(
-        found.relation, found.place, found.is_goal, found.is_source, relative, found.length + start - at
+        found.relation,
+        found.place,
+        found.is_goal,
+        found.is_source,
+        relative,
+        found.is_inside,
+        found.length + start - at,
     )
 
 
@@ -71,23 +79,24 @@ def _source(words: Words, at: int) -> Preposition | None:
 
 def _at_place(words: Words, at: int) -> Preposition | None:
     """Match "on the left", "at the front of", "in the middle of", "in front"."""
-    if at < len(words) and words[at] in ("on", "at", "in", "to", "toward", "towards", "onto"):
-        return _place(words, at, length=1, goal=words[at] in ("to", "onto"))
-    return None
+    if at >= len(words) or words[at] not in ("on", "at", "in", "into", "to", "toward", "towards", "onto"):
+        return None
+    found = _place(words, at, length=1, goal=words[at] in ("to", "onto", "into"))
+    return replace(found, is_inside=True) if found and words[at] in ("in", "into") else found
 
 
 def _place(words: Words, at: int, length: int, goal: bool = False) -> Preposition | None:
     end = at + length
     end += end < len(words) and words[end] in ("the", "its", "far", "very")
     end += end < len(words) and words[end] in ("far", "very")
-    if end >= len(words) or words[end] not in v.PLACES:
+    if end >= len(words) or words[end] not in v.PLACES | v.HEIGHTS or words[at:end] == ("on",):
         return None
-    place = v.PLACES[words[end]]
+    place = v.PLACES.get(words[end]) or v.HEIGHTS[words[end]]
     end += 1
     end += end < len(words) and words[end] == "hand"
     end += end < len(words) and words[end] in ("side", "edge", "end", "part")
     after = words[end] if end < len(words) else ""
-    if after == "of":
+    if after == "of" and place in v.RELATION_OF_PLACE:
         return Preposition(v.RELATION_OF_PLACE[place], is_goal=goal, length=end + 1 - at)
     if after and after != "," and match_preposition(words, end) is None:
         return None  # "on the left plate"

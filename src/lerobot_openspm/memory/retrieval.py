@@ -54,7 +54,26 @@ def semantic_candidates(
         InstructionError: It cannot be read, no entry is about it, or entries about different things fit it as
             well. The error names the instructions that the memory knows, or those that may be meant.
     """
-    sub_tasks = parse_instruction(instruction)
+    return candidates_for(parse_instruction(instruction), instruction, entries, names)
+
+
+def candidates_for(
+    sub_tasks: Sequence[SubTask],
+    instruction: str,
+    entries: Sequence[MemoryEntry],
+    names: NameSimilarity = TABLE_NAMES,
+) -> list[tuple[MemoryEntry, float]]:
+    """Entries that are about some sub-tasks, as :func:`semantic_candidates` finds them.
+
+    Args:
+        sub_tasks: What is asked.
+        instruction: How errors call it.
+        entries: The memory.
+        names: Says which names mean the same thing.
+
+    Raises:
+        InstructionError: As there.
+    """
     entries = near(sub_tasks, entries, semantic_score)
     # Demonstrations of one task share their key, so there are far fewer keys than entries.
     keys = {entry.key.sub_tasks for entry in entries}

@@ -13,6 +13,8 @@ from lerobot_openspm.memory.wording import SAME, SEEN, WANTED, plain_wording
 
 Words = tuple[str, ...]
 
+# Nobody reads out more than this; and some patterns take time with the square of the length.
+MAX_CHARACTERS = 500
 _REFUSED = (
     ("not|never|no|nor|neither|without|avoid|refrain|cancel|stop|except|instead|rather|undo|abort|wrong"
      "|prevent|forget|nothing|none|forbidden|hardly",
@@ -39,6 +41,8 @@ _AFTER = ("as soon as", "after", "once", "when", "having")
 _SUBJECTS = re.compile(
     r"^(?:you|it|that|this|they) (?:have|has|are|is)(?: (?:finished|done|been|through))?(?: with)? "
 )
+# "the stove should be on and the pan on it": said once, it holds for the rest of the sentence.
+_TELLING = frozenset({"should", "must", "needs", "goes"})
 # What may stand between a subject and what is to become of it.
 PREDICATES = v.word_set("goes go belongs belong should must needs need has have ought is are be gets")
 
@@ -70,6 +74,8 @@ def read_clauses(instruction: str) -> list[Clause]:
     Raises:
         InstructionError: It asks, forbids, depends on a condition, or says nothing.
     """
+    if len(instruction) > MAX_CHARACTERS:
+        raise InstructionError(f"has {len(instruction)} characters, expected at most {MAX_CHARACTERS}")
     text = plain_wording(instruction)
     if not text:
         raise InstructionError("says nothing, expected one like 'put the bowl on the plate'")
@@ -98,6 +104,8 @@ def _read_sentence(words: Words, first_step: int) -> list[Clause]:
             order.remove(i)
             order.insert(0, i)
     clauses = [_clause(words, marker) for marker, words in pieces]
+    told = next((i for i, clause in enumerate(clauses) if _TELLING & set(clause.words)), len(clauses))
+    clauses[told + 1 :] = [replace(clause, is_wanted=True) for clause in clauses[told + 1 :]]
     return [
         replace(clause, step=first_step + order.index(i)) for i, clause in enumerate(clauses) if clause.words
     ]
@@ -192,6 +200,8 @@ def _is_fronted(words: Words) -> bool:
 
 
 def _begins_clause(words: Words, at: int, current: Words) -> bool:
+    if words[at] in PREDICATES:
+        return False  # "the bowl, which is on the stove, goes on the plate"
     if v.match_verb(words, at) or v.match_verb(words, at, "gerund") or words[at] in (WANTED, SEEN):
         return True
     pairs = "between" in current[-4:] and "and" not in current[-4:]
@@ -204,14 +214,23 @@ def _begins_clause(words: Words, at: int, current: Words) -> bool:
     if match_preposition(words, at) is not None:
         return False
     # "put the bowl on the plate and the bottle on the rack"
-    is_said = _relation_at(current) > 0 or bool(PREDICATES & set(current))
-    tells = _relation_at(rest[:end]) > 0 or any(v.match_verb(rest, i, "participle") for i in range(1, end))
-    return is_said and tells
+    is_told = rest[end - 1] in v.RESULTS or any(v.match_verb(rest, i, "participle") for i in range(1, end))
+    return _is_said(current) and (is_told or _relation_at(rest[:end]) > 0)
+
+
+def _is_said(words: Words) -> bool:
+    """Whether words say of something where it is or what becomes of it."""
+    return _relation_at(words) > 0 or words[-1] in v.RESULTS or bool(PREDICATES & set(words))
 
 
 def _is_complete(words: Words) -> bool:
     """Whether words can be a clause: not the first half of "the yellow and white mug"."""
-    return v.match_verb(words, 0) is not None or _relation_at(words) > 0 or bool(PREDICATES & set(words))
+    return (
+        v.match_verb(words, 0) is not None
+        or words[-1] in v.RESULTS
+        or _relation_at(words) > 0
+        or bool(PREDICATES & set(words))
+    )
 
 
 def _relation_at(words: Sequence[str]) -> int:

@@ -11,43 +11,53 @@ def word_set(words: str) -> frozenset[str]:
     return frozenset(words.split())
 
 
+def _phrases(phrases: str) -> tuple[str, ...]:
+    return tuple(phrases.split(", "))
+
+
 # Verb phrases by the operation they mean. "pick" is half of a put: where a thing is taken from tells which.
 VERBS: dict[str, tuple[str, ...]] = {
-    "pick": (
-        "pick up", "pick out", "pick", "grab hold of", "grab", "grasp", "take hold of", "take", "lift up",
-        "lift", "get hold of", "get", "fetch", "retrieve", "collect", "gather", "seize", "scoop up",
-        "reach for", "find", "locate", "remove",
+    "pick": _phrases(
+        "pick up, pick out, pick, grab hold of, grab, grasp, take hold of, take out, take, lift up, "
+        "lift out, lift, get hold of, get, fetch, retrieve, collect, gather, seize, scoop up, scoop, "
+        "reach for, find, locate, remove, snag, snatch, pluck, extract, select, choose, catch, hoist, "
+        "raise, unload, pull out of, secure, obtain"
     ),
-    "put": (
-        "put down", "put back", "put away", "put", "place", "set down", "set", "lay down", "lay", "move",
-        "bring", "stack", "drop off", "drop", "deposit", "position", "transfer", "relocate", "rest", "load",
-        "insert", "stow", "store", "stick", "stash", "pop", "tuck", "slot", "slip", "park", "file", "stand",
-        "shift", "deliver", "carry", "chuck", "toss", "pile", "plop", "situate", "nestle", "balance",
-        "transport", "return", "pack", "lower", "ease", "arrange", "add", "plunk", "dump", "fit", "settle",
-        "send", "leave", "shelve", "perch", "sit", "plonk", "seat", "install", "house", "keep",
+    "put": _phrases(
+        "put down, put back, put away, put, place, set down, set, lay down, lay, move, bring, stack, "
+        "drop off, drop, deposit, position, reposition, transfer, relocate, rest, load, insert, stow "
+        "away, stow, store, stick, stash, pop, tuck, slot, slip, park, file, stand, shift, deliver, "
+        "carry, chuck, toss, pile, plop, situate, nestle, nest, balance, transport, return, pack, "
+        "lower, ease, arrange, add, plunk, dump, fit, settle, send, leave, shelve, perch, sit, plonk, "
+        "seat, install, house, keep, bung, sling, stuff, squeeze, wedge, lodge, dock, mount, hang, "
+        "prop, lean, haul, lug, ferry, cart, shuttle, convey, pass, plant, line up, tidy, clear, "
+        "hide, feed, thrust, guide, steer, direct, relay"
     ),
-    "open": ("open up", "open"),
-    "close": ("close up", "close", "shut"),
-    "push": ("push", "slide", "shove", "nudge", "scoot", "drag", "pull"),
-    "turn on": (
-        "turn on", "switch on", "power on", "power up", "start up", "start", "light up", "light", "ignite",
-        "fire up", "activate", "flip on", "click on",
+    "open": _phrases("open up, open"),
+    "close": _phrases("close up, close, shut"),
+    "push": _phrases("push, slide, shove, nudge, scoot, drag, pull, press, shunt, glide"),
+    "turn on": _phrases(
+        "turn on, switch on, power on, power up, start up, start, light up, light, ignite, fire up, "
+        "activate, flip on, click on, flick on, heat up, enable, crank up"
     ),
-    "turn off": (
-        "turn off", "switch off", "power off", "power down", "shut off", "shut down", "extinguish",
-        "deactivate", "flip off", "click off", "kill",
+    "turn off": _phrases(
+        "turn off, switch off, power off, power down, shut off, shut down, extinguish, deactivate, "
+        "flip off, click off, flick off, kill, disable"
     ),
-}  # fmt: skip
+}
 # "slide the drawer open", "pull open the drawer": how a thing is moved, and what becomes of it.
-MOTIONS = ("pull", "push", "slide", "swing", "draw", "shove", "nudge", "ease", "move", "get")
+MOTIONS = _phrases(
+    "pull, push, slide, swing, draw, shove, nudge, ease, move, get, yank, tug, pop, press, crack, roll, "
+    "bring, haul, put, flip, drag"
+)
 RESULTS = {"open": "open", "shut": "close", "closed": "close"}
 # Likewise, but of drawers alone: "slide the bowl in" puts it into something.
 DRAWER_RESULTS = {"out": "open", "in": "close"}
 # What "turn" means without "on" or "off".
 HALF_A_VERB = "half a verb"
-SWITCHES = ("turn", "shut", "switch", "power", "flip", "click")
+SWITCHES = ("turn", "shut", "switch", "power", "flip", "click", "flick", "toggle", "crank", "twist")
 # What a thing does that is to be somewhere: "the bowl should sit on the plate".
-STANDS = word_set("sit rest stand stay lie end ends up sits rests gets land be")
+STANDS = word_set("stay come belong sit rest stand stay lie end ends up sits rests gets land be")
 # Verbs that say to change nothing, unless what they are said of is in the hand.
 OF_WHAT_IS_HELD = ("leave", "keep")
 # "slide the pan under the shelf": where the way does not lead along the table, sliding is putting.
@@ -76,14 +86,15 @@ RELATIONS: dict[str, tuple[str, ...]] = {
     "in": ("inside of", "inside", "into", "in to", "in", "within", "down into"),
     "next to": (
         "next to", "beside", "alongside", "near to", "near", "close to", "by", "adjacent to",
-        "at the side of", "by the side of", "nearest to", "nearest", "closest to",
+        "at the side of", "by the side of", "nearest to", "nearest", "closest to", "close by", "against",
+        "to the side of", "touching", "neighbouring",
     ),
     "between": ("in between", "between"),
     "behind": ("behind", "in back of", "in the back of"),
     "front of": ("in front of",),
     "left of": ("left of",),
     "right of": ("right of",),
-    "under": ("underneath", "beneath", "below", "under"),
+    "under": ("underneath", "beneath", "below", "under", "at the bottom of", "on the bottom of"),
     "at": ("to", "towards", "toward", "at"),
 }  # fmt: skip
 # Prepositions that say where to, whatever follows, and those that say where from.
@@ -93,7 +104,7 @@ GOALS = ("onto", "on to", "into", "in to", "to", "down into", "towards", "toward
 SOURCES = {"from": "", "off of": "on", "off": "on", "out of": "in", "out from": "in"}
 # Words before a preposition that add nothing to it: "over onto the plate", "right next to".
 PARTICLES = word_set(
-    "forward over down up back away right just directly straight out along immediately safely"
+    "forwards across forward over down up back away right just directly straight out along immediately safely"
 )
 
 # Places in the scene, among several things of one name, and in a thing's part.
@@ -119,13 +130,17 @@ RELATION_OF_PLACE = {
 
 # Parts, and the thing they belong to where it is not said.
 PART_OF = {"drawer": "cabinet", "burner": "stove", "knob": "stove", "compartment": "caddy"}
+# Things in whose left, right, front or back there is a part: "in the front of the caddy".
+PART_BY_PLACE = {"caddy": "compartment"}
 # Things with parts in them: "the shelf inside the cabinet".
 WITH_PARTS = ("cabinet", "caddy", "stove")
 # Parts that are named together with their thing alone; "the shelf" by itself may be a thing.
 NAMED_PARTS = ("shelf", "door")
 PART_SYNONYMS = {
     "layer": "drawer", "tier": "drawer", "level": "drawer", "section": "compartment", "slot": "compartment",
-    "pocket": "compartment", "bin": "compartment", "dial": "knob",
+    "pocket": "compartment", "bin": "compartment", "part": "compartment", "bay": "compartment",
+    "cubby": "compartment", "partition": "compartment", "division": "compartment", "area": "compartment",
+    "portion": "compartment", "space": "compartment", "dial": "knob",
 }  # fmt: skip
 # Parts that stand for the whole: who turns on the knob of the stove turns on the stove.
 SILENT_PARTS = ("knob", "burner", "door")
@@ -134,7 +149,8 @@ SILENT_PARTS = ("knob", "burner", "door")
 SYNONYMS = {
     "cupboard": "cabinet", "chest of drawers": "cabinet", "drawer unit": "cabinet", "dresser": "cabinet",
     "set of drawers": "cabinet", "drawer chest": "cabinet", "drawer cabinet": "cabinet",
-    "cabinet unit": "cabinet", "wooden cabinet": "cabinet",
+    "cabinet unit": "cabinet", "wooden cabinet": "cabinet", "wood cabinet": "cabinet", "bureau": "cabinet",
+    "storage unit": "cabinet", "kitchen cabinet": "cabinet", "closet": "cabinet", "sideboard": "cabinet",
     "cooker": "stove", "stovetop": "stove", "stove top": "stove", "cooktop": "stove", "hob": "stove",
     "gas stove": "stove", "range": "stove", "hotplate": "stove", "hot plate": "stove",
     "microwave oven": "microwave", "desk caddy": "caddy", "desk organizer": "caddy",
@@ -144,17 +160,66 @@ SYNONYMS = {
 }  # fmt: skip
 # Names that stay as they are said, because objects are learned under them, but mean the same in retrieval.
 ALIASES = {
-    "cup": "mug", "pan": "frying pan", "skillet": "frying pan", "fry pan": "frying pan",
-    "frypan": "frying pan", "coffee pot": "moka pot", "moka": "moka pot", "moka coffee pot": "moka pot",
-    "espresso maker": "moka pot", "espresso pot": "moka pot", "coffee maker": "moka pot",
-    "moka maker": "moka pot", "mokapot": "moka pot", "wine rack": "rack", "bottle rack": "rack",
-    "wine holder": "rack", "barbecue sauce": "bbq sauce", "barbeque sauce": "bbq sauce",
-    "bar b q sauce": "bbq sauce", "catsup": "ketchup", "tomato ketchup": "ketchup", "oj": "orange juice",
-    "choc pudding": "chocolate pudding", "choco pudding": "chocolate pudding",
-    "soft cheese": "cream cheese", "cookies": "cookie", "biscuit": "cookie", "biscuits": "cookie",
-    "dinner plate": "plate", "dish": "plate", "saucer": "plate", "hamper": "basket", "wine": "wine bottle",
-    "ramekin dish": "ramekin", "ramekin bowl": "ramekin", "serving tray": "tray", "counter": "table",
-    "worktop": "table", "countertop": "table", "novel": "book", "textbook": "book", "notebook": "book",
+    "cup": "mug",
+    "pan": "frying pan",
+    "skillet": "frying pan",
+    "fry pan": "frying pan",
+    "frypan": "frying pan",
+    "coffee pot": "moka pot",
+    "moka": "moka pot",
+    "moka coffee pot": "moka pot",
+    "espresso maker": "moka pot",
+    "espresso pot": "moka pot",
+    "coffee maker": "moka pot",
+    "moka maker": "moka pot",
+    "mokapot": "moka pot",
+    "wine rack": "rack",
+    "bottle rack": "rack",
+    "wine holder": "rack",
+    "barbecue sauce": "bbq sauce",
+    "barbeque sauce": "bbq sauce",
+    "bar b q sauce": "bbq sauce",
+    "catsup": "ketchup",
+    "tomato ketchup": "ketchup",
+    "oj": "orange juice",
+    "choc pudding": "chocolate pudding",
+    "choco pudding": "chocolate pudding",
+    "soft cheese": "cream cheese",
+    "cookies": "cookie",
+    "biscuit": "cookie",
+    "biscuits": "cookie",
+    "dinner plate": "plate",
+    "dish": "plate",
+    "saucer": "plate",
+    "hamper": "basket",
+    "wine": "wine bottle",
+    "ramekin dish": "ramekin",
+    "ramekin bowl": "ramekin",
+    "serving tray": "tray",
+    "counter": "table",
+    "worktop": "table",
+    "countertop": "table",
+    "novel": "book",
+    "textbook": "book",
+    "notebook": "book",
+    "coffee mug": "mug",
+    "coffee cup": "mug",
+    "tea cup": "mug",
+    "teacup": "mug",
+    "percolator": "moka pot",
+    "wine stand": "rack",
+    "wicker basket": "basket",
+    "shopping basket": "basket",
+    "chocolate pud": "chocolate pudding",
+    "letter soup": "alphabet soup",
+    "biscuit box": "cookie",
+    "cookie package": "cookie",
+    "stovetop espresso maker": "moka pot",
+}
+# Short names, of the whole name alone: the "soup" is the alphabet soup, but "pumpkin soup" is not.
+SHORT_NAMES = {
+    "soup": "alphabet soup", "pudding": "chocolate pudding", "dressing": "salad dressing",
+    "juice": "orange juice", "bbq": "bbq sauce", "barbecue": "bbq sauce", "pot": "moka pot",
 }  # fmt: skip
 # What things are sold in: "the can of alphabet soup" is the alphabet soup.
 CONTAINERS = word_set(
@@ -175,7 +240,7 @@ DESCRIPTIONS = word_set(
 
 COLOURS = word_set("black white red yellow green blue brown grey gray orange purple pink golden silver beige")
 DETERMINERS = word_set("the a an some this that these those my your our its")
-FILLERS = word_set("also furthest farthest far other same entire whole single little said very")
+FILLERS = word_set("stacked also furthest farthest far other same entire whole single little said very")
 NUMBERS = {"both": 2, "two": 2, "pair of": 2, "couple of": 2, "three": 3, "four": 4}
 PRONOUNS = {
     **dict.fromkeys(("it", "this", "that", "itself"), "it"),

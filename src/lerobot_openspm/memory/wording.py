@@ -34,7 +34,7 @@ _SPELLING = (
     (r"'s\b", " 's"),
     ("[-_\u2013\u2014]", " "),
     (r"[.!?;\n]+", " ; "),
-    (r"[,:]+", " , "),
+    (r"[,:()]+", " , "),
     (r"&", " and "),
     (r"[^a-z0-9,;' ]+", " "),
     (r"\bstep (?:one|two|three|\d)\b|\b\d\b", " ; "),
@@ -55,21 +55,36 @@ _COURTESIES = (
     rf"(?:could|can|would|will|might) {_YOU}"
     r"(?: (?:be so (?:kind|good) as to|be able to|mind|go ahead and|go and|help me))?",
     rf"i (?:would|want|need)(?: really)?(?: like| love| prefer)?(?: for)? {_YOU} to",
-    r"i (?:would|will) (?:really )?(?:appreciate|love|like|be (?:grateful|happy|glad)) (?:it )?if(?: you)?",
+    r"i (?:would|will) (?:really )?(?:appreciate|love|like|be (?:grateful|happy|glad)) (?:it )?if(?: you)?"
+    r"(?: could| would)?",
     r"it would be (?:great|nice|good|helpful|lovely|wonderful) (?:if you (?:could|would)|to)",
     rf"i am going to need {_YOU} to|i will need {_YOU} to|help me(?: out)?(?: to| by)?",
     r"(?:would|is) it (?:be )?(?:possible|ok(?:ay)?)(?: for you)? to|i (?:think|guess|believe|suppose)",
     r"(?:start|begin|finish|end)(?: off| up)? (?:by|with)|in order(?= to)",
     r"(?:you|we|the robot|robot) (?:should|must|need to|have to|ought to|are to|can|may|shall)",
     r"(?:your|the|my|our)(?: (?:next|first))? (?:task|job|goal|mission|aim)(?: now)? is to",
+    r"(?:do you )?mind(?= \w+ing)|(?:care|like) to|fancy(?= \w+ing)|be a (?:dear|pal) and|thanks in advance",
+    r"(?:i was wondering if|i wonder if|any chance|any chance that) you (?:could|would|can)",
+    r"do me a favou?r and|(?:what|all) i (?:want|need|would like) is (?:for you )?to|you are (?:to|going to)",
+    r"(?:when|once|as soon as|after) (?:you are |that is |it is |you have )?(?:done|finished)(?! \w+ing)",
+    r"(?:once|when|after|as soon as) (?:it|that) is (?:in(?:side)?|there|in there|in it|in place)"
+    r"(?= ?(?:[,;]|$))",
     r"go ahead and|go and|let us|why do not you|be so (?:kind|good) as to|it is time to|time to",
 )
 # What may be left out where a sentence begins.
 _GREETINGS = r"(?:hey|hi|hello|ok|okay|alright|all right|so|well|robot|assistant|yes|right|excuse me)"
 
+_HEADINGS = r"(?:(?:your|next|new|the|first) )?(?:task|goal|job|instruction|command|request|order|thing)"
+
 # Other constructions of what an imperative says.
 _CONSTRUCTIONS = (
     (rf"\b({_THING}) is where (?:i|we) (?:want|need|would like) ({_THING}){_END}", r"put \2 to \1"),
+    (rf"\b({_THING}) is where ({_THING}) (?:(?:should|needs? to|must|ha(?:s|ve) to) (?:go|be)|goes?|belongs?)"
+     rf"{_END}", r"put \2 to \1"),
+    (r"\b(?:what|all) (?:i|we) (?:want|need|would like) is\b", WANTED),
+    (r"\bto (?:the )?(on|off)(?: position| setting)?\b(?= ?(?:[,;]|$|and|then))", r"\1"),
+    (r" , (?:the|that) one(?= (?:on|in|at|next|between|by|from|near|beside|to)\b)", f" {WHICH}"),
+    (r"\bfrom where it (?:is|sits|stands|lies|rests)\b", "from"),
     (r"\b(?:i|we) (?:would|want|need|wish)(?: really)?(?: like| love| prefer)?(?: to (?:have|see|get))?\b",
      WANTED),
     # "have the bowl placed on the plate", "make sure the drawer is open", "could we have the milk here"
@@ -78,7 +93,7 @@ _CONSTRUCTIONS = (
      r"|\b(?:could|can|may) (?:i|we) (?:have|get)\b", WANTED),
     (rf"\b({_THING}) (?:gets|receives|(?:should|must|needs to|has to) (?:hold|have|contain|get|receive))"
      rf" ((?:the|a|both) {_THINGS})(?: (?:on|in) it)?{_END}", r"put \2 to \1"),
-    (rf"\bfill ({_THING}) with ({_THINGS}){_END}", r"put \2 in \1"),
+    (rf"\b(?:fill|load|pack) ({_THING}) with ({_THINGS}){_END}", r"put \2 in \1"),
     (rf"\bwith ({_THING}) (open|on|off|closed|shut) ,", r"once \1 is \2 ,"),
     (rf"\bmove ({_THING}) by (push|slid)ing it\b", r"push \1"),
     (rf"\bget ({_THING}) (?:going|started|running|lit)\b", r"turn on \1"),
@@ -94,21 +109,26 @@ _CONSTRUCTIONS = (
     (rf"\band (?:then )?the other(?: one)?(?: too| as well)?{_END}", f", {SAME} the other"),
     (rf"\band ((?:the|that|a) {_THING})(?: ,)? (?:too|as well|also|likewise){_END}", rf", {SAME} \1"),
     (rf" (?:too|as well|also|likewise){_END}", ""),
+    (r" , both of (?:them|these)\b(?: ,)?", ""),
+    (r"\b(?:furthest|farthest|nearest|closest)(?: to)?(?: the)? (left|right|front|back)\b", r"at the \1"),
+    (r" , which (should|must|needs to)(?: then)?\b", r" ; it \1"),
+    (rf"\bget ({_THING} (?:turned|switched|opened|closed|shut|put|placed|set|moved)\b)", rf"{WANTED} \1"),
     (r"\b(?:along with|together with|as well as|plus|and also|and then)"
-     rf" ((?:the|that) \w+(?: (?!in\b|on\b|into\b|onto\b|to\b|is\b|goes\b)\w+){{0,3}}){_END}",
+     r" ((?:the|that) \w+(?: (?!in\b|on\b|into\b|onto\b|to\b|is\b|goes\b)\w+){0,3})(?=\s*(?:;|$))",
      rf", {SAME} \1"),
     (r"\b(?:as well as|along with|together with|plus)\b", "and"),
     (r"\b(?:do )?you (?:can |will )?(?:see|find)\b|\bthere (?:is|are)\b|\bnotice\b|\bas for\b"
      r"|(?:^|(?<=; ))(?:see|look at|i (?:can )?see)\b", SEEN),
     # "the bowl that is standing on ...", "the bowl you see on ...", "the bowl lying on ..."
     (rf"(?:\b(?:that|which)\b|{SEEN})(?: (?:is|are|was|were|currently|sitting|standing|lying|resting|located"
-     r"|placed|found|positioned|kept|sits?|stands?|lies?|rests?))+\b"
-     r"|(?<!and )\b(?:currently|sitting|standing|lying|resting|located|positioned)\b", WHICH),
+     r"|placed|found|positioned|kept|sits?|stands?|lies?|rests?|sandwiched|nestled|perched|balanced|situated"
+     r"|stored|sat|seated|tucked|hiding))+\b|(?<!and )(?<!be )(?<!been )\b(?:currently|sitting|standing|lying"
+     r"|resting|located|positioned|sandwiched|nestled|situated|perched|stored)\b", WHICH),
     (rf"(\w+) {WHICH} ((?:{_COLOUR})(?: and (?:{_COLOUR}))*)\b", r"\2 \1"),
     (r"\bfrom (?:its|their) (?:usual |current )?(?:place|spot|position)\b(?= \w)", "from"),
     (r"\b(?:in|to|into|at) (?:its|their) (?:usual |right )?(?:place|spot|position|home)\b(?= \w)", ""),
     # "to the stove's front side", "from the wooden cabinet's left"
-    (r"\b(to|at|on|onto|from) (?:the )?([a-z ]+?) 's (left|right|front|back|rear|top)(?: hand)?"
+    (r"\b(to|at|on|onto|from) (?:the )?([a-z]+(?: [a-z]+)?) 's (left|right|front|back|rear|top)(?: hand)?"
      rf"(?: side| edge)?{_END}",
      r"\1 the \3 of the \2"),
     (rf"\b(?:on|onto|to) the (\w+) top{_END}", r"on top of the \1"),
@@ -123,6 +143,7 @@ def plain_wording(text: str) -> str:
     text = _collapse(text)
     text = _collapse(re.sub(rf"\b(?:{'|'.join(_COURTESIES)})\b", " ", text))
     text = _collapse(re.sub(rf"(?:^|(?<=; ))(?:{_GREETINGS}\b[ ,]*)+", "", text))
+    text = _collapse(re.sub(rf"(?:^|(?<=; ))(?:{_HEADINGS})(?: now)? , ", "", text))
     text = _collapse(re.sub(r",? (?:would|will|could|can) you\b|, (?:robot|ok|okay)\b", "", text))
     for pattern, replacement in _CONSTRUCTIONS:
         text = _collapse(re.sub(pattern, f" {replacement} ", text))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from tqdm import tqdm
@@ -145,11 +145,7 @@ def layouts_in_scenes(
     models = dict(known)
     if named:
         logger.info("learning what these look like: %s", ", ".join(named))
-        unknown = [
-            replace(scene, hints=tuple(hint for hint in scene.hints if hint.name in named))
-            for scene in scenes
-        ]
-        learned = learn_objects(unknown, rng, known.values(), segmenter, shape, shapes)
+        learned = learn_objects(scenes, rng, known.values(), segmenter, shape, shapes)
         models |= learned
         if missing := [name for name in named if name not in learned]:
             logger.warning("could not learn what %s looks like; no key pose will be anchored there", missing)

@@ -34,7 +34,7 @@ from lerobot_openspm.perception.patch_learning import learn_patches
 from lerobot_openspm.perception.shape import Posed, Votes
 from lerobot_openspm.perception.sightings import segmented
 from lerobot_openspm.perception.types import Scene, Segmenter
-from lerobot_openspm.perception.yaw import yaw_range
+from lerobot_openspm.perception.yaw import search_range, yaw_range
 
 log = logging.getLogger(__name__)
 
@@ -72,7 +72,7 @@ def learn_objects(
     shape_source: Shape = "demonstrations",
     shapes: ShapeBackend | None = None,
 ) -> dict[str, KnownObject]:
-    """Learn every object that some scene hints at.
+    """Learn every object that some scene hints at and that is not known.
 
     Args:
         scenes: First frames and hints of the demonstrations of all tasks.
@@ -91,14 +91,15 @@ def learn_objects(
     Raises:
         DatasetError: No scene has a hint.
     """
-    names = sorted({hint.name for scene in scenes for hint in scene.hints})
-    if not names:
+    hints = [hint for scene in scenes for hint in scene.hints]
+    names = sorted({hint.name for hint in hints} - {model.name for model in known})
+    if not hints:
         raise DatasetError(
             "no demonstration shows a grasp, contact or release; perception has nothing to learn from"
         )
     if segmenter is not None and shape_source != "demonstrations":
         return {**learn_boxes(names, scenes, segmenter, shapes)}
-    floor = min(float(hint.point_world[2]) for scene in scenes for hint in scene.hints) - 0.02
+    floor = min([float(hint.point_world[2]) - 0.02 for hint in hints] + [model.height for model in known])
     if segmenter is not None:
         return _learn_masked(names, scenes, floor, segmenter)
     models: dict[str, KnownObject] = {**learn_patches(names, scenes, known)}
@@ -361,7 +362,7 @@ def _model(
     yaws = (
         np.array([se3.yaw_of(scene.T_world_obj) for scene in posed])[scores > 0.8 * np.median(scores)] + turn
     )
-    yaw_centre, halfwidth = yaw_range(yaws, period)
+    yaw_centre, halfwidth = search_range(yaws, period)
     height = float(np.median([scene.T_world_obj[2, 3] for scene in posed])) + bottom
     return ObjectModel(
         name, log_odds, points.astype(np.float32), cloud.spacing, height, period, yaw_centre, halfwidth,

@@ -4,9 +4,14 @@ Which camera shows an object well, where on it a patch finds hold and how large 
 large one follows the table, one on a bottle's neck slides along it. So patches of all kinds are cut around
 the places that the hand touched, and each is followed through the first frames of many demonstrations, also
 of other tasks. What really follows the object is followed alike by patches of several kinds, a *group*; the
-others each go their own way. Where the hand touched the object often enough, where it went has to agree; and
-two objects do not move alike, so a group belongs to one object alone. One demonstration of each of several
-tasks is enough.
+others each go their own way. Where the hand touched a place of the object more than once, where it went has
+to agree; and two objects do not move alike, so a group belongs to one object alone. One demonstration of each
+of several tasks is enough.
+
+That an object hardly moves is never taken from a few scenes that happen to agree. The hand's repeated
+touches tell how likely it is, all places and both axes taken together. So do the other objects' touches, and
+how the objects are known that were learned before: in one place most objects stand still, in another most
+are moved about.
 """
 
 from __future__ import annotations
@@ -16,6 +21,7 @@ from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
+from scipy.stats import chi2
 
 from lerobot_openspm.geometry.camera import project
 from lerobot_openspm.geometry.se3 import Array
@@ -23,10 +29,11 @@ from lerobot_openspm.perception.model import KnownObject, Patch, PatchModel, Pro
 from lerobot_openspm.perception.patches import as_seen, cut, localise_patches, match
 from lerobot_openspm.perception.types import Hint, Scene, View
 
-# The hand's target moves with the object; if it kept within this in all demonstrations, patches do.
-MAX_SPREAD_M = 0.03
+# The hand's target moves with the object; if its standard deviation along an axis is below this, patches do.
+# It is that of a uniform distribution within 3 cm of the middle, about as far as a patch is sought.
+MAX_STD_M = 0.03 / np.sqrt(3)
 # A place touched less often says nothing of how far its object moves.
-MIN_TOUCHES = 3
+MIN_TOUCHES = 2
 RADII_M = (0.025, 0.035, 0.05, 0.07, 0.10)
 # What holds a patch may lie below the hand, which grasps a bottle's neck or lets go of something above.
 DROPS_M = (0.0, 0.05, 0.10)
@@ -44,8 +51,9 @@ AGREEMENT_M, MIN_AGREEING = 0.0025, 3
 EXPLAINED_SHARE, STILL_M = 0.8, 0.006
 # It may explain it so much worse than the group that does best.
 RESIDUAL_RATIO = 1.3
-# Without touches to ask, a group must move, or it may be the table; and be seen in so many scenes.
-MIN_MOTION_M, MIN_SCENES = 0.001, 6
+# Without touches to ask, a group must move by more than passes for agreement, or it may be the table, and
+# be seen in this many scenes.
+MIN_SCENES = 6
 # Two motions that differ by less than this share of either are those of one object.
 SAME_MOTION_SHARE = 0.3
 # An object that turns looks more like its turned patch, by this much, in more than this share of the scenes.
@@ -105,7 +113,8 @@ def learn_patches(
         scenes: First frames of all demonstrations, with hints at the objects.
         known: Other objects, whose motions are not theirs.
     """
-    candidates = [_candidate(name, scenes) for name in names if _spread(scenes, name) < MAX_SPREAD_M]
+    still = hardly_moving(names, scenes, known)
+    candidates = [_candidate(name, scenes) for name in names if still[name] >= 0.5]
     # What many patches agree on is claimed first: what they follow is not another object.
     candidates.sort(key=lambda one: -max((len(group) for group in one.groups), default=0))
     learned: dict[str, PatchModel] = {}
@@ -118,14 +127,44 @@ def learn_patches(
     return learned
 
 
-def _spread(scenes: Sequence[Scene], name: str) -> float:
-    """Largest distance of a touched place from the middle of its demonstrations' like ones, metres.
+def hardly_moving(
+    names: Sequence[str], scenes: Sequence[Scene], known: Collection[KnownObject] = ()
+) -> dict[str, float]:
+    """Probability by name that an object hardly moves between demonstrations, given all touches.
 
-    Zero where no place was touched often enough to tell.
+    Two or three places that agree are weak evidence, so each object begins with what the others tell: of a
+    beta distribution, counting every other object that tells anything, and one of either kind.
+
+    Args:
+        names: The objects.
+        scenes: First frames of all demonstrations, with hints at the objects.
+        known: Other objects, which are known by patches where they hardly moved.
     """
-    places = _places([hint for scene in scenes for hint in scene.hints if hint.name == name])
-    told = [np.stack([hint.point_world for hint in one])[:, :2] for one in places if len(one) >= MIN_TOUCHES]
-    return max((float(np.ptp(points, axis=0).max() / 2) for points in told), default=0.0)
+    told = {name: p for name in names if (p := _hardly_moves(scenes, name)) is not None}
+    before = [float(isinstance(model, PatchModel)) for model in known if model.name not in names]
+    found = {}
+    for name in names:
+        others = [*before, *(p for other, p in told.items() if other != name)]
+        prior = (1 + sum(others)) / (2 + len(others))
+        own = told.get(name, 0.5)
+        found[name] = own * prior / (own * prior + (1 - own) * (1 - prior))
+    return found
+
+
+def _hardly_moves(scenes: Sequence[Scene], name: str) -> float | None:
+    """Probability, by the touches of one object alone, that its standard deviation is small.
+
+    The variance's posterior given n independent deviations is an inverse chi-squared distribution, where
+    nothing is known of its scale beforehand (Gelman et al., Bayesian Data Analysis, section 2.6). Kept
+    strictly between 0 and 1; None where no place was touched twice.
+    """
+    places = _places(hint for scene in scenes for hint in scene.hints if hint.name == name)
+    points = [np.stack([hint.point_world[:2] for hint in place]) for place in places]
+    degrees = 2 * sum(len(own) - 1 for own in points)
+    if degrees == 0:
+        return None
+    squares = sum(float(((own - own.mean(axis=0)) ** 2).sum()) for own in points)
+    return float(np.clip(chi2.sf(squares / MAX_STD_M**2, degrees), 1e-6, 1 - 1e-6))
 
 
 def _places(hints: Iterable[Hint]) -> list[list[Hint]]:
@@ -227,17 +266,23 @@ def _believable(groups: Sequence[list[_Trail]], hints: Sequence[Hint]) -> list[l
 
 def _moves(trail: _Trail) -> bool:
     size = float(np.nanmedian(np.linalg.norm(trail.motion, axis=1)))
-    return trail.seen >= MIN_SCENES and size > MIN_MOTION_M
+    return trail.seen >= MIN_SCENES and size > AGREEMENT_M
 
 
 def _residual(points: Array, hints: Sequence[Hint], places: Sequence[Sequence[Hint]]) -> float:
-    """Root mean square distance of points ``(n, 2)`` from hints, less each place's own offset, metres."""
+    """Root mean square distance of points ``(n, 2)`` from hints, less each place's own offset, metres.
+
+    Offsets are estimated from the same touches, so a place of n touches tells of n - 1 distances.
+    """
     offsets = np.stack([hint.point_world[:2] for hint in hints]) - points[: len(hints)]
-    left = []
+    squares, degrees = 0.0, 0
     for place in places:
         own = offsets[[i for i, hint in enumerate(hints) if any(hint is one for one in place)]]
-        left.append(np.linalg.norm(own - np.nanmedian(own, axis=0), axis=1))
-    return float(np.sqrt(np.nanmean(np.concatenate(left) ** 2)))
+        own = own[np.isfinite(own[:, 0])]
+        if len(own) > 1:
+            squares += float(((own - own.mean(axis=0)) ** 2).sum())
+            degrees += len(own) - 1
+    return float(np.sqrt(squares / degrees)) if degrees else np.inf
 
 
 def _claimed(trail: _Trail, scenes: Sequence[Scene], known: Iterable[KnownObject]) -> bool:

@@ -1,0 +1,261 @@
+"""`openspm memory`, typed as a user types it, on a memory made by hand."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from tests.cli.conftest import Openspm
+from tests.memory.builders import entry, robot
+from tests.memory.experiences import LAYOUTS, experience, merged_entry, same
+from tests.perception.builders import model
+
+from lerobot_openspm.cli.memory import COMMANDS
+from lerobot_openspm.experience import Experience, load_experience, save_experience
+
+BOWL, DRAWER, STOVE = "put the bowl on the plate", "open the top drawer", "put the bowl on the stove"
+OBJECTS = {"bowl": model("bowl", 1), "plate": model("plate", 2), "cabinet": model("cabinet", 3)}
+
+
+def made() -> Experience:
+    base = experience(objects=OBJECTS, layouts=LAYOUTS)
+    return replace(base, entries=(*base.entries, entry(BOWL, source="local/demos#2", quality=0.6)))
+
+
+@pytest.fixture
+def memory(tmp_path: Path) -> Path:
+    save_experience(made(), tmp_path / "memory")
+    return tmp_path / "memory"
+
+
+def run(openspm: Openspm, memory: Path, command: str, *options: str) -> dict[str, Any]:
+    code, out, err = openspm("memory", command, f"--path={memory}", *options)
+    assert code == 0, err
+    return json.loads(out.splitlines()[-1])
+
+
+def refused(openspm: Openspm, memory: Path, command: str, *options: str) -> str:
+    """The one line that a mistake is answered with; the memory is as it was."""
+    before = {path.name: path.read_bytes() for path in memory.iterdir()}
+    code, out, err = openspm("memory", command, f"--path={memory}", *options)
+    assert (code, out) == (2, "")
+    assert {path.name: path.read_bytes() for path in memory.iterdir() if path.name != ".memory.lock"} == {
+        name: content for name, content in before.items() if name != ".memory.lock"
+    }
+    assert "Traceback" not in err
+    return err.splitlines()[-1]
+
+
+def sources(memory: Path) -> list[str]:
+    return [e.source for e in load_experience(memory).entries]
+
+
+def test_it_lists_its_commands_and_their_options(openspm: Openspm):
+    code, out, _ = openspm("memory")
+    assert code == 0
+    assert all(f"  {name}" in out for name in COMMANDS)
+    for name in COMMANDS:
+        code, out, _ = openspm("memory", name, "--help")
+        assert (code, "--path" in out) == (0, True)
+    code, _, err = openspm("memory", "forget")
+    assert (code, "unknown command 'forget'; expected one of list, show" in err) == (2, True)
+
+
+def test_list(openspm: Openspm, memory: Path):
+    code, out, _ = openspm("memory", "list", f"--path={memory}")
+    assert code == 0
+    assert [line.split("  ")[-2] for line in out.splitlines()[:-1]] == [f"local/demos#{i}" for i in range(3)]
+    summary = {"entries": 3, "superseded": 0, "listed": 3, "per_task": {BOWL: 2, DRAWER: 1}}
+    assert json.loads(out.splitlines()[-1]) == summary
+    code, out, _ = openspm("memory", "list", f"--path={memory}", "--tasks=true", "--instruction=bowl")
+    assert out.splitlines()[0].split() == ["2", "entries", "mean", "quality", "0.75", *repr(BOWL).split()]
+    assert len(out.splitlines()) == 2
+    assert "2 more; --limit=3" in openspm("memory", "list", f"--path={memory}", "--limit=1")[1]
+
+
+def test_show(openspm: Openspm, memory: Path):
+    save_experience(replace(made(), entries=(merged_entry(source="local/demos#0, local/demos#1"),)), memory)
+    code, out, _ = openspm("memory", "show", f"--path={memory}", "--source=local/demos#0, local/demos#1")
+    assert code == 0
+    assert out.count(" mm, ") == len(merged_entry().key_poses) == out.count("  spread ")
+    assert json.loads(out.splitlines()[-1]) == {"entries": 1, "shown": 1}
+    assert "holds nothing from 'elsewhere#1'" in refused(openspm, memory, "show", "--source=elsewhere#1")
+
+
+def test_what_is_removed_is_named_and_kept_as_superseded(openspm: Openspm, memory: Path):
+    code, out, _ = openspm("memory", "remove", f"--path={memory}", "--source=local/demos#2")
+    assert code == 0
+    assert out.splitlines()[0] == f"removed version 1 of local/demos#2: {BOWL!r}"
+    assert json.loads(out.splitlines()[-1]) == {"entries": 2, "superseded": 1, "removed": 1}
+    loaded = load_experience(memory)
+    assert same(loaded, replace(made(), entries=made().entries[:2], superseded=made().entries[2:]))
+    _, out, _ = openspm("memory", "list", f"--path={memory}", "--all=true")
+    assert [line.endswith("superseded") for line in out.splitlines()[:-1]] == [False, False, True]
+
+
+def test_removing_nothing_or_everything_is_refused(openspm: Openspm, memory: Path):
+    assert "pass --source=DATASET#EPISODE or --instruction" in refused(openspm, memory, "remove")
+    error = refused(openspm, memory, "remove", "--instruction=put the bowl")
+    assert f"holds no entry of 'put the bowl'; it knows: {DRAWER}; {BOWL}" in error
+    assert run(openspm, memory, "remove", f"--instruction={BOWL}")["removed"] == 2
+    error = refused(openspm, memory, "remove", f"--instruction={DRAWER}")
+    assert "would remove all 1 entries" in error
+
+
+def test_add_takes_entries_and_objects_of_another_memory_once(openspm: Openspm, memory: Path, tmp_path: Path):
+    objects = {**OBJECTS, "stove": model("stove", 4)}
+    other = replace(made(), objects=objects, entries=(made().entries[0], entry(STOVE, source="local/new#0")))
+    save_experience(other, tmp_path / "other")
+    added = run(openspm, memory, "add", f"--other={tmp_path / 'other'}")
+    assert added == {"entries": 4, "superseded": 0, "added": 1, "unchanged": 1}
+    assert sources(memory) == [*(f"local/demos#{i}" for i in range(3)), "local/new#0"]
+    assert set(load_experience(memory).objects) == {"stove", "bowl", "plate", "cabinet"}
+    again = run(openspm, memory, "add", f"--other={tmp_path / 'other'}")
+    assert again == {"entries": 4, "superseded": 0, "added": 0, "unchanged": 2}
+
+
+ELSEWHERE = {
+    "perception": ({"perception": "oracle"}, "perception is 'oracle', the memory's 'demonstrations'"),
+    "segmentation": ({"segmentation": "sam3"}, "segmentation is 'sam3'"),
+    "shape": ({"shape": "box"}, "shape is 'box'"),
+    "layout": ({"layouts": LAYOUTS[::-1]}, "'layouts': the memory's state is"),
+    "gripper": ({"robot": robot(close_command=-1.0, open_command=1.0)}, "close_command is -1"),
+    "objects": ({"objects": {**OBJECTS, "plate": model("plate", 9)}}, "'plate' is known by another model"),
+}
+
+
+@pytest.mark.parametrize("what", ELSEWHERE)
+def test_entries_from_elsewhere_are_refused(openspm: Openspm, memory: Path, tmp_path: Path, what: str):
+    changes, message = ELSEWHERE[what]
+    save_experience(replace(made(), **changes), tmp_path / "other")
+    assert message in refused(openspm, memory, "add", f"--other={tmp_path / 'other'}") or what == "gripper"
+    if what == "gripper":
+        new = replace(made(), entries=(entry(BOWL, source="local/new#0"),), **changes)
+        save_experience(new, tmp_path / "other")
+        assert message in refused(openspm, memory, "add", f"--other={tmp_path / 'other'}")
+
+
+def test_add_refuses_what_is_no_memory(openspm: Openspm, memory: Path, tmp_path: Path):
+    assert "pass --other=FOLDER" in refused(openspm, memory, "add")
+    assert "nothing at nowhere" in refused(openspm, memory, "add", "--other=nowhere")
+    (tmp_path / "some.json").write_text('{"format": "zip"}')
+    assert "expected format 'openspm-entries'" in refused(
+        openspm, memory, "add", f"--other={tmp_path / 'some.json'}"
+    )
+    empty = tmp_path / "empty"
+    empty.mkdir()
+    assert "no memory at" in refused(openspm, empty, "add", f"--other={memory}")
+
+
+def test_an_exported_file_can_be_edited_and_added_again(openspm: Openspm, memory: Path, tmp_path: Path):
+    file = tmp_path / "entries.json"
+    assert run(openspm, memory, "export", f"--output={file}", f"--instruction={BOWL}")["entries"] == 2
+    assert run(openspm, memory, "add", f"--other={file}")["unchanged"] == 2
+    assert same(load_experience(memory), made())
+    exported = json.loads(file.read_text())
+    assert sorted(exported["objects"]) == ["bowl", "plate"]
+    exported["entries"][1]["key_poses"][0]["T_obj_ee"][2][3] = 0.5
+    file.write_text(json.dumps(exported))
+    added = run(openspm, memory, "add", f"--other={file}")
+    assert added == {"entries": 3, "superseded": 1, "added": 1, "unchanged": 1}
+    after = load_experience(memory)
+    assert sorted(sources(memory)) == [f"local/demos#{i}" for i in range(3)]
+    edited = next(e for e in after.entries if e.source == "local/demos#2")
+    assert (edited.version, edited.key_poses[0].T_obj_ee[2, 3]) == (2, 0.5)
+    assert same(after.superseded[0], made().entries[2])
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (
+            lambda e: e["entries"][0].update(quality=3),
+            r"entries[0] is malformed: ValueError(\"'quality' is 3",
+        ),
+        (
+            lambda e: e["entries"][1]["key_poses"][0].pop("T_obj_ee"),
+            "entries[1] is malformed: KeyError('T_obj_ee')",
+        ),
+        (lambda e: e["objects"].update(bowl="0" * 16), "'bowl' is known by another model"),
+        (lambda e: e.update(entries=3), "'entries' must be a list"),
+        (lambda e: e.update(colour="red"), "unknown fields ['colour']"),
+        (lambda e: e["robot"].pop("open_width"), "'robot' is malformed"),
+        (lambda e: e.update(version=99), "'version': 99"),
+    ],
+)
+def test_a_badly_edited_file_is_refused(
+    openspm: Openspm, memory: Path, tmp_path: Path, change: Any, message: str
+):
+    file = tmp_path / "entries.json"
+    run(openspm, memory, "export", f"--output={file}")
+    exported = json.loads(file.read_text())
+    change(exported)
+    file.write_text(json.dumps(exported))
+    error = refused(openspm, memory, "add", f"--other={file}")
+    assert str(file) in error
+    assert message.replace("\\", "") in error
+
+
+def test_an_exported_folder_is_a_memory(openspm: Openspm, memory: Path, tmp_path: Path):
+    run(openspm, memory, "export", f"--output={tmp_path / 'out'}", "--source=local/demos#1")
+    assert same(load_experience(tmp_path / "out"), replace(made(), entries=made().entries[1:2]))
+    assert "exists already" in refused(openspm, memory, "export", f"--output={tmp_path / 'out'}")
+    error = refused(openspm, memory, "export", f"--output={tmp_path / 'more'}", "--source=elsewhere#1")
+    assert "holds no such entry" in error
+
+
+def test_what_was_removed_or_edited_is_restored(openspm: Openspm, memory: Path):
+    edited = replace(entry(BOWL, source="local/demos#2", quality=0.1), version=2)
+    save_experience(
+        replace(made(), entries=(*made().entries[:2], edited), superseded=made().entries[2:]), memory
+    )
+    restored = run(openspm, memory, "restore", "--source=local/demos#2")
+    assert restored == {"entries": 3, "superseded": 1, "restored": "local/demos#2", "version": 3}
+    after = load_experience(memory)
+    assert same(after.entries[-1], replace(made().entries[2], version=3))
+    assert same(after.superseded[0], edited)
+    run(openspm, memory, "remove", "--source=local/demos#2")
+    error = refused(openspm, memory, "restore", "--source=local/demos#2", "--version=1")
+    assert "no such superseded entry of 'local/demos#2', of its versions: 2, 3" in error
+    assert run(openspm, memory, "restore", "--source=local/demos#2", "--version=2")["version"] == 4
+    assert load_experience(memory).entries[-1].quality == 0.1
+
+
+def test_merge(openspm: Openspm, memory: Path):
+    assert run(openspm, memory, "merge") == {"entries": 2, "superseded": 2, "merged": 2, "into": 1}
+    assert sources(memory) == ["local/demos#0, local/demos#2", "local/demos#1"]
+    assert load_experience(memory).entries[0].quality == pytest.approx(0.75)
+    assert run(openspm, memory, "merge")["merged"] == 0
+    assert "distance_m is -1" in refused(openspm, memory, "merge", "--distance_m=-1")
+
+
+def test_rate(openspm: Openspm, memory: Path):
+    rated = run(openspm, memory, "rate", "--source=local/demos#2", "--success=true")
+    assert rated == {
+        "entries": 3, "superseded": 0, "quality": pytest.approx(4 / 6), "trials": 1, "successes": 1,
+    }  # fmt: skip
+    assert run(openspm, memory, "rate", "--source=local/demos#2", "--success=false")["trials"] == 2
+    assert [e.trials for e in load_experience(memory).entries] == [0, 0, 2]
+    assert "pass --success=true or" in refused(openspm, memory, "rate", "--source=local/demos#2")
+    same_source = entry(STOVE, source="local/demos#2")
+    save_experience(replace(made(), entries=(*made().entries, same_source)), memory)
+    error = refused(openspm, memory, "rate", "--source=local/demos#2", "--success=true")
+    assert (
+        f"2 entries come from 'local/demos#2'; pass --instruction=TEXT with one of: {BOWL}; {STOVE}" in error
+    )
+
+
+def test_another_calibration_is_put_into_a_memory(openspm: Openspm, memory: Path, tmp_path: Path):
+    file = tmp_path / "cameras.json"
+    file.write_text((memory / "cameras.json").read_text().replace("50.1", "60.5"))
+    assert run(openspm, memory, "cameras", f"--file={file}")["cameras"] == ["observation.images.front"]
+    assert load_experience(memory).cameras["observation.images.front"].fx == 60.5
+    # One that was edited in its place is meant likewise.
+    file = memory / "cameras.json"
+    file.write_text(file.read_text().replace("60.5", "70.5"))
+    assert "--file=" in refused(openspm, memory, "list")
+    run(openspm, memory, "cameras", f"--file={file}")
+    assert load_experience(memory).cameras["observation.images.front"].fx == 70.5
+    assert np.isfinite(load_experience(memory).cameras["observation.images.front"].T_mount_cam).all()

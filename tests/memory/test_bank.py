@@ -1,0 +1,103 @@
+import copy
+import json
+import pickle
+
+import numpy as np
+import pytest
+from tests.memory.builders import entry
+from tests.memory.experiences import experience, same
+from tests.memory.memory_files import edit_arrays, edit_entries
+
+from lerobot_openspm import experience as module
+from lerobot_openspm.errors import MemoryFormatError
+from lerobot_openspm.experience import load_experience, save_experience
+from lerobot_openspm.memory.bank import EntryBank
+from lerobot_openspm.memory.columns import HasColumns, columns_of
+
+MANY = tuple(entry(source=f"local/demos#{i}", quality=i / 10) for i in range(10))
+
+
+@pytest.fixture
+def bank(tmp_path, monkeypatch):
+    monkeypatch.setattr(module, "READ_AT_LOAD", 5)
+    save_experience(experience(entries=MANY), tmp_path)
+    return load_experience(tmp_path).entries
+
+
+def test_a_large_memorys_entries_are_a_sequence_read_when_asked_for(bank):
+    assert isinstance(bank, EntryBank)
+    assert len(bank) == 10
+    assert same(tuple(bank), MANY)
+    assert same(bank[3], MANY[3])
+    assert same(bank[-1], MANY[-1])
+    assert bank[3] is bank[3]
+    assert same(tuple(bank[7:2:-2]), MANY[7:2:-2])
+    with pytest.raises(IndexError):
+        _ = bank[10]
+
+
+def test_it_can_be_copied_and_sent_to_other_processes(bank):
+    for again in (copy.deepcopy(bank), pickle.loads(pickle.dumps(bank[2:4]))):
+        assert same(again[1], MANY[1] if len(again) == 10 else MANY[3])
+
+
+def test_superseded_entries_are_not_among_those_in_use(tmp_path, monkeypatch):
+    monkeypatch.setattr(module, "READ_AT_LOAD", 5)
+    save_experience(experience(entries=MANY[:7], superseded=MANY[7:]), tmp_path)
+    loaded = load_experience(tmp_path)
+    assert [e.source for e in loaded.entries] == [e.source for e in MANY[:7]]
+    assert [e.source for e in loaded.superseded] == [e.source for e in MANY[7:]]
+    save_experience(loaded, tmp_path)
+    assert same(tuple(load_experience(tmp_path).superseded), MANY[7:])
+
+
+def test_what_is_open_stays_readable_when_a_newer_memory_is_saved(bank, tmp_path):
+    save_experience(experience(), tmp_path)
+    assert same(tuple(bank), MANY)
+
+
+def test_an_entry_at_an_object_that_the_header_does_not_list_is_refused(tmp_path, monkeypatch):
+    monkeypatch.setattr(module, "READ_AT_LOAD", 1)
+    save_experience(experience(entries=MANY), tmp_path)
+
+    def rename(rows):
+        rows[2] = json.loads(json.dumps(rows[2]).replace("plate", "moon"))
+
+    edit_entries(tmp_path, rename)
+    entries = load_experience(tmp_path).entries
+    with pytest.raises(MemoryFormatError, match=r"entries\[2\] has key poses at \['moon'\]"):
+        tuple(entries)
+
+
+def test_what_is_kept_to_find_entries_by_is_what_reading_them_would_say(tmp_path, monkeypatch):
+    monkeypatch.setattr(module, "READ_AT_LOAD", 5)
+    stove = entry("put the bowl on the stove", source="local/demos#10", quality=0.25)
+    save_experience(experience(entries=(*MANY, stove), superseded=MANY[:1]), tmp_path)
+    bank = load_experience(tmp_path).entries
+    assert isinstance(bank, HasColumns)
+    for some, entries in (
+        (bank, (*MANY, stove)),
+        (bank[8:], (*MANY[8:], stove)),
+        (bank[::-2], [*MANY, stove][::-2]),
+    ):
+        kept, made = columns_of(some), columns_of(entries)
+        assert kept.digests.tolist() == made.digests.tolist()
+        assert kept.qualities.tolist() == made.qualities.tolist()
+
+
+@pytest.mark.parametrize("name", ["entries.keys", "entries.qualities"])
+def test_columns_of_another_kind_are_refused(tmp_path, name):
+    save_experience(experience(), tmp_path)
+    edit_arrays(tmp_path, lambda arrays: arrays.update({name: arrays[name].astype(np.float32)}))
+    with pytest.raises(MemoryFormatError, match=f"array '{name}' is float32"):
+        load_experience(tmp_path)
+    edit_arrays(tmp_path, lambda arrays: arrays.pop(name))
+    with pytest.raises(MemoryFormatError, match=f"array '{name}' is missing"):
+        load_experience(tmp_path)
+
+
+def test_another_quality_than_the_entrys_is_refused(tmp_path):
+    save_experience(experience(), tmp_path)
+    edit_arrays(tmp_path, lambda arrays: arrays.update({"entries.qualities": np.array([0.9, 0.1])}))
+    with pytest.raises(MemoryFormatError, match=r"entries\[1\] has another quality"):
+        load_experience(tmp_path)

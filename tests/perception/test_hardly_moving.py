@@ -1,0 +1,84 @@
+"""Whether an object hardly moves is a matter of evidence: two or three scenes that agree are little of it."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from tests.perception.builders import model
+from tests.perception.drawn_world import demonstration, draw_poses
+
+from lerobot_openspm.perception.learning import learn_objects
+from lerobot_openspm.perception.model import PatchModel
+from lerobot_openspm.perception.patch_learning import hardly_moving
+from lerobot_openspm.perception.types import Hint, Scene
+
+# How far to either side of the middle objects stand, along both axes.
+NEAR_M, FAR_M = 0.007, 0.06
+
+
+def scenes(sides_m: dict[str, float], touches: int, places: int = 1) -> list[Scene]:
+    """Scenes in which every object is touched, in turn on one side of its middle and on the other."""
+    return [
+        Scene(
+            {},
+            tuple(
+                Hint(name, np.array([(-1) ** i * side, (-1) ** i * side, 0.1]), "grasp", f"{name} {place}")
+                for name, side in sides_m.items()
+            ),
+        )
+        for place in range(places)
+        for i in range(touches)
+    ]
+
+
+def test_a_few_scenes_that_agree_are_not_believed_where_everything_else_moves():
+    others: dict[str, float] = dict.fromkeys(["bowl", "plate", "box", "rack"], FAR_M)
+    sides_m = {"cabinet": NEAR_M, **others}
+    few = hardly_moving(list(sides_m), scenes(sides_m, touches=2))
+    assert max(few.values()) == few["cabinet"] < 0.5
+    many = hardly_moving(list(sides_m), scenes(sides_m, touches=10))
+    assert many["cabinet"] > 0.99
+    assert all(many[name] < 0.01 for name in others)
+
+
+def test_a_few_are_enough_where_everything_else_stands_still():
+    sides_m: dict[str, float] = dict.fromkeys(["cabinet", "bowl", "plate", "box", "rack"], NEAR_M)
+    assert min(hardly_moving(list(sides_m), scenes(sides_m, touches=2)).values()) > 0.75
+
+
+def test_places_that_are_touched_twice_count_together():
+    """The cabinet of the tabletop: two touches each of four places, none of which tells much."""
+    alone = hardly_moving(["cabinet"], scenes({"cabinet": 0.021}, touches=2))["cabinet"]
+    together = hardly_moving(["cabinet"], scenes({"cabinet": 0.021}, touches=2, places=4))["cabinet"]
+    assert 0.0 < together < 0.1 * alone
+
+
+def test_where_one_place_lies_of_another_says_nothing():
+    apart = scenes({"cabinet": NEAR_M}, touches=1, places=6)
+    assert hardly_moving(["cabinet"], apart) == {"cabinet": 0.5}
+
+
+def patches(name: str) -> PatchModel:
+    return PatchModel(name, (), 0.0, 1.0)
+
+
+def test_what_is_known_already_tells_how_it_is_here():
+    once = scenes({"rack": NEAR_M}, touches=1)
+    still = [patches(name) for name in ("bowl", "plate", "stove")]
+    moved = [model(name) for name in ("bowl", "plate", "stove")]
+    assert hardly_moving(["rack"], once, still)["rack"] == pytest.approx(0.8)
+    assert hardly_moving(["rack"], once, moved)["rack"] == pytest.approx(0.2)
+
+
+def test_a_movable_object_that_stood_still_in_a_few_scenes_is_learned_by_its_shape():
+    # Of many scenes, the two in which the block stood nearest to one place; the cup moved between them.
+    at = np.stack([draw_poses(np.random.default_rng(seed))["block"][:2, 3] for seed in range(40)])
+    between = np.linalg.norm(at[:, None] - at[None], axis=2) + np.eye(len(at))
+    assert between.min() < 0.01
+    pair = np.unravel_index(int(between.argmin()), between.shape)
+    alike = [demonstration(np.random.default_rng(int(seed))) for seed in pair]
+    alike = [replace(s, hints=tuple(replace(h, place=h.name) for h in s.hints)) for s in alike]
+    known = [replace(model("bowl"), name=name) for name in ("bowl", "plate")]
+    models = learn_objects(alike, np.random.default_rng(0), known)
+    assert "block" in models
+    assert not isinstance(models["block"], PatchModel)

@@ -1,0 +1,68 @@
+"""What the policy is told of how its episodes ended changes the entries that it acted by."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from tests.policy.conftest import Frame, batch_of
+
+from lerobot_openspm.errors import OpenSPMError
+from lerobot_openspm.experience import load_experience
+from lerobot_openspm.modeling_openspm import OpenSPMPolicy
+
+
+def trials(policy: OpenSPMPolicy) -> dict[str, tuple[int, int]]:
+    """Trials and successes by source, of entries that have any."""
+    return {e.source: (e.trials, e.successes) for e in policy.require_experience().entries if e.trials}
+
+
+def test_outcomes_change_the_entries_that_were_acted_by_and_are_saved(
+    policy: OpenSPMPolicy, recorded: list[list[Frame]], tmp_path: Path
+):
+    policy.select_action(batch_of([recorded[0][0], recorded[3][0], recorded[4][0]]))
+    used = [row.used_entries for row in policy.rows]
+    assert [len(entries) for entries in used] == [1, 1, 1]
+    bowl, stove = used[0][0], used[1][0]
+    policy.report_outcomes([False, True, None])
+    assert trials(policy) == {bowl.source: (1, 0), stove.source: (1, 1)}
+    quality = {e.source: e.quality for e in policy.require_experience().entries}
+    assert quality[bowl.source] < bowl.quality
+    assert stove.quality < quality[stove.source]
+    # An episode counts once; what was not known may follow later.
+    policy.report_outcomes([True, False, True])
+    policy.report_outcomes([True, False, False])
+    third = used[2][0].source
+    expected = {bowl.source: (1, 0), stove.source: (1, 1)}
+    tried, succeeded = expected.get(third, (0, 0))
+    expected[third] = (tried + 1, succeeded + 1)
+    assert trials(policy) == expected
+    policy.save_pretrained(tmp_path)
+    saved = {e.source: (e.trials, e.successes) for e in load_experience(tmp_path).entries if e.trials}
+    assert saved == expected
+
+
+def test_the_next_episodes_choose_by_what_was_learned(policy: OpenSPMPolicy, recorded: list[list[Frame]]):
+    frame = batch_of([recorded[0][0]])
+    chosen = []
+    for _ in range(12):
+        policy.reset()
+        policy.select_action(frame)
+        chosen.append(policy.rows[0].used_entries[0].source)
+        policy.report_outcomes([False])
+    # What goes on failing is left for another demonstration of the same task.
+    assert len(set(chosen)) > 1
+    assert sum(tried for tried, _ in trials(policy).values()) == 12
+
+
+def test_outcomes_of_episodes_that_do_not_run_are_refused(
+    load: Callable[..., OpenSPMPolicy], recorded: list[list[Frame]]
+):
+    policy = load()
+    with pytest.raises(OpenSPMError, match="got 1 outcomes, but 0 episodes are running"):
+        policy.report_outcomes([True])
+    policy.select_action(batch_of([recorded[0][0]]))
+    with pytest.raises(OpenSPMError, match="got 2 outcomes, but 1 episodes are running"):
+        policy.report_outcomes([True, False])
+    policy.reset()
+    policy.report_outcomes([])
+    assert trials(policy) == {}
