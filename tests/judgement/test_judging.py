@@ -22,6 +22,7 @@ from tests.policy.lerobot_commands import CALIBRATION
 from lerobot_openspm.configuration_openspm import OpenSPMConfig
 from lerobot_openspm.errors import DatasetError, PerceptionError
 from lerobot_openspm.experience import load_experience
+from lerobot_openspm.judgement import question
 from lerobot_openspm.judgement.judging import MAX_FAILURES
 from lerobot_openspm.judgement.structure import check_sequence
 from lerobot_openspm.memory.entry import PHASES
@@ -192,7 +193,11 @@ def test_a_server_that_fails_now_and_then_is_asked_on(mined: Mined, asked, caplo
     assert "is asked no more" not in caplog.text
 
 
-def test_qwen3vl_judges_in_this_process(mined: Mined, tiny_qwen3vl_folder: Path, tmp_path: Path):
+def test_qwen3vl_judges_in_this_process(
+    mined: Mined, tiny_qwen3vl_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    # Its tokens are single letters, and a trajectory has thousands.
+    monkeypatch.setattr(question, "TRAJECTORY_MOMENTS", 2)
     found = mined.judged(
         first=1,
         phase_judge="qwen3vl",
