@@ -233,13 +233,13 @@ def _symmetrise(
     posed: list[Posed], half_size: float, cloud: Cloud, limits: tuple[float, float]
 ) -> tuple[Cloud, list[Posed], float]:
     """The most symmetric shape that explains the masks as well as the free one, poses and yaw period."""
-    _, halfwidth = yaw_range(np.array([se3.yaw_of(scene.T_world_obj) for scene in posed]), 2 * np.pi)
+    _, halfwidth = search_range(np.array([se3.yaw_of(scene.T_world_obj) for scene in posed]), 2 * np.pi)
     free = float(
         np.mean([one.score for one in (_refit(scene, cloud, 2 * np.pi) for scene in _reliable(posed, cloud))])
     )
     for order in (BODY_OF_REVOLUTION, 4, 2):
         period = 0.0 if order == BODY_OF_REVOLUTION else 2 * np.pi / order
-        # Where the yaws keep to a part of the circle nothing shows the symmetry, and nothing needs it.
+        # Where the yaws are sure to keep to a part of the circle, nothing needs the symmetry, nor shows it.
         if period > 0 and halfwidth < period / 2:
             continue
         turned, moved = cloud, posed
