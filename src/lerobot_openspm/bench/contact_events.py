@@ -13,9 +13,8 @@ place   The last frame in which both fingers squeeze a free thing that they move
         policy needs to know is where to open its fingers.
 open    The same for a thing on a slide: its handle is let go of.
 turn    The same for a thing on a hinge.
-release The last frame before the hand leaves, of those in which the fingers are open and have come to rest.
-push    The last frame before the hand leaves what it moved without holding it, or stops to touch it; of those
-        in which that has come to rest.
+release The last frame before the hand leaves, after the fingers have opened.
+push    The last frame before the hand leaves what it moved without holding it, after it touched it last.
 ======= ======================================================================================================
 
 A phase that is going on when the demonstration ends, ends there. The other phases (approach, lift, pre-place,
@@ -35,17 +34,15 @@ from lerobot_openspm.bench.contact_sensor import ThingKind, ThingTrack
 from lerobot_openspm.geometry import se3
 from lerobot_openspm.geometry.se3 import Array
 
-# Contacts flicker: what is lost for this long and found again was not lost.
-GAP_STEPS = 3
-# What was moved by less than this while the hand had it was not manipulated (a radian counts as 0.1 m).
+# Contacts flicker: what is lost for this long, a quarter of a second, and found again was not lost.
+GAP_STEPS = 5
+# What was moved by less than this while the hand had it was not manipulated (a radian counts as 0.1 m), and a
+# hand that stays this near to what it touched, trembling or recoiling, has not gone away from it.
 MOVED_M = 0.03
-# A hand or a thing has left where it stood when it is this far away; it began to when it was still this near.
-# Between the two lies more than a hand trembles by.
-LEFT_M, STOOD_M = 0.010, 0.005
-# Fingers whose opening changes by less than this in a step rest; they have opened when it grew by this much.
-FINGERS_REST_M, FINGERS_OPENED_M = 0.0005, 0.010
-# A hand that stays this near to where it touched a thing goes on pushing it after a pause.
-STAYED_M = 0.030
+# What leaves gets further away by this much in every step (1 cm/s); slower than that it stands.
+LEAVING_M = 0.0005
+# Fingers have opened when they have gone this share of how far they open within this time.
+OPENED_SHARE, OPENING_STEPS = 0.8, 40
 ENDS: dict[ThingKind, str] = {"free": "place", "slide": "open", "hinge": "turn"}
 PHASES = ("grasp", "place", "open", "turn", "release", "push")
 
@@ -101,12 +98,15 @@ def _of_hold(
 ) -> list[ContactEvent]:
     """Grasp, end and release of one hold."""
     held = slice(first, last + 1)
-    grasp = ContactEvent("grasp", first + stands(track.T_world_thing[held], T_world_ee[held]), first)
+    grasp = ContactEvent(
+        "grasp", first + stands([track.T_world_thing[held], T_world_ee[held]], MOVED_M), first
+    )
     end = ContactEvent(ENDS[track.kind], last, last)
     if last == len(opening) - 1:
         return [grasp, end]
-    rest = _opened(opening, last)
-    return [grasp, end, ContactEvent("release", rest + stands(T_world_ee[rest:]), last + 1)]
+    sweep = opening[last : last + OPENING_STEPS] - opening[last]
+    opened = last + int(np.argmax(sweep >= OPENED_SHARE * sweep.max()))
+    return [grasp, end, ContactEvent("release", opened + stands([T_world_ee[opened:]], MOVED_M), last + 1)]
 
 
 def _pushes(track: ThingTrack, holds: Sequence[tuple[int, int]], T_world_ee: Array) -> Iterator[ContactEvent]:
@@ -117,7 +117,7 @@ def _pushes(track: ThingTrack, holds: Sequence[tuple[int, int]], T_world_ee: Arr
         if any(first <= b and last >= a for a, b in holds):
             continue
         between = T_thing_ee[stretches[-1][1] : first + 1, :3, 3] if stretches else np.empty((0, 3))
-        if stretches and np.linalg.norm(between - between[0], axis=-1).max() < STAYED_M:
+        if stretches and np.linalg.norm(between - between[0], axis=-1).max() < MOVED_M:
             stretches[-1] = (stretches[-1][0], last)
         else:
             stretches.append((first, last))
@@ -126,8 +126,7 @@ def _pushes(track: ThingTrack, holds: Sequence[tuple[int, int]], T_world_ee: Arr
         poses = track.T_world_thing[max(first - 1, 0) : last + GAP_STEPS + 1]
         # What a hand brushes in passing may swing out and back.
         if se3.distance(poses[0], poses[-1]) > MOVED_M:
-            rest = max(first - 1, 0) + len(poses) - 1 - stands(poses[::-1])
-            yield ContactEvent("push", rest + stands(T_world_ee[rest:]), rest)
+            yield ContactEvent("push", last + stands([T_world_ee[last:]], MOVED_M), last)
 
 
 def runs(flags: NDArray[np.bool_], gap: int) -> list[tuple[int, int]]:
@@ -141,24 +140,22 @@ def runs(flags: NDArray[np.bool_], gap: int) -> list[tuple[int, int]]:
     return found
 
 
-def stands(*paths: Array) -> int:
-    """Index of the last poses ``(n, 4, 4)`` at which what stood at the first had not begun to leave together.
+def stands(paths: Sequence[Array], away: float) -> int:
+    """Index of the last poses at which what stood at the first ones had not begun to leave together.
 
     A thing that shifts between closing fingers has not left, nor has a hand that trembles around it.
+
+    Args:
+        paths: Poses ``(n, 4, 4)`` of each.
+        away: What is further than this from where it stood has left, in metres.
     """
     distance = np.min([se3.distance(T[:1], T) for T in paths], axis=0)
-    left = np.flatnonzero(distance > LEFT_M)
-    last = int(left[0]) if len(left) else len(distance)
-    return int(np.flatnonzero(distance[:last] < STOOD_M)[-1]) if len(left) else last - 1
+    left = np.flatnonzero(distance > away)
+    if not len(left):
+        return len(distance) - 1
+    lingers = np.flatnonzero(np.diff(distance[: left[0] + 1]) < LEAVING_M)
+    return int(lingers[-1]) + 1 if len(lingers) else 0
 
 
 def _farthest(T: Array) -> float:
     return float(np.max(se3.distance(T[:1], T)))
-
-
-def _opened(opening: Array, start: int) -> int:
-    """First frame at which the fingers, closed at `start`, rest wide apart; the last one if they never do."""
-    wide = opening[start:-1] > opening[start] + FINGERS_OPENED_M
-    rest = (np.abs(np.diff(opening[start:])) < FINGERS_REST_M) & wide
-    found = np.flatnonzero(rest)
-    return start + int(found[0]) if len(found) else len(opening) - 1

@@ -183,7 +183,7 @@ MEASURES: dict[str, Callable[[BenchConfig], dict[str, Any]]] = {
 }
 # Measures with options of their own: a module with a dataclass `Options` and `measure(options)`, which
 # returns what is printed. Imported when it is asked for.
-ON_THEIR_OWN: dict[str, str] = {}
+ON_THEIR_OWN: dict[str, str] = {"keyposes": "lerobot_openspm.bench.key_poses"}
 
 
 def main(args: Sequence[str] | None = None) -> None:
