@@ -290,7 +290,7 @@ def _settled(episode: Episode, start: int, until: int) -> int:
 
 
 def _parting(opening: Array) -> int:
-    """Index of the last frame before fingers that were told to open part; a tight grip takes a while to ease."""
+    """Index of the last frame before fingers that were told to open part: a tight grip eases first."""
     sweep = opening - opening[0]
     return max(int(np.argmax(sweep >= PARTING_FRACTION * sweep.max())) - 1, 0) if sweep.max() > 0 else 0
 
