@@ -41,6 +41,9 @@ GAP_STEPS = 5
 MOVED_M = 0.03
 # What leaves gets further away by this much in every step (1 cm/s); slower than that it stands.
 LEAVING_M = 0.0005
+# A thing that moves by this much in a step (2 cm/s), and the hand with it, is being pushed, though contact
+# may be lost at the moment that is looked at.
+PUSHED_M = 0.001
 # Fingers have opened when they have gone this share of how far they open within this time.
 OPENED_SHARE, OPENING_STEPS = 0.8, 40
 ENDS: dict[ThingKind, str] = {"free": "place", "slide": "open", "hinge": "turn"}
@@ -113,8 +116,11 @@ def _pushes(track: ThingTrack, holds: Sequence[tuple[int, int]], T_world_ee: Arr
     """Ends of pushes: contact that moved the thing and was no hold."""
     T_thing_ee = se3.inverse(track.T_world_thing) @ T_world_ee
     stretches: list[tuple[int, int]] = []
-    for first, last in runs(track.touched, GAP_STEPS):
-        if any(first <= b and last >= a for a, b in holds):
+    step = se3.distance(track.T_world_thing[:-1], track.T_world_thing[1:])
+    apart = np.linalg.norm(np.diff(T_thing_ee[:, :3, 3], axis=0), axis=-1)
+    along = np.append(False, (step > PUSHED_M) & (apart < step))
+    for first, last in runs(np.logical_or(track.touched, along), GAP_STEPS):
+        if not track.touched[first : last + 1].any() or any(first <= b and last >= a for a, b in holds):
             continue
         between = T_thing_ee[stretches[-1][1] : first + 1, :3, 3] if stretches else np.empty((0, 3))
         if stretches and np.linalg.norm(between - between[0], axis=-1).max() < MOVED_M:
