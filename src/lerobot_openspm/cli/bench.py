@@ -169,6 +169,7 @@ MEASURES: dict[str, Callable[[BenchConfig], dict[str, Any]]] = {
 # Measures with options of their own: a module with a dataclass `Options` and `measure(options)`, which
 # returns what is printed. Imported when it is asked for.
 ON_THEIR_OWN: dict[str, str] = {
+    "keyposes": "lerobot_openspm.bench.key_poses",
     "language": "lerobot_openspm.bench.language",
     "memory": "lerobot_openspm.bench.memory",
     "teach": "lerobot_openspm.bench.teach",

@@ -11,6 +11,7 @@ import numpy as np
 from lerobot_openspm.envs import scene
 from lerobot_openspm.envs.motions import (
     LEVEL_ROTATION,
+    TABLETOP_PACE,
     Actions,
     ScriptedHand,
     pointing_down,
@@ -37,7 +38,12 @@ PLATE_INNER = scene.PLATE_RADIUS - scene.PLATE_RIM_WIDTH - 0.010
 FINAL_HOLD_STEPS = 15
 
 
-def expert_actions(simulator: TabletopSimulator, task: str, rng: np.random.Generator) -> Actions:
+def expert_actions(
+    simulator: TabletopSimulator,
+    task: str,
+    rng: np.random.Generator,
+    operator: type[ScriptedHand[TabletopSimulator]] = ScriptedHand,
+) -> Actions:
     """Yield the actions that solve `task` from the simulator's present state.
 
     Step the environment with each action before asking for the next one.
@@ -46,8 +52,9 @@ def expert_actions(simulator: TabletopSimulator, task: str, rng: np.random.Gener
         simulator: Simulator of the environment that is stepped.
         task: A name in `ANY_TASK`.
         rng: Source of the demonstration's imperfections.
+        operator: Who leads the hand.
     """
-    hand = ScriptedHand(simulator, rng)
+    hand = operator(simulator, rng, TABLETOP_PACE)
     for i, part in enumerate(ANY_TASK[task].parts or (task,)):
         if i > 0:
             hand.closing = False

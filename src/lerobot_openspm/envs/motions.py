@@ -43,15 +43,22 @@ class Pace:
         step_rad: How far a rotation of 1 turns it in one step, in radians.
         closing_steps: Bounds [low, high) of the steps that closing fingers need to settle.
         opening_steps: The same for opening fingers.
+        asked_m: How far a translation of 1 asks the hand to go, which it may not cover in a step.
+        asked_rad: How far a rotation of 1 asks it to turn.
     """
 
     step_m: float
     step_rad: float
     closing_steps: tuple[int, int]
     opening_steps: tuple[int, int]
+    asked_m: float
+    asked_rad: float
 
 
-TABLETOP_PACE = Pace(MAX_STEP_M, MAX_STEP_RAD, closing_steps=(7, 11), opening_steps=(7, 11))
+TABLETOP_PACE = Pace(
+    MAX_STEP_M, MAX_STEP_RAD, closing_steps=(7, 11), opening_steps=(7, 11), asked_m=MAX_STEP_M,
+    asked_rad=MAX_STEP_RAD,
+)  # fmt: skip
 
 
 def yaw_matrix(yaw: float) -> np.ndarray:

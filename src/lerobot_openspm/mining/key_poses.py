@@ -25,11 +25,17 @@ CONTACT_TOLERANCE_M = 0.010
 FREE_SPACE_TOLERANCE = 0.35
 # A gripper command must last this long to count: shorter flickers are noise.
 MIN_COMMAND_STEPS = 4
-# The fingers have settled when the opening changes by less than this fraction of its range in a step.
-SETTLED_FRACTION = 0.01
+# The fingers have come to rest when they are slower than this fraction of their fastest.
+SWEEP_FRACTION = 0.25
+MIN_SETTLING_STEPS = 3
+# Fingers that open have parted when they have gone this fraction of the way.
+PARTING_FRACTION = 0.02
 # A hand slower than this fraction of its usual speed stands still.
 STILL_FRACTION = 0.12
-MAX_DWELL_STEPS = 30
+# Fingers take no longer than this to settle.
+MAX_SETTLING_STEPS = 30
+# A hand that leaves a contact gets this much further away with every step.
+LEAVING_M = 0.0008
 # An episode in which the hand never moves faster than this, per step, holds no motion at all.
 MOTIONLESS_M = 1e-5
 # Closed fingers that hold something and rise by this much carry it; otherwise they pull or turn it.
@@ -72,13 +78,16 @@ class KeyPose:
 
 @dataclass(frozen=True)
 class _Mark:
-    """A key pose before it is measured: where, what, and how sure."""
+    """A key pose before it is measured: where, what, and how sure.
+
+    `command` is the frame of the gripper command that the fingers answer to on the way here, or None.
+    """
 
     frame: int
     phase: str
     confidence: float
     closed: bool
-    dwell: bool
+    command: int | None
     contact: int
 
 
@@ -87,9 +96,10 @@ def find_key_poses(episode: Episode, robot: RobotModel) -> list[KeyPose]:
     speed = _speed(episode) if len(episode) > 1 else np.zeros(len(episode))
     if speed.max(initial=0.0) < MOTIONLESS_M:
         return []
-    closed = _debounced(robot.closed(episode.actions[:, 6]))
+    closed = _without_false_starts(_debounced(robot.closed(episode.actions[:, 6])), episode.T_world_ee)
     moving = speed > STILL_FRACTION * np.median(speed[speed > 0.1 * speed.max()])
-    events = [(f, _settled(episode, robot, f, moving)) for f in np.flatnonzero(np.diff(closed)) + 1]
+    transitions = [*(np.flatnonzero(np.diff(closed)) + 1).tolist(), len(episode) - 1]
+    events = [(f, _settled(episode, f, until)) for f, until in pairwise(transitions)]
     starts = [0] + [end for _, end in events]
     ends = [start for start, _ in events] + [len(episode) - 1]
 
@@ -124,34 +134,37 @@ def _span_marks(
         contact: Ordinal of the span.
     """
     if closed and not _fist(episode, start, end):
-        release = [] if event_end is None else [_Mark(event_end, "release", 1.0, False, True, contact)]
-        return _carry_marks(episode, start, end, contact) + release
+        if event_end is None:
+            return _carry_marks(episode, start, end, end, contact)
+        let_go = end + _parting(episode.opening[end : event_end + 1])
+        release = _Mark(event_end, "release", 1.0, False, end, contact)
+        return [*_carry_marks(episode, start, end, let_go, contact), release]
     if closed or (event_end is None and contact == 0):
         return _push_marks(episode, start, end, closed, contact)
     if event_end is None:  # the hand leaves after the last release
         turns = _corner_marks(episode, start, end, "retreat", False, contact, contacts=[start])
-        return [*turns, _Mark(end, "retreat", 0.8, False, False, contact)]
+        return [*turns, _Mark(end, "retreat", 0.8, False, None, contact)]
     contacts = [start, end] if contact > 0 else [end]
     turns = _corner_marks(episode, start, end, "approach", False, contact, contacts)
     if turns and contact > 0:
-        turns[0] = _Mark(turns[0].frame, "retreat", turns[0].confidence, False, False, contact)
+        turns[0] = _Mark(turns[0].frame, "retreat", turns[0].confidence, False, None, contact)
     if next_end is not None and _fist(episode, event_end, next_end):
         return turns
-    arrival = _Mark(end, "approach", 1.0, False, False, contact)
-    return [*turns, arrival, _Mark(event_end, "grasp", 1.0, True, True, contact)]
+    arrival = _Mark(end, "approach", 1.0, False, None, contact)
+    return [*turns, arrival, _Mark(event_end, "grasp", 1.0, True, end, contact)]
 
 
-def _carry_marks(episode: Episode, start: int, end: int, contact: int) -> list[_Mark]:
-    """Lift, pre-place and place of a carried object; or the end of a pull or of a turn."""
+def _carry_marks(episode: Episode, start: int, end: int, let_go: int, contact: int) -> list[_Mark]:
+    """Lift, pre-place and place of a carried object, or the end of a pull or of a turn; that at `let_go`."""
     poses = episode.T_world_ee[start : end + 1]
     if poses[:, 2, 3].max() - poses[0, 2, 3] < LIFTED_M:
         metres, radians = se3.distances(poses[0], poses[-1])
         phase = "turn" if radians > TURNED_RAD and metres < 0.06 else "open"
-        return [_Mark(end, phase, 1.0, True, False, contact)]
+        return [_Mark(let_go, phase, 1.0, True, None, contact)]
     turns = _corner_marks(episode, start, end, "pre-place", True, contact, [start, end])
     if turns:
-        turns[0] = _Mark(turns[0].frame, "lift", turns[0].confidence, True, False, contact)
-    return [*turns, _Mark(end, "place", 1.0, True, False, contact)]
+        turns[0] = _Mark(turns[0].frame, "lift", turns[0].confidence, True, None, contact)
+    return [*turns, _Mark(let_go, "place", 1.0, True, None, contact)]
 
 
 def _push_marks(episode: Episode, start: int, end: int, closed: bool, contact: int) -> list[_Mark]:
@@ -169,10 +182,10 @@ def _push_marks(episode: Episode, start: int, end: int, closed: bool, contact: i
     retreat = _corner_marks(episode, last, end, "retreat", closed, contact, [last])
     return [
         *approach,
-        _Mark(first, "approach", 1.0, closed, False, contact),
-        _Mark(last, "push", 1.0, closed, False, contact),
+        _Mark(first, "approach", 1.0, closed, None, contact),
+        _Mark(last, "push", 1.0, closed, None, contact),
         *retreat,
-        _Mark(end, "retreat", 0.8, closed, False, contact),
+        _Mark(end, "retreat", 0.8, closed, None, contact),
     ]
 
 
@@ -200,7 +213,7 @@ def _corner_marks(
         if found and np.linalg.norm(points[corner] - points[found[-1].frame - start]) < MIN_SPACING_M:
             continue
         confidence = _corner_confidence(points, int(corner))
-        found.append(_Mark(start + int(corner), phase, confidence, closed, False, contact))
+        found.append(_Mark(start + int(corner), phase, confidence, closed, None, contact))
     return found
 
 
@@ -223,11 +236,15 @@ def _measure(episode: Episode, marks: list[_Mark], moving: NDArray[np.bool_]) ->
         if mark.frame <= before:
             continue  # the episode ended with the mark before
         frames = slice(max(before, 0), mark.frame)
-        n_steps = mark.frame - before if mark.dwell else int(moving[frames].sum())
+        if mark.command is None:
+            n_steps = int(moving[frames].sum())
+        else:  # an operator may dawdle for longer than any fingers take
+            n_steps = min(mark.frame - mark.command, MAX_SETTLING_STEPS)
         key_poses.append(
             KeyPose(
                 int(mark.frame), episode.T_world_ee[mark.frame], mark.phase, mark.confidence, mark.closed,
-                float(episode.opening[mark.frame]), int(max(n_steps, 1)), mark.dwell, mark.contact,
+                float(episode.opening[mark.frame]), int(max(n_steps, 1)),
+                mark.command is not None, mark.contact,
             )
         )  # fmt: skip
         before = mark.frame
@@ -245,14 +262,45 @@ def _debounced(closed: NDArray[np.bool_]) -> NDArray[np.bool_]:
     return closed
 
 
-def _settled(episode: Episode, robot: RobotModel, start: int, moving: NDArray[np.bool_]) -> int:
-    """Frame at which the fingers rest after a transition, or the hand moves on, whichever is later."""
-    last = min(start + MAX_DWELL_STEPS, len(episode) - 1)
-    change = np.abs(np.diff(episode.opening[start : last + 1]))
-    still = change < SETTLED_FRACTION * robot.open_width
-    rest = next((t for t in range(3, len(still) - 1) if still[t] and still[t + 1]), len(still))
-    leave = next((t for t in range(rest, last - start) if moving[start + t]), last - start)
-    return min(start + max(rest, leave), last)
+def _without_false_starts(closed: NDArray[np.bool_], T_world_ee: Array) -> NDArray[np.bool_]:
+    """Drop closings after which the hand stayed where it was until it opened again: it took nothing."""
+    closed = closed.copy()
+    bounds = [0, *(np.flatnonzero(np.diff(closed)) + 1).tolist(), len(closed)]
+    for first, last in list(pairwise(bounds))[1:-1]:
+        stayed = se3.distance(T_world_ee[first], T_world_ee[first : last + 1]).max() < MIN_SPACING_M
+        if closed[first] and stayed:
+            closed[first:last] = False
+    return closed
+
+
+def _settled(episode: Episode, start: int, until: int) -> int:
+    """Frame at which the fingers rest after a transition, or the hand leaves, whichever is later.
+
+    A hand that trembles or drifts while its operator waits has not left.
+    """
+    rest = _fingers_rest(episode.opening[start : min(start + MAX_SETTLING_STEPS, until) + 1])
+    away = se3.distance(episode.T_world_ee[start + rest], episode.T_world_ee[start + rest : until + 1])
+    left = np.flatnonzero(away > MIN_SPACING_M)
+    if not len(left):
+        return until
+    leaving = int(left[0])
+    while leaving > 0 and away[leaving] > away[leaving - 1] + LEAVING_M:
+        leaving -= 1
+    return start + rest + leaving
+
+
+def _parting(opening: Array) -> int:
+    """Index of the last frame before fingers that were told to open part: a tight grip eases first."""
+    sweep = opening - opening[0]
+    return max(int(np.argmax(sweep >= PARTING_FRACTION * sweep.max())) - 1, 0) if sweep.max() > 0 else 0
+
+
+def _fingers_rest(opening: Array) -> int:
+    """Index at which a sweep of the fingers ends; afterwards they may still rattle around what they hold."""
+    speed = np.abs(np.diff(opening))
+    fastest = int(np.argmax(speed, axis=0)) if len(speed) else 0
+    slow = np.flatnonzero(speed[fastest:] <= SWEEP_FRACTION * speed[fastest]) if len(speed) else []
+    return max(fastest + int(slow[0]), min(MIN_SETTLING_STEPS, len(speed))) if len(slow) else len(speed)
 
 
 def _fist(episode: Episode, start: int, end: int) -> bool:

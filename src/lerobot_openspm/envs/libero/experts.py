@@ -20,7 +20,9 @@ from lerobot_openspm.envs.motions import Actions, Pace, ScriptedHand, pointing_d
 LiberoHand = ScriptedHand[LiberoSimulator]
 
 # Measured: LIBERO's controller covers about a quarter of an action before the next one replaces it.
-PACE = Pace(step_m=0.012, step_rad=0.065, closing_steps=(14, 18), opening_steps=(8, 11))
+PACE = Pace(
+    step_m=0.012, step_rad=0.065, closing_steps=(14, 18), opening_steps=(8, 11), asked_m=0.05, asked_rad=0.5
+)
 
 PRE_GRASP = 0.08
 CARRY_RISE = 0.12
@@ -80,7 +82,12 @@ DOWN = np.diag([1.0, -1.0, -1.0])
 LEVEL = np.array([[-1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, 1.0, 0.0]])
 
 
-def expert_actions(simulator: LiberoSimulator, task: str, rng: np.random.Generator) -> Actions:
+def expert_actions(
+    simulator: LiberoSimulator,
+    task: str,
+    rng: np.random.Generator,
+    operator: type[LiberoHand] = LiberoHand,
+) -> Actions:
     """Yield the actions (7,) that solve `task` from the simulator's present state.
 
     Step the simulator with each action before asking for the next one.
@@ -89,8 +96,9 @@ def expert_actions(simulator: LiberoSimulator, task: str, rng: np.random.Generat
         simulator: The simulator that is stepped.
         task: A name in `EXPERTS`.
         rng: Source of the demonstration's imperfections.
+        operator: Who leads the hand.
     """
-    hand = LiberoHand(simulator, rng, PACE)
+    hand = operator(simulator, rng, PACE)
     yield from EXPERTS[task](hand)
     yield from hand.hold(FINAL_HOLD_STEPS)
 
