@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 from benchmarks.libero import tables as libero_tables
 
-from benchmarks import markdown, perception_tables, tables
+from benchmarks import markdown, memory_tables, perception_tables, tables
 
 MACHINE = {"commit": "0123456789ab", "machine": {"cores": 2, "processor": "x86_64"}}
 RATE = {"success": 0.5, "n": 4, "interval": [0.15, 0.85], "mean_steps": 100.0}
@@ -41,8 +41,10 @@ def test_the_committed_page_is_made_of_the_committed_results(tmp_path, monkeypat
 
 def test_what_is_not_measured_says_so_and_how_to_measure_it(results, monkeypatch):
     text = page(monkeypatch, results)
-    parts = [*libero_tables.libero_parts(), *perception_tables.perception_parts()]
-    assert text.count("Not measured") == 5 + len(parts) - 2  # but for the introductions
+    parts = [
+        *libero_tables.libero_parts(), *perception_tables.perception_parts(), *memory_tables.memory_parts()
+    ]  # fmt: skip
+    assert text.count("Not measured") == 6 + len(parts) - 3  # but for the introductions
     assert "`execution.json` is missing; run `python -m benchmarks.figures`" in text
     assert "`libero_goal.json` is missing; run `python -m benchmarks.libero.run`" in text
 
