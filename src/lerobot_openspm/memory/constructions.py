@@ -63,6 +63,11 @@ _PLACES = (
     (rf"\bthere (?={_PREPOSITION}\b)", ""),
     (r"\b(?:up and over|up and|over and) (?=on|in|over)", "up "),
     (r"\bup top of\b", "on top of"),
+    (r"\bfrom the top of\b", "from on top of"),
+    (r"\b(?:that|which) (?:you|we) (?:will |can )?(?:find|see)\b", "that is"),
+    (r"\bdrop (it|them) off (?=in|on|at)", r"drop \1 "),
+    (r"\bmaking sure (?:to|you) (close|open|shut)\b", r"and then \1"),
+    (rf"\b(door|drawer) after (?:it|that){_END}", r"\1"),
     (r"\bin the (?:space|gap|spot|area|middle) between\b", "between"),
     (
         rf"\b(?:in|into|inside) the ({_CADDY}) , (?:in|into|at|on|to) the (?:{_CELL} (?:at|in|on) the )?"
@@ -136,8 +141,9 @@ _SAID_OTHERWISE = (
     # "the bowl that is standing on ...", "the bowl you see on ...", "the bowl lying on ..."
     (rf"(?:\b(?:that|which)\b|{SEEN})(?: (?:is|are|was|were|currently|sitting|standing|lying|resting|located"
      r"|placed|found|positioned|kept|sits?|stands?|lies?|rests?|sandwiched|nestled|perched|balanced|situated"
-     r"|stored|sat|seated|tucked|hiding))+\b|(?<!and )(?<!be )(?<!been )\b(?:currently|sitting|standing|lying"
-     r"|resting|located|positioned|sandwiched|nestled|situated|perched|stored)\b", WHICH),
+     r"|stored|stacked|sat|seated|tucked|hiding))+\b"
+     r"|(?<!and )(?<!be )(?<!been )\b(?:currently|sitting|standing|lying|resting|located"
+     r"|positioned|sandwiched|nestled|situated|perched|stored)\b", WHICH),
     (rf"(\w+) {WHICH} ((?:{_COLOUR})(?: and (?:{_COLOUR}))*)\b", r"\2 \1"),
     (r"\bfrom (?:its|their) (?:usual |current )?(?:place|spot|position)\b(?= \w)", "from"),
     (r"\b(?:in|to|into|at) (?:its|their) (?:usual |right )?(?:place|spot|position|home)\b(?= \w)", ""),

@@ -184,6 +184,7 @@ ALIASES = {
     "barbecue sauce": "bbq sauce",
     "barbeque sauce": "bbq sauce",
     "bar b q sauce": "bbq sauce",
+    "b b q sauce": "bbq sauce",
     "catsup": "ketchup",
     "tomato ketchup": "ketchup",
     "oj": "orange juice",
