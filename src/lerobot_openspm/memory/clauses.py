@@ -60,7 +60,7 @@ def read_clause(clause: Clause, before: Said | None) -> Said:
             verb = v.match_verb(words, 0, "participle")
         if verb is not None:
             said = _read_verb(verb, words[verb.length :])
-            return _checked(said, verb)
+            return _checked(said, verb, before)
     said = _without_verb(clause, words, before)
     if said is not None:
         return said
@@ -105,12 +105,20 @@ def _topic(words: Words) -> Said:
     return Said("", (noun,))
 
 
-def _checked(said: Said, verb: v.Verb) -> Said:
-    if verb.word in v.OF_WHAT_IS_HELD and not said.targets[0].pronoun:
+def _checked(said: Said, verb: v.Verb, before: Said | None) -> Said:
+    if verb.word in v.OF_WHAT_IS_HELD and not said.targets[0].pronoun and not _is_beside(said, before):
         raise InstructionError(f"says to {verb.word} something as it is")
     if verb.word == "slide" and said.operation == "push" and said.relation in v.LIFTING_RELATIONS:
         return replace(said, operation="put")
     return said
+
+
+def _is_beside(said: Said, before: Said | None) -> bool:
+    """Whether something goes next to where another thing was just put: it does not stay as it is."""
+    if before is None or before.operation != "put" or before.landmark is None or said.landmark is None:
+        return False
+    is_same = said.landmark.pronoun in ("it", "that") or said.landmark.name == before.landmark.name
+    return is_same and said.relation in v.BESIDE
 
 
 def _without_verb(clause: Clause, words: Words, before: Said | None) -> Said | None:
@@ -124,7 +132,8 @@ def _without_verb(clause: Clause, words: Words, before: Said | None) -> Said | N
         if (clause.is_wanted or before is not None) and _is_participle(words, i):
             return _state(words[:i], words[i:])
         if clause.is_wanted and words[i] in v.STANDS | _GOES:
-            return _state(words[:i], words[i:])
+            subject = words[: i - 1] if words[i - 1] == "to" else words[:i]  # "the bowl to stand on it"
+            return _state(subject, words[i:])
     if clause.is_wanted and words[-1] in ("on", "off", "open", "shut", "closed"):
         return _state(words[:-1], words[-1:])
     return _verbless(clause, words, before)

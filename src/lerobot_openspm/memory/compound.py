@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from functools import partial
 
 from lerobot_openspm.errors import InstructionError
 from lerobot_openspm.memory.entry import MemoryEntry, MemoryKeyPose, Reference, RetrievalKey, SubTask
@@ -124,7 +125,7 @@ def plan_parts(
             the error names the sub-task and lists what the memory knows.
     """
     asked = parse_instruction(instruction)
-    entries = near(asked, entries, semantic_score)
+    entries = near(asked, entries, partial(semantic_score, names=names))
     chain: list[tuple[Candidate, ...]] = []
     left = asked
     while left:

@@ -13,6 +13,7 @@ from lerobot_openspm.errors import InstructionError
 from lerobot_openspm.memory import vocabulary as v
 from lerobot_openspm.memory.clauses import Said, read_clause
 from lerobot_openspm.memory.entry import SubTask
+from lerobot_openspm.memory.names import canonical_name
 from lerobot_openspm.memory.nouns import Noun
 from lerobot_openspm.memory.sentences import MAX_CHARACTERS, Clause, read_clauses
 
@@ -86,9 +87,14 @@ def _resolve_all(clauses: Sequence[Clause], said: Sequence[Said]) -> list[_Meant
                 raise InstructionError(f"states something of {topic.name or 'it'!r}; say what to do")
             continue
         sub_tasks = _Resolver([s for one in meant for s in one.sub_tasks], topic).resolve(said[i])
-        meant.append(_Meant(sub_tasks, clauses[i].step, clauses[i].is_done))
+        meant.append(_Meant(sub_tasks, clauses[i].step, clauses[i].is_done or _is_there(said[i])))
         topic = None
     return meant
+
+
+def _is_there(said: Said) -> bool:
+    """Whether it goes where was said before: "the bowl belongs on the stove, put it there"."""
+    return said.landmark is not None and (said.relation, said.landmark.pronoun) == ("at", "there")
 
 
 def _lacks_noun(said: Said) -> bool:
@@ -118,6 +124,8 @@ class _Resolver:
                 for _ in range(t.count)
             )
         landmark = self._landmark(said.landmark, said.relation, targets[-1])
+        if _is_there(said) and self.before and self.before[-1].relation:
+            said = replace(said, relation=self.before[-1].relation)
         part = landmark.part
         if said.relation == "on" and part.endswith("drawer"):
             part = ""  # what is put on a drawer stands on the cabinet
@@ -165,12 +173,13 @@ class _Resolver:
             return self._named(noun, "put", target)
         if noun.pronoun not in ("it", "them", "there"):
             return self._named(noun, "put")
-        before = [s for s in self.before if s.operation != PICK or s.target != target.name]
+        before = [s for s in self.before if s.operation != PICK or s.target != target.name or s.landmark]
         if not before:
             raise InstructionError(f"names no object after {relation!r}")
         last = before[-1]
         beside = relation not in ("in", "on", "at") or noun.pronoun == "there"
-        if last.landmark and (beside or last.target == target.name):
+        is_holder = canonical_name(last.target).split()[-1] in v.HOLLOW
+        if last.landmark and (beside or last.target == target.name or (relation == "in" and not is_holder)):
             return Noun(last.landmark, last.part, last.landmark_where)
         return Noun(last.target, last.part, last.target_where)
 
@@ -211,6 +220,13 @@ def _is_vaguer(one: SubTask, other: SubTask) -> bool:
     return one.relation == "at" != other.relation and replace(one, relation=other.relation) == other
 
 
+def _is_taken(found: Sequence[SubTask], sub_task: SubTask) -> bool:
+    return not sub_task.landmark and any(
+        (s.operation, s.target, s.target_where) == (PICK, sub_task.target, sub_task.target_where)
+        for s in found
+    )
+
+
 def _merged(meant: Sequence[_Meant]) -> tuple[SubTask, ...]:
     """Join what is taken with where it is put, and leave out what is said twice."""
     found: list[SubTask] = []
@@ -218,6 +234,10 @@ def _merged(meant: Sequence[_Meant]) -> tuple[SubTask, ...]:
         for sub_task in one.sub_tasks:
             if one.is_done and sub_task in found:
                 continue
+            if one.is_done and found and replace(found[-1], operation="push") == sub_task:
+                found.pop()  # "the plate belongs in front of the stove, push it there"
+            if sub_task.operation == PICK and _is_taken(found, sub_task):
+                continue  # "find the milk, pick it up"
             taken = next((s for s in found if s.operation == PICK and s.target == sub_task.target), None)
             if taken is not None and sub_task.operation == "put":
                 found.remove(taken)

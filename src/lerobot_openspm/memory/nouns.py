@@ -211,4 +211,5 @@ def _colours_in_order(words: Words) -> str:
 
 
 def _name(words: Words) -> str:
-    return v.replace_ending(" ".join(words), v.SYNONYMS)
+    name = v.replace_ending(" ".join(words), v.SYNONYMS)
+    return v.replace_ending(name, v.SYNONYMS)  # "wooden cupboard", which is the "wooden cabinet"

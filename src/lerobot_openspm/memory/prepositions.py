@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 from lerobot_openspm.memory import vocabulary as v
-from lerobot_openspm.memory.wording import WHICH
+from lerobot_openspm.memory.constructions import WHICH
 
 Words = tuple[str, ...]
 _PHRASES = {
@@ -45,8 +45,9 @@ def match_preposition(words: Words, at: int) -> Preposition | None:
     start, relative = at, False
     while start < len(words) and (words[start] == WHICH or words[start] in v.PARTICLES):
         relative |= words[start] == WHICH
-        if start == at and (found := _match(words, start)):  # "right of", "out of"
-            return found
+        direct = _match(words, start) if start == at else None
+        if direct and not _longer_after(words, start, direct):  # "right of", "out of"
+            return direct
         start += 1
     found = _match(words, start)
     if found is None:
@@ -60,6 +61,12 @@ def match_preposition(words: Words, at: int) -> Preposition | None:
         found.is_inside,
         found.length + start - at,
     )
+
+
+def _longer_after(words: Words, at: int, direct: Preposition) -> bool:
+    """Whether a longer one begins behind a particle: "on top of" in "up on top of"."""
+    after = _match(words, at + 1)
+    return after is not None and after.length + 1 > direct.length
 
 
 def _match(words: Words, at: int) -> Preposition | None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 
 from lerobot_openspm.errors import InstructionError
 from lerobot_openspm.memory.entry import MemoryEntry, SubTask
@@ -74,7 +75,7 @@ def candidates_for(
     Raises:
         InstructionError: As there.
     """
-    entries = near(sub_tasks, entries, semantic_score)
+    entries = near(sub_tasks, entries, partial(semantic_score, names=names))
     # Demonstrations of one task share their key, so there are far fewer keys than entries.
     keys = {entry.key.sub_tasks for entry in entries}
     names = TableFirst(names, {name for key in keys for sub_task in key for name in sub_task.objects})

@@ -8,8 +8,9 @@ from dataclasses import dataclass, replace
 
 from lerobot_openspm.errors import InstructionError
 from lerobot_openspm.memory import vocabulary as v
+from lerobot_openspm.memory.constructions import SAME, SEEN, WANTED
 from lerobot_openspm.memory.prepositions import match_preposition
-from lerobot_openspm.memory.wording import SAME, SEEN, WANTED, plain_wording
+from lerobot_openspm.memory.wording import plain_wording
 
 Words = tuple[str, ...]
 
@@ -104,7 +105,10 @@ def _read_sentence(words: Words, first_step: int) -> list[Clause]:
             order.remove(i)
             order.insert(0, i)
     clauses = [_clause(words, marker) for marker, words in pieces]
-    told = next((i for i, clause in enumerate(clauses) if _TELLING & set(clause.words)), len(clauses))
+    told = next(
+        (i for i, clause in enumerate(clauses) if clause.is_wanted or _TELLING & set(clause.words)),
+        len(clauses),
+    )
     clauses[told + 1 :] = [replace(clause, is_wanted=True) for clause in clauses[told + 1 :]]
     return [
         replace(clause, step=first_step + order.index(i)) for i, clause in enumerate(clauses) if clause.words

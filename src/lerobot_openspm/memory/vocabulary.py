@@ -31,7 +31,7 @@ VERBS: dict[str, tuple[str, ...]] = {
         "lower, ease, arrange, add, plunk, dump, fit, settle, send, leave, shelve, perch, sit, plonk, "
         "seat, install, house, keep, bung, sling, stuff, squeeze, wedge, lodge, dock, mount, hang, "
         "prop, lean, haul, lug, ferry, cart, shuttle, convey, pass, plant, line up, tidy, clear, "
-        "hide, feed, thrust, guide, steer, direct, relay"
+        "hide, feed, thrust, guide, steer, direct, relay, release"
     ),
     "open": _phrases("open up, open"),
     "close": _phrases("close up, close, shut"),
@@ -57,7 +57,10 @@ DRAWER_RESULTS = {"out": "open", "in": "close"}
 HALF_A_VERB = "half a verb"
 SWITCHES = ("turn", "shut", "switch", "power", "flip", "click", "flick", "toggle", "crank", "twist")
 # What a thing does that is to be somewhere: "the bowl should sit on the plate".
-STANDS = word_set("stay come belong sit rest stand stay lie end ends up sits rests gets land be")
+STANDS = word_set(
+    "stay come belong sit rest stand stay lie end ends up sits rests gets land be "
+    "lying sitting standing resting"
+)
 # Verbs that say to change nothing, unless what they are said of is in the hand.
 OF_WHAT_IS_HELD = ("leave", "keep")
 # "slide the pan under the shelf": where the way does not lead along the table, sliding is putting.
@@ -97,6 +100,8 @@ RELATIONS: dict[str, tuple[str, ...]] = {
     "under": ("underneath", "beneath", "below", "under", "at the bottom of", "on the bottom of"),
     "at": ("to", "towards", "toward", "at"),
 }  # fmt: skip
+# Those that say a place beside a thing.
+BESIDE = ("next to", "behind", "front of", "left of", "right of")
 # Prepositions that say where to, whatever follows, and those that say where from.
 GOALS = ("onto", "on to", "into", "in to", "to", "down into", "towards", "toward",
          "to the top of", "onto the top of")  # fmt: skip
@@ -179,6 +184,7 @@ ALIASES = {
     "barbecue sauce": "bbq sauce",
     "barbeque sauce": "bbq sauce",
     "bar b q sauce": "bbq sauce",
+    "b b q sauce": "bbq sauce",
     "catsup": "ketchup",
     "tomato ketchup": "ketchup",
     "oj": "orange juice",
