@@ -19,7 +19,7 @@ COMMANDS = {
     "teach": ("lerobot_openspm.cli.teach", "teach a checkpoint a task from a few demonstrations"),
     "inspect": ("lerobot_openspm.cli.inspect", "show the memory of a checkpoint"),
     "memory": ("lerobot_openspm.cli.memory", "list, show and change the entries of a memory"),
-    "bench": ("lerobot_openspm.cli.bench", "measure: a checkpoint in the simulators, the memory, the reading of instructions"),
+    "bench": ("lerobot_openspm.cli.bench", "measure a checkpoint, memory or language"),
     "demo": ("lerobot_openspm.cli.demo", "collect, train, evaluate and write one page about it"),
 }
 
