@@ -1,5 +1,8 @@
+import dataclasses
+
 import numpy as np
 import pytest
+from tests.control.test_row import knowledge
 
 from lerobot_openspm.control.referents import Referents, references
 from lerobot_openspm.geometry import se3
@@ -14,6 +17,7 @@ def at(x, y):
     return se3.from_yaw([x, y, 0.0], 0.0)
 
 
+KNOWLEDGE = knowledge()
 RACK = at(0.3, 0.3)
 NEAR, FAR = at(0.3, 0.18), at(0.0, -0.2)
 
@@ -76,11 +80,35 @@ def test_what_the_next_part_means_is_told_anew():
 
 
 def test_references_are_told_by_the_names_of_the_entry():
-    asked = SubTask("put", "bowl", "", "on", "dish", NEXT_TO_RACK, Reference("left"))
+    asked = SubTask("put", "bowl", "", "on", "dish", Reference("next to", ("shelf",)), Reference("left"))
     entry = MemoryEntry(
         RetrievalKey((SubTask("put", "black bowl", "", "on", "plate"),), ()), "", (), 1.0, 1, ""
     )
-    assert references(Candidate(entry, 1.0, entry, (asked,))) == {
+    known = {"shelf": "rack"}
+    assert references(Candidate(entry, 1.0, entry, (asked,)), lambda name: known.get(name, name)) == {
         "black bowl": NEXT_TO_RACK,
         "plate": Reference("left"),
     }
+
+
+def test_the_objects_that_others_are_told_by_may_go_by_other_names():
+    knowledge = dataclasses.replace(
+        KNOWLEDGE, yaw_periods=dict.fromkeys(("bowl", "cream cheese box", "wine bottle", "plate"), 0.0)
+    )
+    said = {
+        "box": "cream cheese box",
+        "cream cheese": "cream cheese box",
+        "bottle": "wine bottle",
+        "moon": "moon",
+    }
+    assert {name: knowledge.object_meant(name) for name in said} == said
+
+
+def test_the_center_of_the_table_is_the_middle_of_where_the_hand_was():
+    referents = Referents({"bowl": Reference("center", ("table",))})
+    low, high = KNOWLEDGE.robot.workspace
+    middle, side = at(*(low + high)[:2] / 2 + 0.03), at(*high[:2])
+    estimates = {"bowl": seen(side, middle)}
+    np.testing.assert_array_equal(
+        referents.sort_out(estimates, KNOWLEDGE.surfaces)["bowl"].T_world_obj, middle
+    )

@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
+import numpy as np
+
 from lerobot_openspm.control.executor import ControlSettings
 from lerobot_openspm.control.transfer import (
     Target,
@@ -13,12 +15,14 @@ from lerobot_openspm.control.transfer import (
     geometric_score,
     transfer,
 )
+from lerobot_openspm.geometry import se3
 from lerobot_openspm.geometry.se3 import Array
 from lerobot_openspm.memory.compound import Candidate
 from lerobot_openspm.memory.entry import MemoryEntry
 from lerobot_openspm.memory.names import TABLE_NAMES, NameSimilarity
 from lerobot_openspm.memory.retrieval import Scored, ScoreWeights, retrieve
 from lerobot_openspm.memory.robot import RobotModel
+from lerobot_openspm.memory.vocabulary import SURFACES
 from lerobot_openspm.perception.tracker import TrackerSettings
 
 
@@ -49,6 +53,19 @@ class Knowledge:
     tracking: bool = True
     step_s: float = 0.05
     names: NameSimilarity = TABLE_NAMES
+
+    def object_meant(self, name: str) -> str:
+        """The object that is known by what a name in an instruction means; the name itself where none is."""
+        alike = {known: self.names.similarity(name, known) for known in self.yaw_periods}
+        best = max(alike, key=lambda known: alike[known], default=name)
+        return best if alike.get(best, 0.0) > 0 else name
+
+    @property
+    def surfaces(self) -> dict[str, Array]:
+        """The table under its names, at the middle of where the hand was in the demonstrations."""
+        low, high = self.robot.workspace
+        middle = se3.transform(np.eye(3), [*(low[:2] + high[:2]) / 2, low[2]])
+        return dict.fromkeys(SURFACES, middle)
 
     def rank(
         self, candidates: Sequence[Candidate], layout: Mapping[str, Array], T_world_ee: Array

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -20,14 +20,23 @@ logger = logging.getLogger(__name__)
 SAME_PLACE_M = 0.05
 
 
-def references(candidate: Candidate) -> dict[str, Reference]:
-    """By the name that an entry gives an object: where the instruction says that it is."""
+def references(candidate: Candidate, object_meant: Callable[[str], str]) -> dict[str, Reference]:
+    """By the name that an entry gives an object: where the instruction says that it is.
+
+    Args:
+        candidate: An entry, and what of the instruction it carries out.
+        object_meant: The name under which an object is known that the instruction tells others by.
+    """
+
+    def known_words(where: Reference) -> Reference:
+        return Reference(where.relation, tuple(object_meant(name) for name in where.landmarks))
+
     said: dict[str, Reference] = {}
     for asked, known in zip(candidate.asked, candidate.entry.key.sub_tasks, strict=True):
         if asked.target_where is not None:
-            said[known.target] = asked.target_where
+            said[known.target] = known_words(asked.target_where)
         if asked.landmark_where is not None:
-            said[known.landmark] = asked.landmark_where
+            said[known.landmark] = known_words(asked.landmark_where)
     return said
 
 

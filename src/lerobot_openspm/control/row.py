@@ -182,7 +182,8 @@ class Row:
 
     def _refer(self) -> None:
         """Take in which of several like objects this part is about."""
-        said = {name: where for one in self._parts[self._part] for name, where in references(one).items()}
+        meant = self._knowledge.object_meant
+        said = {k: where for one in self._parts[self._part] for k, where in references(one, meant).items()}
         self.tracker.forget(self._referents.hear(said))
 
     def _is_to_go_on(self) -> bool:
@@ -254,7 +255,8 @@ class Row:
             if fault.seconds >= GIVE_UP_S:
                 logger.warning("%r: stopping, camera %r: %s", self.instruction, camera, fault.reason)
                 self.executor.stop(Status.CAMERA_FAULT)
-        meant = self._referents.sort_out(self.seen.estimates, self.tracker.poses(hand.T_world_ee))
+        layout = {**self._knowledge.surfaces, **self.tracker.poses(hand.T_world_ee)}
+        meant = self._referents.sort_out(self.seen.estimates, layout)
         return self.tracker.look(meant, hand.T_world_ee, waited_s)
 
     def _look_around(self, hand: Hand, look: Look) -> None:
