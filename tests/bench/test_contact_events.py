@@ -80,13 +80,9 @@ def test_a_push_ends_when_the_hand_leaves_and_pauses_belong_to_it():
     assert read("free", swinging, squeezed, hand, opening, during(30, 69)) == []
 
 
-def spatial(**ways) -> np.ndarray:
-    """Poses `(N, 4, 4)` from ways as of `path`, along x and z."""
-    frames = np.arange(N)
-    x, z = (
-        np.interp(frames, *zip(*ways.get(axis, [(0, 0.0)]), strict=True)) if axis in ways else 0.0 * frames
-        for axis in "xz"
-    )
+def spatial(x, z=((0, 0.0),)) -> np.ndarray:
+    """Poses along x and z, each as of `path`."""
+    x, z = path(*x)[:, 0, 3], path(*z)[:, 0, 3]
     return se3.transform(np.eye(3), np.stack([x, 0 * x, z], axis=-1))
 
 
