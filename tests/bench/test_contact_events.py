@@ -80,6 +80,68 @@ def test_a_push_ends_when_the_hand_leaves_and_pauses_belong_to_it():
     assert read("free", swinging, squeezed, hand, opening, during(30, 69)) == []
 
 
+def spatial(x, z=((0, 0.0),)) -> np.ndarray:
+    """Poses along x and z, each as of `path`."""
+    x, z = path(*x)[:, 0, 3], path(*z)[:, 0, 3]
+    return se3.transform(np.eye(3), np.stack([x, 0 * x, z], axis=-1))
+
+
+PUSHING = [(30, 0.0), (50, 0.1)]
+RISING = [(60, 0.0), (80, 0.2)]
+
+
+@pytest.mark.parametrize(
+    "thing",
+    [
+        pytest.param(spatial(x=PUSHING, z=[(60, 0.0), (66, 0.01), (68, 0.0)]), id="tips back"),
+        pytest.param(spatial(x=PUSHING, z=[(60, 0.0), (70, 0.1), (74, 0.0)]), id="rises and falls"),
+        pytest.param(spatial(x=[*PUSHING, (72, 0.1), (90, 0.13)], z=RISING), id="hangs on the hand"),
+        pytest.param(spatial(x=PUSHING), id="touched again"),
+    ],
+)
+def test_a_push_ends_when_the_hand_rises_whatever_it_touches_then(thing):
+    hand = spatial(x=[*PUSHING, (72, 0.1), (90, 0.13)], z=RISING)
+    nothing, opening = both(during(1, 0)), fingers(during(0, N))
+    for touched in (during(30, 75), during(30, 58) | during(62, 63) | during(66, 80)):
+        assert read("free", thing, nothing, hand, opening, touched) == [("push", 60, 50)]
+
+
+def test_what_tips_up_against_a_low_hand_is_pushed_on():
+    thing = spatial(x=[*PUSHING, (60, 0.1), (70, 0.2)], z=[(50, 0.0), (52, 0.04)])
+    hand = spatial(x=[*PUSHING, (60, 0.1), (70, 0.2)], z=[(75, 0.0), (85, 0.2)])
+    nothing, opening = both(during(1, 0)), fingers(during(0, N))
+    assert read("free", thing, nothing, hand, opening, during(30, 70)) == [("push", 75, 70)]
+
+
+@pytest.mark.parametrize(
+    ("rise", "pushes"), [pytest.param(0.02, [90], id="slides"), pytest.param(0.1, [50, 90], id="lifts off")]
+)
+def test_a_hand_that_slides_over_what_it_pushes_goes_on_pushing_it(rise, pushes):
+    thing = spatial(x=[*PUSHING, (75, 0.1), (90, 0.2)])
+    # It stands behind the thing's middle, and slides forwards over it.
+    way = [(0, -0.08), (30, -0.08), (50, 0.02), (65, 0.07), (75, 0.07), (90, 0.17)]
+    hand = spatial(x=way, z=[(50, 0.0), (58, rise), (66, 0.0), (90, 0.0), (95, 0.1)])
+    nothing, opening = both(during(1, 0)), fingers(during(0, N))
+    touched = during(30, 50) | during(76, 90)
+    assert [e[1] for e in read("free", thing, nothing, hand, opening, touched)] == pushes
+
+
+def test_what_turns_about_a_hinge_is_pushed_where_the_hand_is():
+    angle = np.interp(np.arange(N), [30, 50], [0.0, 0.5])
+    thing = se3.transform(se3.exp_so3(np.stack([0 * angle, angle, 0 * angle], axis=-1)), np.zeros((N, 3)))
+    hand = thing @ se3.transform(np.eye(3), np.array([0.2, 0.0, 0.0]))
+    hand[:, :3, :3] = np.eye(3)
+    hand[:, 0, 3] += np.interp(np.arange(N), [60, 80], [0.0, 0.2])
+    nothing, opening = both(during(1, 0)), fingers(during(0, N))
+    assert read("hinge", thing, nothing, hand, opening, during(31, 70)) == [("push", 60, 50)]
+
+
+def test_what_moves_by_itself_at_a_touch_is_not_pushed():
+    thing = path((30, 0.0), (50, 0.1))
+    still, nothing = path((0, 0.0), (99, 0.0)), both(during(1, 0))
+    assert read("free", thing, nothing, still, fingers(during(0, N)), during(30, 50)) == []
+
+
 def test_what_the_end_of_the_demonstration_cuts_ends_there():
     hand = path((30, 0.0), (50, 0.2))
     held = both(during(20, N))

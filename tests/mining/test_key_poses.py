@@ -1,4 +1,5 @@
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -152,6 +153,134 @@ def test_an_episode_without_touch_has_no_key_poses():
     waving.move([0.1, 0.2, 0.1])
     waving.move([-0.1, 0.1, 0.3])
     assert mine(waving) == []
+
+
+def false_start(held):
+    """Takes the bowl at the second try: the fingers close, open again over it, and close."""
+    d = Drawer([0.0, 0.0, 0.3])
+    d.move([0.1, -0.2, 0.14])
+    at = {"arrive": d.move([0.1, -0.2, 0.02])}
+    d.grip(True, n=6, held=held)
+    at["close"] = d.grip(False)
+    at["grasp"] = d.grip(True)
+    d.move([0.1, -0.2, 0.16])
+    d.move([0.05, 0.2, 0.16])
+    d.move([0.05, 0.2, 0.05])
+    d.grip(False)
+    d.move([0.05, 0.2, 0.2])
+    return d, at
+
+
+@pytest.mark.parametrize("held", [0.0, episodes.HELD], ids=["nothing", "something"])
+def test_a_closing_after_which_the_hand_stays_until_it_opens_again_is_no_grasp(held):
+    drawing, at = false_start(held)
+    key_poses = mine(drawing, noise=NOISE_M)
+    assert at_contacts(key_poses) == ["grasp", "place", "release"]
+    assert abs(frame_of(key_poses, "grasp") - at["grasp"]) <= 1
+    arrival = next(pose for pose, after in pairwise(key_poses) if after.phase == "grasp")
+    assert (arrival.phase, abs(arrival.frame - at["close"]) <= 1) == ("approach", True)
+
+
+def test_a_thing_that_is_carried_a_little_and_put_down_again_was_grasped():
+    d = Drawer([0.0, 0.0, 0.3])
+    d.move([0.1, -0.2, 0.02])
+    d.grip(True)
+    d.move([0.1, -0.15, 0.02])
+    d.grip(False)
+    d.move([0.1, -0.15, 0.2])
+    assert at_contacts(mine(d)) == ["grasp", "open", "release"]
+
+
+def test_a_grasp_and_a_release_end_when_the_hand_leaves_and_not_when_it_trembles():
+    d = Drawer([0.0, 0.0, 0.3])
+    d.move([0.1, -0.2, 0.14])
+    d.move([0.1, -0.2, 0.02])
+    at = {}
+    for name, closed in (("grasp", True), ("release", False)):
+        d.grip(closed)
+        for aside in (0.003, -0.003, 0.003, 0.0):
+            d.move(d.position + np.array([aside, aside, 0.0]), speed=0.0015)
+            d.wait(3)
+        at[name] = d.frame
+        d.move(d.position + np.array([0.0, 0.0, 0.14]))
+        if closed:
+            d.move([0.05, 0.2, 0.16])
+            d.move([0.05, 0.2, 0.05])
+    key_poses = mine(d, noise=NOISE_M)
+    assert at_contacts(key_poses) == ["grasp", "place", "release"]
+    for name, frame in at.items():
+        assert abs(frame_of(key_poses, name) - frame) <= 1, name
+
+
+def test_a_thing_is_put_down_when_the_fingers_part_and_not_when_they_are_told_to():
+    drawing, at = episodes.pick_and_place()
+    episode, told, late = drawing.episode(), at["let go"], 5
+    opening = episode.opening.copy()
+    opening[told + late :] = episode.opening[told:-late]
+    eased = np.linspace(0, 0.0005, late)  # a grip that grows less tight opens fingers a little
+    opening[told : told + late] = episode.opening[told] + eased
+    key_poses = find_key_poses(replace(episode, opening=opening), observe_robot([episode]))
+    assert abs(frame_of(key_poses, "place") - (told + late)) <= 1
+    assert abs(frame_of(key_poses, "release") - at["release"]) <= 1
+
+
+def pushing(*way, speed=SPEED, leave=True):
+    """Sinks, pushes along the way `(y, z)`, and rises; with the frame at which the push ends."""
+    d = Drawer([0.0, 0.0, 0.3])
+    d.move([0.1, -0.1, 0.15])
+    d.move([0.1, -0.1, 0.02])
+    for y, z in way:
+        d.move([0.1, y, z], speed=speed)
+    end = d.frame
+    if leave:
+        d.move([0.1, d.position[1], 0.2])
+    return d, end
+
+
+@pytest.mark.parametrize("noise", [0.0, NOISE_M])
+@pytest.mark.parametrize("speed", [0.003, SPEED])
+@pytest.mark.parametrize(
+    "way",
+    [
+        pytest.param([(0.0, 0.02), (0.03, 0.042), (0.06, 0.042), (0.09, 0.02), (0.12, 0.02)], id="rides up"),
+        pytest.param([(0.04, 0.02), (0.07, 0.036)], id="up at the end"),
+        pytest.param([(0.05, 0.02), (0.08, 0.042), (0.12, 0.042)], id="ends high"),
+    ],
+)
+def test_a_push_goes_on_while_the_hand_goes_further_than_it_rises(way, speed, noise):
+    drawing, end = pushing(*way, speed=speed)
+    key_poses = mine(drawing, noise=noise)
+    assert at_contacts(key_poses) == ["push"]
+    assert abs(frame_of(key_poses, "push") - end) <= 1
+
+
+def test_a_hand_that_waits_trembling_has_not_ended_its_push():
+    drawing, _ = pushing((0.0, 0.02), (0.05, 0.0345), leave=False)
+    for k in range(20):
+        drawing.move([0.1, 0.05 + 0.001 * (k % 2), 0.0353 + 0.0008 * (k % 2)], speed=0.002)
+    end = drawing.frame
+    drawing.move([0.1, 0.05, 0.2])
+    assert abs(frame_of(mine(drawing), "push") - end) <= 1
+
+
+def test_a_hand_that_backs_off_at_a_slant_pushes_no_further():
+    drawing, end = pushing((0.05, 0.02), leave=False)
+    drawing.move([0.1, -0.1, 0.12])
+    assert abs(frame_of(mine(drawing), "push") - end) <= 1
+
+
+def test_a_hand_that_dips_and_lifts_off_before_it_pushes_has_pushed_once():
+    d = Drawer([0.0, 0.0, 0.3])
+    d.move([0.1, -0.3, 0.025])
+    d.move([0.1, -0.25, 0.06])
+    d.move([0.1, -0.1, 0.06])
+    start = d.move([0.1, -0.1, 0.02])
+    end = d.move([0.1, 0.05, 0.02])
+    d.move([0.1, 0.05, 0.2])
+    key_poses = mine(d)
+    assert at_contacts(key_poses) == ["push"]
+    assert abs(frame_of(key_poses, "push") - end) <= 1
+    assert max(pose.frame for pose in key_poses if pose.phase == "approach") == pytest.approx(start, abs=1)
 
 
 def test_a_flicker_of_the_gripper_command_is_no_contact():

@@ -14,7 +14,8 @@ place   The last frame in which both fingers squeeze a free thing that they move
 open    The same for a thing on a slide: its handle is let go of.
 turn    The same for a thing on a hinge.
 release The last frame before the hand leaves, after the fingers have opened.
-push    The last frame before the hand leaves what it moved without holding it, after it touched it last.
+push    The last frame before the hand leaves, after it last moved something along without holding it. What
+        then tips back, rises or falls, or is only touched again, is not pushed any more.
 ======= ======================================================================================================
 
 A phase that is going on when the demonstration ends, ends there. The other phases (approach, lift, pre-place,
@@ -114,25 +115,52 @@ def _of_hold(
 
 def _pushes(track: ThingTrack, holds: Sequence[tuple[int, int]], T_world_ee: Array) -> Iterator[ContactEvent]:
     """Ends of pushes: contact that moved the thing and was no hold."""
-    T_thing_ee = se3.inverse(track.T_world_thing) @ T_world_ee
+    from_thing = T_world_ee[:, :3, 3] - track.T_world_thing[:, :3, 3]
     stretches: list[tuple[int, int]] = []
-    step = se3.distance(track.T_world_thing[:-1], track.T_world_thing[1:])
-    apart = np.linalg.norm(np.diff(T_thing_ee[:, :3, 3], axis=0), axis=-1)
-    along = np.append(False, (step > PUSHED_M) & (apart < step))
+    along = _along(track, T_world_ee)
     for first, last in runs(np.logical_or(track.touched, along), GAP_STEPS):
         if not track.touched[first : last + 1].any() or any(first <= b and last >= a for a, b in holds):
             continue
-        between = T_thing_ee[stretches[-1][1] : first + 1, :3, 3] if stretches else np.empty((0, 3))
-        if stretches and np.linalg.norm(between - between[0], axis=-1).max() < MOVED_M:
+        if stretches and not _went_away(from_thing[stretches[-1][1] : first + 1]):
             stretches[-1] = (stretches[-1][0], last)
         else:
             stretches.append((first, last))
     for first, last in stretches:
         # What was pushed slides on for a moment.
         poses = track.T_world_thing[max(first - 1, 0) : last + GAP_STEPS + 1]
+        pushed = first + np.flatnonzero(along[first : last + 1] & ~_hangs(track, T_world_ee, first, last))
         # What a hand brushes in passing may swing out and back.
-        if se3.distance(poses[0], poses[-1]) > MOVED_M:
-            yield ContactEvent("push", last + stands([T_world_ee[last:]], MOVED_M), last)
+        if len(pushed) and se3.distance(poses[0], poses[-1]) > MOVED_M:
+            end = int(pushed[-1])
+            yield ContactEvent("push", end + stands([T_world_ee[end:]], MOVED_M), end)
+
+
+def _along(track: ThingTrack, T_world_ee: Array) -> NDArray[np.bool_]:
+    """Whether the thing moved in the step to each frame, where the hand is, and the hand along with it."""
+    moves = track.T_world_thing[1:] @ se3.inverse(track.T_world_thing[:-1])
+    hand = T_world_ee[:, :3, 3]
+    thing_step = se3.apply(moves, hand[:-1, None])[:, 0] - hand[:-1]
+    length = np.linalg.norm(thing_step, axis=-1)
+    along = (length > PUSHED_M) & (np.linalg.norm(np.diff(hand, axis=0) - thing_step, axis=-1) < length)
+    if track.kind == "free":  # it is pushed over what it lies on; otherwise it tips, rises or falls
+        along &= np.linalg.norm(thing_step[:, :2], axis=-1) > np.abs(thing_step[:, 2])
+    return np.append(False, along)
+
+
+def _went_away(from_thing: Array) -> bool:
+    """Whether a hand, at ``(n, 3)`` from a thing's middle, left it: what it slides over it stays with."""
+    away, height = np.linalg.norm(from_thing, axis=-1), from_thing[:, 2]
+    return bool(max(away.max() - away[0], height.max() - height[0]) > MOVED_M)
+
+
+def _hangs(track: ThingTrack, T_world_ee: Array, first: int, last: int) -> NDArray[np.bool_]:
+    """Whether a free thing has been lifted by the hand, at each frame of a stretch, or earlier in it.
+
+    What tips up against a hand that stays low is still pushed.
+    """
+    heights = np.stack([T[first : last + 1, 2, 3] for T in (track.T_world_thing, T_world_ee)])
+    lifted = (heights > heights[:, :1] + MOVED_M).all(axis=0)
+    return np.logical_or.accumulate(lifted & (track.kind == "free"))
 
 
 def runs(flags: NDArray[np.bool_], gap: int) -> list[tuple[int, int]]:

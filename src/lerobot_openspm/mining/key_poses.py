@@ -41,9 +41,12 @@ MOTIONLESS_M = 1e-5
 # Closed fingers that hold something and rise by this much carry it; otherwise they pull or turn it.
 LIFTED_M = 0.03
 TURNED_RAD = np.deg2rad(35)
-# A hand that pushes stays within this height of its lowest point.
+# A push begins and ends within this height of its lowest point. In between the hand may ride up further, on
+# what it pushes or as it turns, but does not lift off.
 PUSH_BAND_M = 0.015
-# A hand that sinks by less than this in two steps travels level.
+# A hand that trembles stays within this height.
+STANDING_M = 0.003
+# A hand that sinks or rises by less than this in two steps travels level.
 LEVEL_M = 0.001
 # Corners this close to a contact pose are the contact pose.
 MIN_SPACING_M = 0.02
@@ -170,14 +173,17 @@ def _carry_marks(episode: Episode, start: int, end: int, let_go: int, contact: i
 def _push_marks(episode: Episode, start: int, end: int, closed: bool, contact: int) -> list[_Mark]:
     """Approach, push and retreat of a hand that holds nothing but travels low."""
     height = episode.T_world_ee[start : end + 1, 2, 3]
-    # The lowest stretch: a hand that dips twice and rises in between has pushed nothing on the way.
+    # The lowest stretch: a hand that dips twice and lifts off in between has pushed nothing on the way.
     lowest = int(np.argmin(height))
-    high = np.flatnonzero(height >= height[lowest] + PUSH_BAND_M)
-    low = np.arange(high[high < lowest].max(initial=-1) + 1, high[high > lowest].min(initial=len(height)))
-    first, last = start + _bottom(height, int(low[0]), 1), start + _bottom(height, int(low[-1]), -1)
-    metres, _ = se3.distances(episode.T_world_ee[first], episode.T_world_ee[last])
+    high = np.flatnonzero(height >= height[lowest] + LIFTED_M)
+    between = slice(high[high < lowest].max(initial=-1) + 1, high[high > lowest].min(initial=len(height)))
+    low = between.start + np.flatnonzero(height[between] < height[lowest] + PUSH_BAND_M)
+    first, level = start + _bottom(height, int(low[0]), 1), start + _bottom(height, int(low[-1]), -1)
+    metres, _ = se3.distances(episode.T_world_ee[first], episode.T_world_ee[level])
     if metres < 0.04:  # a hand that only passes a low point pushes nothing
         return []
+    way = episode.T_world_ee[first : start + between.stop, :3, 3]
+    last = first + _push_end(way, start + int(low[-1]) - first)
     approach = _corner_marks(episode, start, first, "approach", closed, contact, [first])
     retreat = _corner_marks(episode, last, end, "retreat", closed, contact, [last])
     return [
@@ -194,6 +200,24 @@ def _bottom(height: Array, index: int, step: int) -> int:
     ahead = index + 2 * step
     while 0 <= ahead < len(height) and height[ahead] < height[index] - LEVEL_M:
         index, ahead = index + step, ahead + step
+    return index
+
+
+def _push_end(positions: Array, low: int) -> int:
+    """Index at which a hand begins to leave what it pushes.
+
+    Args:
+        positions: The hand's way ``(n, 3)`` from the first touch until it has lifted off.
+        low: The last index at which it is in the band of a push: it may stay on at the edge of it.
+    """
+    height, on = positions[:, 2], np.linalg.norm(positions[:, :2] - positions[low, :2], axis=-1)
+    index = int(np.flatnonzero(height - on <= height[low] + STANDING_M)[-1])
+    pushed = np.linalg.norm(positions[:, :2] - positions[0, :2], axis=-1)
+    # Back to where it began to rise by more than it pushed on, in one step or in two.
+    while index >= 2 and any(
+        height[index] - height[i] > max(LEVEL_M, pushed[index] - pushed[i]) for i in (index - 1, index - 2)
+    ):
+        index -= 1
     return index
 
 
