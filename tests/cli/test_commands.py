@@ -138,7 +138,7 @@ def test_collecting_into_a_foreign_folder_is_one_line(openspm: Openspm, tmp_path
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        (("collect", "--env.task=juggle"), "juggle; expected 'all' or a comma list of: bowl_on_plate"),
+        (("collect", "--env.task=juggle"), "juggle; expected 'all', 'compound', 'two_bowls' or a comma list of: bowl_on_plate"),
         (("collect", "--episodes=0"), "episodes must be at least 1, got 0"),
         (("mine", "--policy.execution=telepathy"), "telepathy"),
     ],
