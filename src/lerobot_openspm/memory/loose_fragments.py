@@ -4,14 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from itertools import pairwise
 
 from lerobot_openspm.memory import vocabulary as v
 from lerobot_openspm.memory.loose_words import Element
 from lerobot_openspm.memory.nouns import Noun
 from lerobot_openspm.memory.prepositions import Preposition
-
-# Operations that say all of what becomes of a thing.
-MADE = ("open", "close", "turn on", "turn off")
+from lerobot_openspm.memory.sense import MADE
 
 
 @dataclass
@@ -73,9 +72,14 @@ def read_fragments(elements: Sequence[Element]) -> list[Fragment]:
             one.is_seen |= not element.words.startswith(("that", "which", "the one")) and " " in element.words
             continue
         else:
-            _take(one, element, is_relative)
+            before = elements[i - 1] if i else None
+            is_reported = before is not None and before.words in ("i", "we", "he")  # "I put it there"
+            _take(one, element, is_relative, is_reported)
         is_relative = False
-    return [one for one in fragments if not one.is_empty]
+    found = [one for one in fragments if not one.is_empty]
+    for before, one in pairwise(found):
+        one.is_wish |= one.marker == "and" and before.is_wish and one.is_state
+    return found
 
 
 def _joins_pair(one: Fragment, joint: Element) -> bool:
@@ -93,7 +97,7 @@ def _ends(elements: Sequence[Element], i: int) -> bool:
     return i + 1 >= len(elements) or elements[i + 1].words in (",", ";")
 
 
-def _take(one: Fragment, element: Element, is_relative: bool) -> None:
+def _take(one: Fragment, element: Element, is_relative: bool, is_reported: bool) -> None:
     """Add an element to a fragment."""
     if element.kind == "preposition" and element.preposition is not None:
         preposition = element.preposition
@@ -113,7 +117,9 @@ def _take(one: Fragment, element: Element, is_relative: bool) -> None:
     elif element.kind in ("operation", "result"):
         if one.operation not in MADE:
             one.operation = element.value if element.value != v.HALF_A_VERB else one.operation
-        one.is_wish |= element.kind == "operation"
+        is_told = element.kind == "operation" and not one.is_state and not is_reported
+        one.is_wish |= is_told or (element.kind == "result" and bool(one.nouns) and not one.is_state)
+        one.is_state |= is_reported
     elif element.kind == "wish":
         one.is_wish = True
     elif element.kind == "copula":

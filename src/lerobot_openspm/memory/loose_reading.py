@@ -12,11 +12,11 @@ from dataclasses import replace
 from lerobot_openspm.errors import InstructionError
 from lerobot_openspm.memory import vocabulary as v
 from lerobot_openspm.memory.entry import Reference, SubTask
-from lerobot_openspm.memory.loose_fragments import MADE, Fragment, Phrase, read_fragments
-from lerobot_openspm.memory.loose_words import THINGS, read_elements
+from lerobot_openspm.memory.loose_fragments import Fragment, Phrase, read_fragments
+from lerobot_openspm.memory.loose_words import THINGS, read_elements, said_again
 from lerobot_openspm.memory.names import canonical_name
 from lerobot_openspm.memory.nouns import Noun
-from lerobot_openspm.memory.sense import OPENED, SWITCHED, is_said_again
+from lerobot_openspm.memory.sense import MADE, OPENED, SWITCHED, is_said_again
 from lerobot_openspm.memory.sentences import MAX_CHARACTERS, is_question, refuse_what_asks_for_nothing
 from lerobot_openspm.memory.wording import plain_words
 
@@ -33,7 +33,7 @@ def read_loosely(instruction: str, things: Collection[str] = THINGS) -> tuple[Su
     """
     if len(instruction) > MAX_CHARACTERS:
         raise InstructionError("is too long")
-    text = plain_words(instruction)
+    text = said_again(plain_words(instruction))
     refuse_what_asks_for_nothing(text)
     if any(is_question(tuple(s.split())) for s in text.split(" ; ") if s.strip()):
         raise InstructionError("is a question; say what to do")
@@ -48,6 +48,23 @@ def read_loosely(instruction: str, things: Collection[str] = THINGS) -> tuple[Su
     return reader.finish()
 
 
+def _opened_first(steps: list[SubTask]) -> list[SubTask]:
+    """The opening of a thing before what is put into it: "it goes in the drawer, so open that"."""
+    for step in [s for s in steps if s.operation == "open"]:
+        at = steps.index(step)
+        into = [i for i, s in enumerate(steps[:at]) if (s.landmark, s.part) == (step.target, step.part)]
+        if into and not any(s.operation == "close" for s in steps):
+            steps.insert(into[0], steps.pop(at))
+    return steps
+
+
+def _elsewhere(target: Noun, relation: str, landmark: Noun) -> Noun:
+    """A target that is not told by being already where it goes."""
+    where = target.where
+    is_there = where == Reference(relation.removesuffix(" of"), (landmark.name,)) and relation.endswith(" of")
+    return replace(target, where=None) if is_there else target
+
+
 class _Reader:
     """Makes steps of fragments; remembers what was named."""
 
@@ -57,6 +74,7 @@ class _Reader:
         self._waiting: list[Noun] = []  # targets that still go nowhere
         self._goal: tuple[str, Noun] | None = None  # where something goes that was not said yet
         self._about: list[Phrase] = []  # which one is meant, said before it is named
+        self._listed: tuple[str, Noun] | None = None  # where things go that are listed after it
         self._pushes = False
         self._later: list[SubTask] = []
 
@@ -95,7 +113,7 @@ class _Reader:
                 found[at] = replace(found[at], operation="push")
         if not found or self._goal is not None or self._waiting:
             raise InstructionError("leaves open what is to be done to what")
-        return tuple(found)
+        return tuple(_opened_first(found))
 
     def _count(self, step: SubTask) -> bool:
         return any(noun.count > 1 and noun.name == step.target for noun in self._named)
@@ -134,6 +152,10 @@ class _Reader:
         about = [p for p in phrases if p is not goal and (p not in after or p.preposition.is_source)]
         if targets and about:
             targets[-1] = self._which(targets[-1], about)
+        elif about and self._waiting:
+            self._waiting[-1] = self._which(self._waiting[-1], about)
+        elif goal is not None:
+            self._about = about
         self._named += targets
         self._named += [self._resolve(n) for p in about for n in p.nouns if not n.pronoun]
         if goal is None:
@@ -141,9 +163,15 @@ class _Reader:
                 self._waiting = targets if fragment.is_seen or fragment.operation else self._joined(targets)
                 if fragment.is_state and not is_told and not fragment.phrases:
                     self._waiting = []
-            if self._goal and self._waiting:
-                self._put(self._waiting, *self._goal)
+            if fragment.operation == "push" and self._steps and targets == self._last_targets():
+                self._steps[-1], self._waiting = replace(self._steps[-1], operation="push"), []
+                self._pushes = False
+            listed = self._listed if fragment.marker in (",", "and") and not fragment.operation else None
+            if self._waiting and (goes := self._goal or listed):
+                self._put(self._waiting, *goes)
+                self._listed = goes
             return
+        self._listed = None
         landmark, relation = self._landmark(goal, targets)
         landmark = self._which(landmark, after) if after else landmark
         is_joined = fragment.marker in (",", "and", "") and not any(n.pronoun for n in fragment.nouns)
@@ -154,6 +182,7 @@ class _Reader:
             for t in targets or self._waiting or self._last_targets()
             if (t.name, t.where) != (landmark.name, landmark.where)
         ]
+        targets = [_elsewhere(t, relation, landmark) for t in targets]
         self._named.append(landmark)
         if targets:
             self._put(targets, relation, landmark)
@@ -191,8 +220,8 @@ class _Reader:
     def _last_targets(self) -> list[Noun]:
         if not self._steps:
             return []
-        last = self._steps[-1]
-        if last.operation not in ("put", "push"):
+        last = next((s for s in reversed(self._steps) if s.landmark), self._steps[-1])
+        if not last.landmark:
             return []
         same = [s for s in self._steps if s.landmark == last.landmark and s.relation == last.relation]
         return [Noun(s.target, s.part if not s.landmark else "", s.target_where) for s in dict.fromkeys(same)]
@@ -207,6 +236,8 @@ class _Reader:
                 return replace(drawer, part=f"{height} {drawer.part.split()[-1]}") if height else drawer
             name = f"{noun.name} {last.name.split()[-1]}" if noun.name else last.name
             return Noun(name, "", noun.where or last.where)
+        if noun.pronoun == "its" and self._named:
+            return replace(noun, name=self._named[-1].name, pronoun="")
         if noun.pronoun:
             raise InstructionError(f"does not say what {noun.pronoun!r} is")
         if noun.part and len(noun.part.split()) == 1:  # "that drawer"
@@ -236,6 +267,8 @@ class _Reader:
             last = self._steps[-1] if self._steps else None
             if last is not None and last.landmark and noun.pronoun == "there":
                 return Noun(last.landmark, last.part, last.landmark_where), last.relation
+            if noun.pronoun == "there" and (found := self._spoken_of(targets)):
+                return found
             taken = [t.name for t in targets] if goal.nouns else []
             others = [n for n in self._named if n.name not in taken]
             if not goal.nouns:
@@ -249,6 +282,15 @@ class _Reader:
         if goal.preposition.is_inside and (part := v.PART_BY_PLACE.get(noun.name)):
             noun, relation = replace(noun, part=f"{v.PLACE_OF_RELATION[relation]} {part}"), "in"
         return noun, relation
+
+    def _spoken_of(self, targets: Sequence[Noun]) -> tuple[Noun, str] | None:
+        """Where "there" is, if only said of the thing: "get it in front of the stove by pushing it there"."""
+        where = targets[-1].where if targets else None
+        if where is None or len(where.landmarks) != 1:
+            return None
+        relation = {"back": "behind"}.get(where.relation, where.relation)
+        relation = f"{relation} of" if relation in ("front", "left", "right") else relation
+        return Noun(where.landmarks[0]), relation
 
     def _which(self, noun: Noun, phrases: Sequence[Phrase]) -> Noun:
         """Give a noun the phrase that tells which of several it is."""

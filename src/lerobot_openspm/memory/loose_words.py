@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Collection
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Literal
 
@@ -31,7 +31,7 @@ _RESULTS = {
     "burning": "turn on", "running": "turn on",
 }  # fmt: skip
 _WISHES = v.word_set(
-    "should must needs need ought goes go going belongs belong has have want wants wanted needed meant "
+    "should must needs need ought goes go belongs belong has have want wants wanted needed meant "
     "supposed shall let prefer fancy wish would could makes see ends end lands land"
 )
 _COPULAS = v.word_set("is are was were")
@@ -56,12 +56,18 @@ _FILLERS = v.word_set(
     "currently at point up's do does done doing will can may might both all one ones together along away now "
     "thing things item items object objects something place places spot home position stay stand sit rest "
     "come comes put inside mean like love would glad happy where which who in on 's by from same just only "
-    "right good better please piece such move moved kind straight already order ready good's into onto "
-    "new proper usual robot sure make which's need's lid quick careful little bit gentle light small push"
-) - v.word_set("push on in off only already found by from light inside into onto")
+    "right good sits stands lies rests better please piece such move moved kind straight already order ready "
+    "new proper usual going robot sure make which's need's lid quick careful little bit gentle light small"
+) - v.word_set("on in off only already found by from light inside into onto")
 _SIDE = r"left|right|front|back|middle|cent(?:re|er)|rear"
 _SPOT = r"(?:area|space|gap|spot|place|region|position|home)"
 _SAID_AGAIN = (
+    (r"\b(?:what|all) (?:i|we) (?:(?:would|really|want|need|like|love|prefer) )+is (?:for )?", "should "),
+    (r"(?:^|(?<=; ))(?:see|notice|spot|look at) (?=(?:the|that|a)\b)", "there is "),
+    (r"\b(?:go|head|walk|reach)(?: over)? (?:to|for) (the [a-z]+(?: [a-z]+)?) and ", r"\1 , "),
+    (r"\bsee to it that\b", "should"), (r"\band that the\b", "and the"), (r"\bfirst of all\b|\bup top ,", ""),
+    (r"\b(fire|power|light|start|turn|switch) (the \w+|it) (up|on|off)\b", r"\1 \3 \2"),
+    (r"\b(?:flame|heat|gas|fire|burner) (?:on|of|under) the stove\b", "stove"),
     (r"\b(?:box|package|packet|pack)s? of (?:the )?(?:cookies?|biscuits?)\b", "cookie box"),
     (r"\bbottle of wine\b", "wine bottle"),
     (rf"\b(?:{'|'.join(sorted(v.CONTAINERS - {'block'}))})s? of (?:the )?(?=[a-z])", ""),
@@ -73,6 +79,14 @@ _SAID_AGAIN = (
     (rf"'s (?:new |right |proper |usual )?{_SPOT} is\b", "goes to"),
     (r"(the [a-z ]+?) (?:should|must|needs to|has to) (?:have|hold|get|receive) (the [a-z ]+?) "
      r"(?:on|in|inside) it\b", r"put \2 to \1"),
+    (r"(?<!to )(?<!on )(?<!at )(?<!from )the (\w+most|left|right|middle|front|back|rear)(?: one)? of "
+     r"(?:the )?(?:two |three |both )?((?:[a-z]+ )?[a-z]+)s\b", r"the \1 \2"),
+    (r"\b(that|those) ((?:\w+ )?\w+) there\b", r"\1 \2"),
+    (r"\b(?:(?:the|these|those|both|all) )?(?:two|three|following|these|those|both) "
+     r"(?:things|items|objects)\b", ""),
+    (r"(?<!in )(?<!on )(?<!to )(?<!of )(?<!into )(?<!onto )(?<!under )(?<!inside )"
+     r"\b(the [a-z' ]+?) is where (the [a-z ]+?) (?:should|must|has to|needs to|ought to|goes|belongs)"
+     r"(?: (?:be|go|stand|sit|end up))?(?= ?(?:[,;]|$))", r"put \2 to \1"),
     (r"(?:that is|that) where\b|\bis where\b", "goes"),
     (r"\bhas to\b|\bhave to\b|\b(?:is|are)(?: both| all)? (?:to|supposed to|meant to)\b", "must"),
     (r"\b(?:is|are) (needed|wanted|meant)\b", r"\1"),
@@ -80,8 +94,6 @@ _SAID_AGAIN = (
     (r"\b(?:makes it|finds its way|find its way|gets|get)(?= (?:in)?to\b)", "goes"),
     (r"\b(left|right|front|back) most\b|\b(left|right) hand\b", r"\1\2"),
     (r"\b(?:furthest|farthest|closest|nearest)(?: to)?(?: the)? (left|right|front|back)\b", r"at the \1"),
-    (r"(?<!to )(?<!on )(?<!at )(?<!from )the (\w+most|left|right|middle|front|back|rear)(?: one)? of "
-     r"(?:the )?(?:two |three |both )?((?:[a-z]+ )?[a-z]+)s\b", r"the \1 \2"),
     (r"(?<!the )(?<!to )\b(left|right) of\b", r"to the \1 of"),
     (rf"\b(to|at|on|in) (?:the )?((?:\w+ )?\w+) 's ({_SIDE})(?: side)?(?= ?(?:[,;]|$|by|and))",
      r"\1 the \3 of the \2"),
@@ -117,14 +129,19 @@ class Element:
     preposition: Preposition | None = None
 
 
+def said_again(text: str) -> str:
+    """A text in plain words, with fewer ways to say a thing."""
+    for pattern, other in _SAID_AGAIN:
+        text = " ".join(re.sub(pattern, f" {other} ", text).split())
+    return text
+
+
 def read_elements(text: str, things: Collection[str] = THINGS) -> list[Element]:
-    """Find the elements of a text in plain words.
+    """Find the elements of a text as :func:`said_again` gives it.
 
     Raises:
         InstructionError: There is a word that is none of them.
     """
-    for pattern, other in _SAID_AGAIN:
-        text = re.sub(pattern, f" {other} ", text)
     words = tuple(text.split())
     noun_at = _noun_pattern(frozenset(things))
     found: list[Element] = []
@@ -166,9 +183,12 @@ def _element(
     rest = " ".join(words[i:])
     if match := re.match(rf"(?:{_RELATIVES})(?: (?:{'|'.join(_STANDING)}))?(?= |$)", rest):
         after = rest[match.end() :].strip().split()
-        if match_preposition(tuple(after), 0) or match[0].startswith(("there", "you", "will", "i ")):
+        is_done_to = bool(found) and found[-1].kind == "operation"  # "move that one onto the plate"
+        if (not is_done_to and match_preposition(tuple(after), 0)) or match[0].startswith(
+            ("there", "you", "will", "i ")
+        ):
             return Element("relative", match[0])
-    if words[i] in _STANDING and match_preposition(words, i + 1) and found and found[-1].kind == "noun":
+    if words[i] in _STANDING and match_preposition(words, i + 1) and found and _is_name(found[-1]):
         return Element("relative", words[i])
     if match := _HERE.match(rest):
         return Element("preposition", match[0], preposition=Preposition("", v.PLACES[match[1]]))
@@ -193,11 +213,17 @@ def _element(
         return Element("joint", words[i], _JOINTS[words[i]])
     if words[i] in _COPULAS:
         return Element("copula", words[i])
+    if words[i] in ("has", "have", "had") and words[i + 1 : i + 2] == ("been",):
+        return Element("copula", words[i])
     if words[i] in _WISHES:
         return Element("wish", words[i])
     if verb is not None:
         return Element("operation", " ".join(words[i : i + verb.length]), verb.operation)
     return Element("filler", words[i]) if words[i] in _FILLERS or words[i] in v.PARTICLES else None
+
+
+def _is_name(element: Element) -> bool:
+    return element.noun is not None and not element.noun.pronoun
 
 
 def _is_result(words: tuple[str, ...], i: int) -> bool:
@@ -208,4 +234,5 @@ def _is_result(words: tuple[str, ...], i: int) -> bool:
 def _noun(words: str) -> Noun:
     if words in ("that", "this") or "of them" in words or "of these" in words or "of those" in words:
         return Noun(pronoun="it" if words in ("that", "this") else "them")
-    return read_noun(tuple(words.removeprefix("of ").split()))
+    noun = read_noun(tuple(words.removeprefix("of ").split()))
+    return replace(noun, count=1) if words.startswith("of ") else noun  # one of them is named next

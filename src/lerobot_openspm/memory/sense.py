@@ -12,6 +12,8 @@ from lerobot_openspm.memory.names import canonical_name
 # What is opened and closed, and what is switched.
 OPENED = v.word_set("cabinet microwave")
 SWITCHED = v.word_set("stove microwave")
+# Operations that say all of what becomes of a thing.
+MADE = ("open", "close", "turn on", "turn off")
 _PARTS = {*v.PART_OF, *v.NAMED_PARTS, *v.PLACES, *v.PART_SYNONYMS}
 _POSITIONS = {*v.PLACES, *v.HEIGHTS}
 
@@ -58,6 +60,11 @@ def _can_be(sub_task: SubTask) -> bool:
     target, part = canonical_name(sub_task.target), sub_task.part.split()
     if part and (part[-1] not in _PARTS or not set(part[:-1]) <= _POSITIONS):
         return False
+    owner = canonical_name(sub_task.landmark or sub_task.target)
+    if part and v.PART_OF.get(v.PART_SYNONYMS.get(part[-1], part[-1]), owner) != owner:
+        return False
+    if sub_task.operation in MADE and sub_task.target_where is not None:
+        return False  # "the drawer on the cabinet" is a part of it
     if sub_task.operation in ("put", "push"):
         return (bool(sub_task.landmark) and target != canonical_name(sub_task.landmark)) or (
             target.endswith("bowl") and sub_task.target_where is not None
