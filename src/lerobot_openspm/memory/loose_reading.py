@@ -33,8 +33,9 @@ def read_loosely(instruction: str, things: Collection[str] = THINGS) -> tuple[Su
     """
     if len(instruction) > MAX_CHARACTERS:
         raise InstructionError("is too long")
-    text = said_again(plain_words(instruction))
+    text = plain_words(instruction)
     refuse_what_asks_for_nothing(text)
+    text = said_again(text)
     if any(is_question(tuple(s.split())) for s in text.split(" ; ") if s.strip()):
         raise InstructionError("is a question; say what to do")
     elements = read_elements(text, things)
@@ -121,7 +122,7 @@ class _Reader:
     def _make(self, fragment: Fragment) -> None:
         """Open, close or switch something."""
         things = [*fragment.nouns, *(n for p in fragment.phrases for n in p.nouns)]
-        things = [self._resolve(n) for n in things if not n.pronoun or n.pronoun == "one"]
+        things = [self._resolve(n) for n in things if n.pronoun in ("", "one", "its")]
         self._named += things
         may_be = SWITCHED if fragment.operation.startswith("turn") else OPENED
         fits = [n for n in (things or reversed(self._named)) if canonical_name(n.name) in may_be]
@@ -186,6 +187,7 @@ class _Reader:
         self._named.append(landmark)
         if targets:
             self._put(targets, relation, landmark)
+            self._listed = (relation, landmark)
         else:
             self._goal = (relation, landmark)
 
@@ -269,7 +271,7 @@ class _Reader:
                 return Noun(last.landmark, last.part, last.landmark_where), last.relation
             if noun.pronoun == "there" and (found := self._spoken_of(targets)):
                 return found
-            taken = [t.name for t in targets] if goal.nouns else []
+            taken = [t.name for t in targets]
             others = [n for n in self._named if n.name not in taken]
             if not goal.nouns:
                 others = [n for n in others if canonical_name(n.name).split()[-1] in v.HOLLOW or n.part]

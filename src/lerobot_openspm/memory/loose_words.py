@@ -62,10 +62,13 @@ _FILLERS = v.word_set(
 _SIDE = r"left|right|front|back|middle|cent(?:re|er)|rear"
 _SPOT = r"(?:area|space|gap|spot|place|region|position|home)"
 _SAID_AGAIN = (
-    (r"\b(?:what|all) (?:i|we) (?:(?:would|really|want|need|like|love|prefer) )+is (?:for )?", "should "),
+    (r"\b(?:what|all) (?:i|we) (?:(?:would|really|want|need|like|love|prefer) )+is (?:for )?", "must "),
     (r"(?:^|(?<=; ))(?:see|notice|spot|look at) (?=(?:the|that|a)\b)", "there is "),
     (r"\b(?:go|head|walk|reach)(?: over)? (?:to|for) (the [a-z]+(?: [a-z]+)?) and ", r"\1 , "),
-    (r"\bsee to it that\b", "should"), (r"\band that the\b", "and the"), (r"\bfirst of all\b|\bup top ,", ""),
+    (r"\bsee to it that\b", "must"),
+    (r"\bafter (?:that|which|this)\b(?! \w+ing)", "then"),
+    (r"\band that the\b", "and the"),
+    (r"\bfirst of all\b|\bup top ,", ""),
     (r"\b(fire|power|light|start|turn|switch) (the \w+|it) (up|on|off)\b", r"\1 \3 \2"),
     (r"\b(?:flame|heat|gas|fire|burner) (?:on|of|under) the stove\b", "stove"),
     (r"\b(?:box|package|packet|pack)s? of (?:the )?(?:cookies?|biscuits?)\b", "cookie box"),
@@ -82,6 +85,9 @@ _SAID_AGAIN = (
     (r"(?<!to )(?<!on )(?<!at )(?<!from )the (\w+most|left|right|middle|front|back|rear)(?: one)? of "
      r"(?:the )?(?:two |three |both )?((?:[a-z]+ )?[a-z]+)s\b", r"the \1 \2"),
     (r"\b(that|those) ((?:\w+ )?\w+) there\b", r"\1 \2"),
+    (r"\bon (?:the )?(cabinet|stove) top\b", r"on top of the \1"),
+    (r"\bthe one (?:to (?:put|place|set|go) )(?=on|in|under)", "must go "),
+    (r"\bto where (the (?:front|left|right) of the \w+) is\b", r"to \1"),
     (r"\b(?:(?:the|these|those|both|all) )?(?:two|three|following|these|those|both) "
      r"(?:things|items|objects)\b", ""),
     (r"(?<!in )(?<!on )(?<!to )(?<!of )(?<!into )(?<!onto )(?<!under )(?<!inside )"
@@ -228,11 +234,12 @@ def _is_name(element: Element) -> bool:
 
 def _is_result(words: tuple[str, ...], i: int) -> bool:
     after = words[i + 1] if i + 1 < len(words) else ""
-    return after in ("", ",", ";", "and", "then", "at", "now", "before", "after", "once")
+    return after in ("", ",", ";", "and", "then", "at", "now", "before", "first", "second", "after", "once")
 
 
 def _noun(words: str) -> Noun:
     if words in ("that", "this") or "of them" in words or "of these" in words or "of those" in words:
         return Noun(pronoun="it" if words in ("that", "this") else "them")
     noun = read_noun(tuple(words.removeprefix("of ").split()))
-    return replace(noun, count=1) if words.startswith("of ") else noun  # one of them is named next
+    is_one = words.startswith("of ") or (words.startswith("both ") and not words.endswith("s"))
+    return replace(noun, count=1) if is_one else noun  # "of the bowls, the left one", "both the milk and"

@@ -66,8 +66,7 @@ def _can_be(sub_task: SubTask) -> bool:
     if sub_task.operation in MADE and sub_task.target_where is not None:
         return False  # "the drawer on the cabinet" is a part of it
     if sub_task.operation in ("put", "push"):
-        return (bool(sub_task.landmark) and target != canonical_name(sub_task.landmark)) or (
-            target.endswith("bowl") and sub_task.target_where is not None
-        )
+        is_other = target != canonical_name(sub_task.landmark) or target.endswith("bowl")  # one on another
+        return bool(sub_task.landmark) and is_other
     may_be = SWITCHED if sub_task.operation.startswith("turn") else OPENED
     return target in may_be and (target != "cabinet" or bool(sub_task.part))
