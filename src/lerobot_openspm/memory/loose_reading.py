@@ -160,18 +160,26 @@ class _Reader:
         self._named += targets
         self._named += [self._resolve(n) for p in about for n in p.nouns if not n.pronoun]
         if goal is None:
-            if targets:
-                self._waiting = targets if fragment.is_seen or fragment.operation else self._joined(targets)
-                if fragment.is_state and not is_told and not fragment.phrases:
-                    self._waiting = []
-            if fragment.operation == "push" and self._steps and targets == self._last_targets():
-                self._steps[-1], self._waiting = replace(self._steps[-1], operation="push"), []
-                self._pushes = False
-            listed = self._listed if fragment.marker in (",", "and") and not fragment.operation else None
-            if self._waiting and (goes := self._goal or listed):
-                self._put(self._waiting, *goes)
-                self._listed = goes
-            return
+            self._wait(fragment, targets, is_told)
+        else:
+            self._send(fragment, targets, goal, after)
+
+    def _wait(self, fragment: Fragment, targets: list[Noun], is_told: bool) -> None:
+        """Keep targets that go nowhere yet; put them where was said before."""
+        if targets:
+            self._waiting = targets if fragment.is_seen or fragment.operation else self._joined(targets)
+            if fragment.is_state and not is_told and not fragment.phrases:
+                self._waiting = []
+        if fragment.operation == "push" and self._steps and targets == self._last_targets():
+            self._steps[-1], self._waiting = replace(self._steps[-1], operation="push"), []
+            self._pushes = False
+        listed = self._listed if fragment.marker in (",", "and") and not fragment.operation else None
+        if self._waiting and (goes := self._goal or listed):
+            self._put(self._waiting, *goes)
+            self._listed = goes
+
+    def _send(self, fragment: Fragment, targets: list[Noun], goal: Phrase, after: Sequence[Phrase]) -> None:
+        """Put targets at a goal, or keep the goal for what is named next."""
         self._listed = None
         landmark, relation = self._landmark(goal, targets)
         landmark = self._which(landmark, after) if after else landmark
