@@ -6,15 +6,18 @@ reads a verb with its ``nouns`` and ``prepositions``; here clauses become sub-ta
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 
 from lerobot_openspm.errors import InstructionError
 from lerobot_openspm.memory import vocabulary as v
 from lerobot_openspm.memory.clauses import Said, read_clause
 from lerobot_openspm.memory.entry import SubTask
+from lerobot_openspm.memory.loose_reading import read_loosely
+from lerobot_openspm.memory.loose_words import THINGS
 from lerobot_openspm.memory.names import canonical_name
 from lerobot_openspm.memory.nouns import Noun
+from lerobot_openspm.memory.sense import makes_sense
 from lerobot_openspm.memory.sentences import MAX_CHARACTERS, Clause, read_clauses
 
 PICK = "pick"
@@ -35,22 +38,48 @@ class _Meant:
     is_done: bool = False
 
 
-def parse_instruction(instruction: str) -> tuple[SubTask, ...]:
+def parse_instruction(instruction: str, things: Collection[str] = THINGS) -> tuple[SubTask, ...]:
     """Read what is to be done, in the order of execution.
 
     "open the top drawer and put the bowl inside" gives two sub-tasks, the second with the cabinet of the
     first as its landmark. "pick up the bowl on the stove and put it on the plate" gives one: where a thing is
-    picked up tells which is meant, not where it goes.
+    picked up tells which is meant, not where it goes. A sentence that the grammar cannot read, or only with
+    words left over, is read from its elements wherever they stand (``loose_reading``).
+
+    Args:
+        instruction: What is asked.
+        things: Names of things that are known, for the second reading.
 
     Raises:
         InstructionError: It is no instruction to do something (a question, a statement, a negation, a
             condition), no verb of the grammar is in it, or the verb has no object.
     """
     try:
-        return _parse(instruction)
+        return _read_twice(instruction, things)
     except InstructionError as error:
         shown = instruction if len(instruction) <= MAX_CHARACTERS else f"{instruction[:60]} ..."
         raise InstructionError(f"the instruction {shown!r} {error}") from None
+
+
+def _read_twice(instruction: str, things: Collection[str]) -> tuple[SubTask, ...]:
+    """By the grammar; from the elements where that fails or leaves words unexplained."""
+    found: tuple[SubTask, ...] = ()
+    refusal = InstructionError("")
+    try:
+        found = _parse(instruction)
+    except InstructionError as error:
+        refusal = error
+    if found and makes_sense(found, things):
+        return found
+    try:
+        loose = read_loosely(instruction, things)
+        if makes_sense(loose, things):
+            return loose
+    except InstructionError:
+        pass  # what the grammar says of it is of more use
+    if not found:
+        raise refusal
+    return found
 
 
 def _parse(instruction: str) -> tuple[SubTask, ...]:

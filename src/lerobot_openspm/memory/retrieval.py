@@ -10,6 +10,7 @@ from lerobot_openspm.errors import InstructionError
 from lerobot_openspm.memory.entry import MemoryEntry, SubTask
 from lerobot_openspm.memory.indexed_entries import near
 from lerobot_openspm.memory.instruction import parse_instruction
+from lerobot_openspm.memory.loose_words import THINGS
 from lerobot_openspm.memory.meaning import semantic_score
 from lerobot_openspm.memory.names import TABLE_NAMES, NameSimilarity, TableFirst
 
@@ -55,7 +56,9 @@ def semantic_candidates(
         InstructionError: It cannot be read, no entry is about it, or entries about different things fit it as
             well. The error names the instructions that the memory knows, or those that may be meant.
     """
-    return candidates_for(parse_instruction(instruction), instruction, entries, names)
+    keys = {entry.key.sub_tasks for entry in entries}
+    things = THINGS | {name for key in keys for sub_task in key for name in sub_task.objects}
+    return candidates_for(parse_instruction(instruction, things), instruction, entries, names)
 
 
 def candidates_for(

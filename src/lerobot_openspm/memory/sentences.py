@@ -80,9 +80,7 @@ def read_clauses(instruction: str) -> list[Clause]:
     text = plain_wording(instruction)
     if not text:
         raise InstructionError("says nothing, expected one like 'put the bowl on the plate'")
-    for words, reason in _REFUSED:
-        if match := re.search(rf"\b(?:{words})\b", text):
-            raise InstructionError(f"{reason} (it says {match[0]!r})")
+    refuse_what_asks_for_nothing(text)
     found: list[Clause] = []
     for sentence in text.split(";"):
         if words := tuple(sentence.split()):
@@ -91,6 +89,24 @@ def read_clauses(instruction: str) -> list[Clause]:
     if polite and not any(v.match_verb(clause.words, 0) for clause in found):  # "soup in the basket, please"
         found = [replace(clause, is_wanted=True) for clause in found]
     return found
+
+
+def refuse_what_asks_for_nothing(text: str) -> None:
+    """Check a text in plain words.
+
+    Raises:
+        InstructionError: It forbids, depends on a condition, leaves a choice, or says when or how often.
+    """
+    for words, reason in _REFUSED:
+        if match := re.search(rf"\b(?:{words})\b", text):
+            raise InstructionError(f"{reason} (it says {match[0]!r})")
+
+
+def is_question(words: Words) -> bool:
+    """Whether a sentence asks something rather than for something."""
+    if words[0] == "have":
+        return words[1:2] in (("you",), ("they",), ("we",), ("i",))
+    return words[0] in _QUESTION - {"will", "can", "could", "would"} and not _is_request(words)
 
 
 def _read_sentence(words: Words, first_step: int) -> list[Clause]:

@@ -69,8 +69,8 @@ _GREETINGS = r"(?:hey|hi|hello|ok|okay|alright|all right|so|well|robot|assistant
 _HEADINGS = r"(?:(?:your|next|new|the|first) )?(?:task|goal|job|instruction|command|request|order|thing)"
 
 
-def plain_wording(text: str) -> str:
-    """Lower-case words with "," and ";" between clauses and sentences, and the marks above."""
+def plain_words(text: str) -> str:
+    """Lower-case words with "," and ";" between clauses and sentences, without courtesies."""
     text = text.lower()
     for pattern, replacement in _SPELLING:
         text = re.sub(pattern, replacement, text)
@@ -78,7 +78,12 @@ def plain_wording(text: str) -> str:
     text = _collapse(re.sub(rf"\b(?:{'|'.join(_COURTESIES)})\b", " ", text))
     text = _collapse(re.sub(rf"(?:^|(?<=; ))(?:{_GREETINGS}\b[ ,]*)+", "", text))
     text = _collapse(re.sub(rf"(?:^|(?<=; ))(?:{_HEADINGS})(?: now)? , ", "", text))
-    text = _collapse(re.sub(r",? (?:would|will|could|can) you\b|, (?:robot|ok|okay)\b", "", text))
+    return _collapse(re.sub(r",? (?:would|will|could|can) you\b|, (?:robot|ok|okay)\b", "", text))
+
+
+def plain_wording(text: str) -> str:
+    """Plain words with other constructions rewritten, and the marks above."""
+    text = plain_words(text)
     for pattern, replacement in CONSTRUCTIONS:
         text = _collapse(re.sub(pattern, f" {replacement} ", text))
     for name, other in SYNONYMS.items():
