@@ -145,7 +145,8 @@ def measure(options: Options) -> dict[str, Any]:
     splits = {
         split: _measure_split(split, options.folder, names, failures) for split in _splits(options.folder)
     }
-    headline = splits.get(HELD_OUT) or next(iter(splits.values()))
+    split = HELD_OUT if HELD_OUT in splits else next(iter(splits))
+    headline = {**splits[split], "split": split}
     of_libero = [known for known in known_instructions() if known.suites - {"tabletop"}]
     read = [known for known in of_libero if _is_read(known)]
     result = {
@@ -170,7 +171,7 @@ def _is_read(known: Known) -> bool:
 
 
 def _splits(folder: str | None) -> list[str]:
-    return sorted({row["split"] for row in read_rows(PARAPHRASES, folder)})
+    return sorted({row["split"] for name in (PARAPHRASES, OUT_OF_DOMAIN) for row in read_rows(name, folder)})
 
 
 def _measure_split(
