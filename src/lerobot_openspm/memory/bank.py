@@ -263,9 +263,9 @@ def write_texts(file: BinaryIO, texts: Iterable[bytes]) -> tuple[Lines, str]:
 def _check_length(text: bytes, row: int) -> None:
     if len(text) > MAX_LINE_BYTES:
         raise MemoryFormatError(
-            f"entries[{row}] has {len(text)} bytes as JSON, expected up to {MAX_LINE_BYTES}: it could never be "
-            f"loaded again, so nothing was saved. It begins with {text[:80].decode(errors='replace')}; shorten "
-            "its texts, or leave it out"
+            f"entries[{row}] has {len(text)} bytes as JSON, expected up to {MAX_LINE_BYTES}: it could never "
+            f"be loaded again, so nothing was saved. It begins with {text[:80].decode(errors='replace')}; "
+            "shorten its texts, or leave it out"
         )
 
 
