@@ -179,6 +179,56 @@ def test_an_exported_file_can_be_edited_and_added_again(openspm: Openspm, memory
     assert same(after.superseded[0], made().entries[2])
 
 
+def edit(file: Path, change: Any) -> None:
+    exported = json.loads(file.read_text())
+    change(exported["entries"])
+    file.write_text(json.dumps(exported))
+
+
+def test_a_file_with_two_entries_of_one_source_and_instruction_is_refused(
+    openspm: Openspm, memory: Path, tmp_path: Path
+):
+    file = tmp_path / "entries.json"
+    run(openspm, memory, "export", f"--output={file}")
+    edit(file, lambda rows: rows.extend([{**rows[0], "quality": 0.1}, {**rows[0], "quality": 0.2}]))
+    error = refused(openspm, memory, "add", f"--other={file}")
+    assert f"entries[0] and entries[3] are both of source 'local/demos#0' and instruction {BOWL!r}" in error
+    # Of one source there may well be several instructions.
+    edit(file, lambda rows: [rows.pop(), rows[3].update(language=f"{BOWL} now")])
+    assert run(openspm, memory, "add", f"--other={file}")["added"] == 1
+    assert len(load(memory).entries) == 4
+
+
+def test_what_was_merged_or_removed_is_not_added_again(openspm: Openspm, memory: Path, tmp_path: Path):
+    other, file, merged = tmp_path / "other", tmp_path / "entries.json", tmp_path / "merged"
+    run(openspm, memory, "rate", "--source=local/demos#0", "--success=true")
+    save_experience(made(), other)  # its entries have no outcomes, so are not quite what was merged
+    run(openspm, memory, "export", f"--output={file}")
+    run(openspm, memory, "merge")
+    for parcel in (other, file):
+        again = run(openspm, memory, "add", f"--other={parcel}")
+        assert again == {"entries": 2, "superseded": 2, "added": 0, "unchanged": 3}
+    # Also where nothing is known of how the merged entry came about.
+    run(openspm, memory, "export", f"--output={merged}")
+    assert run(openspm, merged, "add", f"--other={other}")["added"] == 0
+    edit(file, lambda rows: rows[2].update(quality=0.1))
+    error = refused(openspm, memory, "add", f"--other={file}")
+    assert "entries[2] is an edited 'local/demos#2', which is part of the merged entry" in error
+    run(openspm, memory, "remove", "--source=local/demos#1")
+    assert run(openspm, memory, "add", f"--other={other}")["added"] == 0
+    assert run(openspm, memory, "restore", "--source=local/demos#1")["entries"] == 2
+
+
+def test_a_file_can_bring_back_what_an_entry_was(openspm: Openspm, memory: Path, tmp_path: Path):
+    before, edited = tmp_path / "before.json", tmp_path / "edited.json"
+    for file in (before, edited):
+        run(openspm, memory, "export", f"--output={file}")
+    edit(edited, lambda rows: rows[1].update(quality=0.1))
+    assert run(openspm, memory, "add", f"--other={edited}")["added"] == 1
+    assert run(openspm, memory, "add", f"--other={before}")["added"] == 1
+    assert [(e.version, e.quality) for e in load(memory).entries if e.source[-1] == "1"] == [(3, 0.9)]
+
+
 @pytest.mark.parametrize(
     ("change", "message"),
     [
