@@ -129,7 +129,7 @@ class Experience:
     def with_outcomes(self, outcomes: Iterable[tuple[MemoryEntry, bool]]) -> Experience:
         """This experience after some of its entries were acted by, each with whether it succeeded.
 
-        All entries are read and kept, also those of a large memory (about 0.2 ms each).
+        All entries are read and kept, also those of a large memory (about 0.3 ms each).
         """
         entries = list(self.entries)
         by_source: dict[str, list[int]] = defaultdict(list)

@@ -66,8 +66,8 @@ class Lines:
         lengths = np.diff(self.ends, prepend=len(HEAD) - len(BETWEEN)) - len(BETWEEN)
         if n and not (lengths.min() > 0 and lengths.max() <= MAX_LINE_BYTES):
             raise MemoryFormatError(
-                f"{where}: array 'entries.ends' has lines of {lengths.min()} to {lengths.max()} bytes, "
-                f"expected 1 to {MAX_LINE_BYTES}: changed or damaged; train or pull it again"
+                f"{where}: array 'entries.ends' does not count up line by line: lines of {lengths.min()} to "
+                f"{lengths.max()} bytes, expected 1 to {MAX_LINE_BYTES}; train or pull it again"
             )
 
 
