@@ -144,6 +144,7 @@ def without(*path):
 
 ENTRY = (0,)
 POSE = (*ENTRY, "key_poses", 0)
+SUB_TASK = (*ENTRY, "key", "sub_tasks", 0)
 AXIS = {"kind": "slide", "direction": [1.0, 0.0, 0.0], "amount": 0.1}
 HEADERS = {
     "newer version": (setting("version", value=VERSION + 1), rf"version {VERSION + 1}.*upgrade"),
@@ -168,7 +169,26 @@ HEADERS = {
     "an object without a name": (without("objects", 0, "name"), "name"),
     "an unknown field": (setting("colour", value="red"), "unknown fields.*colour"),
     "no files": (without("files"), "files"),
-    "files of another kind": (setting("files", value=[]), r"files\['arrays'\] is missing or malformed"),
+    "files of another kind": (setting("files", value=[]), r"'files' is \[\], expected an object"),
+    "a file that nobody reads": (setting("files", "more", value={"file": "x"}), r"'files' has unknown.*more"),
+    "open width below 0": (
+        setting("robot", "open_width", value=-1),
+        "'open_width' is -1, expected .* from 0",
+    ),
+    "a gain beyond robots": (setting("robot", "metres_per_action", value=1e300), "'metres_per_action' is 1e"),
+    "a speed below 0": (setting("robot", "metres_per_step", value=-0.1), "'metres_per_step' is -0.1"),
+    "workspace exchanged": (
+        setting("robot", "workspace", value=[[0.5, 0.5, 0.5], [-0.5, 0.6, 0.6]]),
+        "'workspace' is .*expected the lowest",
+    ),
+    "workspace beyond robots": (
+        setting("robot", "workspace", value=[[0, 0, 0], [1e300, 1, 1]]),
+        "'workspace' must hold 2 x 3 numbers",
+    ),
+    "an object twice": (
+        lambda header: header["objects"].append(header["objects"][0]),
+        "'objects' has 'bowl' twice",
+    ),
     "no file of entries": (without("files", "entries"), r"files\['entries'\]"),
     "a file somewhere else": (setting("files", "arrays", "file", value="../a.safetensors"), "has the name"),
     "no checksum": (without("files", "arrays", "sha256"), "checksum"),
@@ -242,9 +262,40 @@ ENTRIES = {
     "ragged pose": (setting(*POSE, "T_obj_ee", value=[[1, 0], [0, 1, 0]]), r"entries\[0\].*T_obj_ee"),
     "pose of two rows": (without(*POSE, "T_obj_ee", 0), r"entries\[0\].*T_obj_ee"),
     "scaled pose": (setting(*POSE, "T_obj_ee", 0, 0, value=1.5), r"entries\[0\].*T_obj_ee.*rigid"),
-    "huge pose": (setting(*POSE, "T_obj_ee", 0, 0, value=1e300), r"entries\[0\].*T_obj_ee.*rigid"),
+    "huge pose": (setting(*POSE, "T_obj_ee", 0, 0, value=1e300), r"entries\[0\].*T_obj_ee.*numbers from"),
     "null in a pose": (setting(*POSE, "T_obj_ee", 0, 3, value=None), r"entries\[0\].*T_obj_ee"),
     "mirrored layout": (setting(*ENTRY, "layout", "bowl", 2, value=[0, 0, -1, 0]), r"entries\[0\].*'layout'"),
+    "source with half a character": (
+        setting(*ENTRY, "source", value="a\ud800"),
+        r"'source' is 'a\\+ud800', expected text without",
+    ),
+    "source that a terminal obeys": (setting(*ENTRY, "source", value="a\x1b[2J"), r"without '\\+x1b'"),
+    "source of two lines": (setting(*ENTRY, "source", value="a\nb"), r"'source'.* without '\\+n'"),
+    "no source": (setting(*ENTRY, "source", value=""), r"'source' is '', expected text that is not empty"),
+    "no language": (setting(*ENTRY, "language", value=" "), r"entries\[0\].*'language' is empty"),
+    "language with half a character": (setting(*ENTRY, "language", value="put \udfff"), r"'language' is "),
+    "layout with half a character": (
+        lambda rows: rows[0]["layout"].update({"a\ud800": rows[0]["layout"]["bowl"]}),
+        "a name in 'layout' is",
+    ),
+    "landmarks with half a character": (
+        setting(*SUB_TASK, "target_where", value={"relation": "on", "landmarks": ["a\ud800"]}),
+        "'landmarks'",
+    ),
+    "trials beyond counting": (setting(*ENTRY, "trials", value=10**400), r"'trials' is about 2\*\*1329"),
+    "steps beyond counting": (setting(*POSE, "n_steps", value=10**400), r"'n_steps' is about 2\*\*1329"),
+    "version beyond counting": (setting(*ENTRY, "version", value=10**10), r"'version' is 10000000000, exp"),
+    "opening beyond grippers": (setting(*POSE, "opening", value=-1e308), r"'opening' is -1e\+308"),
+    "place beyond tables": (setting(*POSE, "T_obj_ee", 0, 3, value=1e300), r"T_obj_ee.*numbers from -1e\+09"),
+    "unknown operation": (
+        setting(*SUB_TASK, "operation", value="explode"),
+        "'operation' is 'explode', expected one of .*'put'",
+    ),
+    "unknown relation": (setting(*SUB_TASK, "relation", value="inside out"), "'relation' is 'inside out'"),
+    "unknown reference": (
+        setting(*SUB_TASK, "target_where", value={"relation": "near-ish", "landmarks": []}),
+        "'relation' is 'near-ish', expected one of .*'left'",
+    ),
     "covariance of 2 rows": (setting(*POSE, "covariance", value=[[1] * 6] * 2), r"entries\[0\].*covariance"),
     "covariance not symmetric": (
         setting(*POSE, "covariance", value=np.triu(np.ones((6, 6))).tolist()),

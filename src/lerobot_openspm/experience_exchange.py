@@ -18,6 +18,7 @@ from lerobot_openspm.files import write_beside
 from lerobot_openspm.memory.bank import anchored_objects, entry_to_json
 from lerobot_openspm.memory.entry import MemoryEntry
 from lerobot_openspm.memory.fields import MALFORMED, known, text
+from lerobot_openspm.memory.merging import SOURCES
 from lerobot_openspm.memory.store import entry_from_fields
 from lerobot_openspm.memory.strict_json import loads
 from lerobot_openspm.perception.model import KnownObject
@@ -134,7 +135,8 @@ def combined(ours: Experience, parcel: Parcel, where: str) -> tuple[Experience, 
 
     Raises:
         MemoryFormatError: The parcel comes from another robot, from another perception, or has key poses in
-            the frames of other models of objects.
+            the frames of other models of objects. Or it is a file with two entries of one source and
+            instruction, or with an edited entry that was merged into another one.
     """
     theirs = parcel.experience
     for name in ("perception", "segmentation", "shape", "simulator_objects"):
@@ -145,11 +147,53 @@ def combined(ours: Experience, parcel: Parcel, where: str) -> tuple[Experience, 
                 "Mine its demonstrations into this memory: openspm teach, or --policy.memory_update=append"
             )
     _check_objects(ours, parcel, where)
-    held = {entry_to_json(entry) for entry in ours.entries}
-    new = [entry for entry in theirs.entries if entry_to_json(entry) not in held]
+    if parcel.is_edited:
+        _check_twice(theirs.entries, where)
+    new = _not_held(ours, parcel, where)
     if parcel.is_edited:
         return _with_edited(ours, new, theirs), len(new)
-    return ours.appended(replace(theirs, entries=tuple(new), superseded=())), len(new)
+    return ours.appended(replace(theirs, entries=new, superseded=())), len(new)
+
+
+def _not_held(ours: Experience, parcel: Parcel, where: str) -> tuple[MemoryEntry, ...]:
+    """The entries of a parcel that a memory does not hold: neither as they are, nor within merged ones.
+
+    From another memory, nothing is taken that this one has superseded: what was replaced, merged or removed
+    stays so until it is restored. A file that people edit may well bring back what an entry was before.
+    """
+    held = {entry_to_json(entry) for entry in ours.entries}
+    superseded = {entry_to_json(entry) for entry in ours.superseded}
+    merged = {(part, e.key): e.source for e in ours.entries for part in _merged_sources(e)}
+    new: list[MemoryEntry] = []
+    for i, entry in enumerate(parcel.experience.entries):
+        text, within = entry_to_json(entry), merged.get((entry.source, entry.key))
+        if text in held or (text in superseded and (within or not parcel.is_edited)):
+            continue
+        if within and parcel.is_edited:
+            raise MemoryFormatError(
+                f"{where}: entries[{i}] is an edited {entry.source!r}, which is part of the merged entry "
+                f"{within!r} by now; export and edit that one, or remove it and restore what it was made of"
+            )
+        if not within:
+            new.append(entry)
+    return tuple(new)
+
+
+def _merged_sources(entry: MemoryEntry) -> Sequence[str]:
+    parts = entry.source.split(SOURCES)
+    return parts if len(parts) > 1 else ()
+
+
+def _check_twice(entries: Sequence[MemoryEntry], where: str) -> None:
+    """Of one source and instruction there may be one entry in a file, as each takes the place of another."""
+    first: dict[tuple[str, str], int] = {}
+    for i, entry in enumerate(entries):
+        if (before := first.setdefault((entry.source, entry.language), i)) != i:
+            raise MemoryFormatError(
+                f"{where}: entries[{before}] and entries[{i}] are both of source {entry.source!r} and "
+                f"instruction {entry.language!r}, expected one of each; leave one out, or give it another "
+                "source"
+            )
 
 
 def _with_edited(ours: Experience, new: Sequence[MemoryEntry], theirs: Experience) -> Experience:

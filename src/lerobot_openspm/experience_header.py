@@ -8,7 +8,7 @@ from typing import Any
 from lerobot_openspm.errors import MemoryFormatError
 from lerobot_openspm.experience_files import FORMAT, VERSION, Fields
 from lerobot_openspm.geometry.layout import ROTATION_KINDS, VectorLayout, parse_layout
-from lerobot_openspm.memory.fields import MALFORMED, integer, known, text, texts
+from lerobot_openspm.memory.fields import MALFORMED, integer, known, readable, text, texts
 from lerobot_openspm.memory.robot import RobotModel
 from lerobot_openspm.memory.store import robot_from_dict, robot_to_dict
 from lerobot_openspm.perception.learning import SHAPES
@@ -21,6 +21,8 @@ NAMES = frozenset(
         "robot", "objects", "n_entries", "anchored", "files",
     )
 )  # fmt: skip
+
+FILES = frozenset(("entries", "arrays", "cameras"))
 
 Layouts = tuple[VectorLayout, VectorLayout]
 
@@ -87,6 +89,7 @@ def header_from_fields(fields: Fields, where: str) -> Header:
     try:
         if not is_old:
             known(fields, NAMES, "the header")
+            known(fields["files"], FILES, "'files'")
         _ = fields["arrays"]["sha256"] if is_old else fields["files"]
         objects, rows = fields["objects"], fields["entries"] if is_old else []
         if not isinstance(rows, list) or not isinstance(objects, list):
@@ -96,6 +99,7 @@ def header_from_fields(fields: Fields, where: str) -> Header:
                 raise MemoryFormatError(
                     f"{where}: 'objects' must hold JSON objects, got {type(model).__name__}"
                 )
+        _check_names(objects)
         return Header(
             _choice(fields, "perception", PERCEPTIONS, where),
             # Until version 3 nothing else was known.
@@ -113,6 +117,15 @@ def header_from_fields(fields: Fields, where: str) -> Header:
     except MALFORMED as error:
         reason = f"field {error} is missing" if isinstance(error, KeyError) else f"malformed: {error}"
         raise MemoryFormatError(f"{where}: {reason}; train or pull it again") from error
+
+
+def _check_names(objects: list[Fields]) -> None:
+    names: set[str] = set()
+    for model in objects:
+        name = readable(model["name"], "the name of one of the 'objects'", line=True)
+        if name in names:
+            raise ValueError(f"'objects' has {name!r} twice, expected each name once")
+        names.add(name)
 
 
 def _choice(fields: Fields, name: str, choices: tuple[str, ...], where: str) -> str:

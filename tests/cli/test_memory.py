@@ -12,8 +12,10 @@ from tests.memory.builders import entry, robot
 from tests.memory.experiences import LAYOUTS, experience, merged_entry, same
 from tests.perception.builders import model
 
+from lerobot_openspm import experience as module
 from lerobot_openspm.cli.memory import COMMANDS
 from lerobot_openspm.experience import Experience, load_experience, save_experience
+from lerobot_openspm.memory.bank import EntryBank
 
 BOWL, DRAWER, STOVE = "put the bowl on the plate", "open the top drawer", "put the bowl on the stove"
 OBJECTS = {"bowl": model("bowl", 1), "plate": model("plate", 2), "cabinet": model("cabinet", 3)}
@@ -24,10 +26,20 @@ def made() -> Experience:
     return replace(base, entries=(*base.entries, entry(BOWL, source="local/demos#2", quality=0.6)))
 
 
-@pytest.fixture
-def memory(tmp_path: Path) -> Path:
+@pytest.fixture(params=["read at load", "read when asked for"])
+def memory(request: pytest.FixtureRequest, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A memory that is read as a small or as a large one is."""
+    if request.param == "read when asked for":
+        monkeypatch.setattr(module, "READ_AT_LOAD", 0)
     save_experience(made(), tmp_path / "memory")
     return tmp_path / "memory"
+
+
+def load(memory: Path) -> Experience:
+    """A memory with every entry read."""
+    loaded = load_experience(memory)
+    assert isinstance(loaded.entries, EntryBank) == (module.READ_AT_LOAD == 0)
+    return replace(loaded, entries=tuple(loaded.entries), superseded=tuple(loaded.superseded))
 
 
 def run(openspm: Openspm, memory: Path, command: str, *options: str) -> dict[str, Any]:
@@ -49,7 +61,7 @@ def refused(openspm: Openspm, memory: Path, command: str, *options: str) -> str:
 
 
 def sources(memory: Path) -> list[str]:
-    return [e.source for e in load_experience(memory).entries]
+    return [e.source for e in load(memory).entries]
 
 
 def test_it_lists_its_commands_and_their_options(openspm: Openspm):
@@ -89,7 +101,7 @@ def test_what_is_removed_is_named_and_kept_as_superseded(openspm: Openspm, memor
     assert code == 0
     assert out.splitlines()[0] == f"removed version 1 of local/demos#2: {BOWL!r}"
     assert json.loads(out.splitlines()[-1]) == {"entries": 2, "superseded": 1, "removed": 1}
-    loaded = load_experience(memory)
+    loaded = load(memory)
     assert same(loaded, replace(made(), entries=made().entries[:2], superseded=made().entries[2:]))
     _, out, _ = openspm("memory", "list", f"--path={memory}", "--all=true")
     assert [line.endswith("superseded") for line in out.splitlines()[:-1]] == [False, False, True]
@@ -111,7 +123,7 @@ def test_add_takes_entries_and_objects_of_another_memory_once(openspm: Openspm, 
     added = run(openspm, memory, "add", f"--other={tmp_path / 'other'}")
     assert added == {"entries": 4, "superseded": 0, "added": 1, "unchanged": 1}
     assert sources(memory) == [*(f"local/demos#{i}" for i in range(3)), "local/new#0"]
-    assert set(load_experience(memory).objects) == {"stove", "bowl", "plate", "cabinet"}
+    assert set(load(memory).objects) == {"stove", "bowl", "plate", "cabinet"}
     again = run(openspm, memory, "add", f"--other={tmp_path / 'other'}")
     assert again == {"entries": 4, "superseded": 0, "added": 0, "unchanged": 2}
 
@@ -153,18 +165,68 @@ def test_an_exported_file_can_be_edited_and_added_again(openspm: Openspm, memory
     file = tmp_path / "entries.json"
     assert run(openspm, memory, "export", f"--output={file}", f"--instruction={BOWL}")["entries"] == 2
     assert run(openspm, memory, "add", f"--other={file}")["unchanged"] == 2
-    assert same(load_experience(memory), made())
+    assert same(load(memory), made())
     exported = json.loads(file.read_text())
     assert sorted(exported["objects"]) == ["bowl", "plate"]
     exported["entries"][1]["key_poses"][0]["T_obj_ee"][2][3] = 0.5
     file.write_text(json.dumps(exported))
     added = run(openspm, memory, "add", f"--other={file}")
     assert added == {"entries": 3, "superseded": 1, "added": 1, "unchanged": 1}
-    after = load_experience(memory)
+    after = load(memory)
     assert sorted(sources(memory)) == [f"local/demos#{i}" for i in range(3)]
     edited = next(e for e in after.entries if e.source == "local/demos#2")
     assert (edited.version, edited.key_poses[0].T_obj_ee[2, 3]) == (2, 0.5)
     assert same(after.superseded[0], made().entries[2])
+
+
+def edit(file: Path, change: Any) -> None:
+    exported = json.loads(file.read_text())
+    change(exported["entries"])
+    file.write_text(json.dumps(exported))
+
+
+def test_a_file_with_two_entries_of_one_source_and_instruction_is_refused(
+    openspm: Openspm, memory: Path, tmp_path: Path
+):
+    file = tmp_path / "entries.json"
+    run(openspm, memory, "export", f"--output={file}")
+    edit(file, lambda rows: rows.extend([{**rows[0], "quality": 0.1}, {**rows[0], "quality": 0.2}]))
+    error = refused(openspm, memory, "add", f"--other={file}")
+    assert f"entries[0] and entries[3] are both of source 'local/demos#0' and instruction {BOWL!r}" in error
+    # Of one source there may well be several instructions.
+    edit(file, lambda rows: [rows.pop(), rows[3].update(language=f"{BOWL} now")])
+    assert run(openspm, memory, "add", f"--other={file}")["added"] == 1
+    assert len(load(memory).entries) == 4
+
+
+def test_what_was_merged_or_removed_is_not_added_again(openspm: Openspm, memory: Path, tmp_path: Path):
+    other, file, merged = tmp_path / "other", tmp_path / "entries.json", tmp_path / "merged"
+    run(openspm, memory, "rate", "--source=local/demos#0", "--success=true")
+    save_experience(made(), other)  # its entries have no outcomes, so are not quite what was merged
+    run(openspm, memory, "export", f"--output={file}")
+    run(openspm, memory, "merge")
+    for parcel in (other, file):
+        again = run(openspm, memory, "add", f"--other={parcel}")
+        assert again == {"entries": 2, "superseded": 2, "added": 0, "unchanged": 3}
+    # Also where nothing is known of how the merged entry came about.
+    run(openspm, memory, "export", f"--output={merged}")
+    assert run(openspm, merged, "add", f"--other={other}")["added"] == 0
+    edit(file, lambda rows: rows[2].update(quality=0.1))
+    error = refused(openspm, memory, "add", f"--other={file}")
+    assert "entries[2] is an edited 'local/demos#2', which is part of the merged entry" in error
+    run(openspm, memory, "remove", "--source=local/demos#1")
+    assert run(openspm, memory, "add", f"--other={other}")["added"] == 0
+    assert run(openspm, memory, "restore", "--source=local/demos#1")["entries"] == 2
+
+
+def test_a_file_can_bring_back_what_an_entry_was(openspm: Openspm, memory: Path, tmp_path: Path):
+    before, edited = tmp_path / "before.json", tmp_path / "edited.json"
+    for file in (before, edited):
+        run(openspm, memory, "export", f"--output={file}")
+    edit(edited, lambda rows: rows[1].update(quality=0.1))
+    assert run(openspm, memory, "add", f"--other={edited}")["added"] == 1
+    assert run(openspm, memory, "add", f"--other={before}")["added"] == 1
+    assert [(e.version, e.quality) for e in load(memory).entries if e.source[-1] == "1"] == [(3, 0.9)]
 
 
 @pytest.mark.parametrize(
@@ -200,7 +262,7 @@ def test_a_badly_edited_file_is_refused(
 
 def test_an_exported_folder_is_a_memory(openspm: Openspm, memory: Path, tmp_path: Path):
     run(openspm, memory, "export", f"--output={tmp_path / 'out'}", "--source=local/demos#1")
-    assert same(load_experience(tmp_path / "out"), replace(made(), entries=made().entries[1:2]))
+    assert same(load(tmp_path / "out"), replace(made(), entries=made().entries[1:2]))
     assert "exists already" in refused(openspm, memory, "export", f"--output={tmp_path / 'out'}")
     error = refused(openspm, memory, "export", f"--output={tmp_path / 'more'}", "--source=elsewhere#1")
     assert "holds no such entry" in error
@@ -213,20 +275,21 @@ def test_what_was_removed_or_edited_is_restored(openspm: Openspm, memory: Path):
     )
     restored = run(openspm, memory, "restore", "--source=local/demos#2")
     assert restored == {"entries": 3, "superseded": 1, "restored": "local/demos#2", "version": 3}
-    after = load_experience(memory)
+    after = load(memory)
     assert same(after.entries[-1], replace(made().entries[2], version=3))
     assert same(after.superseded[0], edited)
     run(openspm, memory, "remove", "--source=local/demos#2")
     error = refused(openspm, memory, "restore", "--source=local/demos#2", "--version=1")
     assert "no such superseded entry of 'local/demos#2', of its versions: 2, 3" in error
     assert run(openspm, memory, "restore", "--source=local/demos#2", "--version=2")["version"] == 4
-    assert load_experience(memory).entries[-1].quality == 0.1
+    assert load(memory).entries[-1].quality == 0.1
+    assert [(e.source, e.version) for e in load(memory).superseded] == [("local/demos#2", 3)]
 
 
 def test_merge(openspm: Openspm, memory: Path):
     assert run(openspm, memory, "merge") == {"entries": 2, "superseded": 2, "merged": 2, "into": 1}
     assert sources(memory) == ["local/demos#0, local/demos#2", "local/demos#1"]
-    assert load_experience(memory).entries[0].quality == pytest.approx(0.75)
+    assert load(memory).entries[0].quality == pytest.approx(0.75)
     assert run(openspm, memory, "merge")["merged"] == 0
     assert "distance_m is -1" in refused(openspm, memory, "merge", "--distance_m=-1")
 
@@ -237,7 +300,7 @@ def test_rate(openspm: Openspm, memory: Path):
         "entries": 3, "superseded": 0, "quality": pytest.approx(4 / 6), "trials": 1, "successes": 1,
     }  # fmt: skip
     assert run(openspm, memory, "rate", "--source=local/demos#2", "--success=false")["trials"] == 2
-    assert [e.trials for e in load_experience(memory).entries] == [0, 0, 2]
+    assert [e.trials for e in load(memory).entries] == [0, 0, 2]
     assert "pass --success=true or" in refused(openspm, memory, "rate", "--source=local/demos#2")
     same_source = entry(STOVE, source="local/demos#2")
     save_experience(replace(made(), entries=(*made().entries, same_source)), memory)
@@ -251,11 +314,11 @@ def test_another_calibration_is_put_into_a_memory(openspm: Openspm, memory: Path
     file = tmp_path / "cameras.json"
     file.write_text((memory / "cameras.json").read_text().replace("50.1", "60.5"))
     assert run(openspm, memory, "cameras", f"--file={file}")["cameras"] == ["observation.images.front"]
-    assert load_experience(memory).cameras["observation.images.front"].fx == 60.5
+    assert load(memory).cameras["observation.images.front"].fx == 60.5
     # One that was edited in its place is meant likewise.
     file = memory / "cameras.json"
     file.write_text(file.read_text().replace("60.5", "70.5"))
     assert "--file=" in refused(openspm, memory, "list")
     run(openspm, memory, "cameras", f"--file={file}")
-    assert load_experience(memory).cameras["observation.images.front"].fx == 70.5
-    assert np.isfinite(load_experience(memory).cameras["observation.images.front"].T_mount_cam).all()
+    assert load(memory).cameras["observation.images.front"].fx == 70.5
+    assert np.isfinite(load(memory).cameras["observation.images.front"].T_mount_cam).all()

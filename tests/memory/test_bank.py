@@ -1,17 +1,21 @@
 import copy
+import gc
 import json
+import os
 import pickle
+from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 from tests.memory.builders import entry
 from tests.memory.experiences import experience, same
-from tests.memory.memory_files import edit_arrays, edit_entries
+from tests.memory.memory_files import edit_arrays, edit_entries, name_of
 
 from lerobot_openspm import experience as module
 from lerobot_openspm.errors import MemoryFormatError
 from lerobot_openspm.experience import load_experience, save_experience
-from lerobot_openspm.memory.bank import EntryBank
+from lerobot_openspm.memory.bank import MAX_LINE_BYTES, EntryBank
 from lerobot_openspm.memory.columns import HasColumns, columns_of
 
 MANY = tuple(entry(source=f"local/demos#{i}", quality=i / 10) for i in range(10))
@@ -101,3 +105,45 @@ def test_another_quality_than_the_entrys_is_refused(tmp_path):
     edit_arrays(tmp_path, lambda arrays: arrays.update({"entries.qualities": np.array([0.9, 0.1])}))
     with pytest.raises(MemoryFormatError, match=r"entries\[1\] has another quality"):
         load_experience(tmp_path)
+
+
+def test_an_entry_that_could_not_be_loaded_again_is_not_saved(tmp_path):
+    save_experience(experience(), tmp_path)
+    files = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
+    long = replace(entry(), language="x" * MAX_LINE_BYTES)
+    with pytest.raises(MemoryFormatError, match=rf"entries\[10\] has 400\d+ bytes.*up to {MAX_LINE_BYTES}"):
+        save_experience(experience(entries=(*MANY, long)), tmp_path)
+    assert {name: (tmp_path / name).read_bytes() for name in files} == files
+    assert same(load_experience(tmp_path), experience())
+
+
+def test_a_line_that_is_too_long_is_refused_with_what_is_expected(tmp_path):
+    save_experience(experience(), tmp_path)
+    edit_arrays(tmp_path, lambda arrays: arrays["entries.ends"].__iadd__(MAX_LINE_BYTES))
+    with pytest.raises(MemoryFormatError, match=rf"expected 1 to {MAX_LINE_BYTES}.*pull it again"):
+        load_experience(tmp_path)
+
+
+def test_a_file_truncated_after_it_was_loaded_is_an_error_and_no_crash(bank, tmp_path):
+    os.truncate(tmp_path / name_of(tmp_path, "entries"), 100)
+    for read in (lambda: bank[0], lambda: bank[9], lambda: list(bank[3:].texts())):
+        with pytest.raises(MemoryFormatError, match=r"entries\[\d\] has \d+ bytes, expected \d+: truncated"):
+            read()
+
+
+def test_the_file_is_open_once_and_closed_with_the_last_slice(tmp_path, monkeypatch):
+    monkeypatch.setattr(module, "READ_AT_LOAD", 5)
+    save_experience(experience(entries=MANY), tmp_path)
+
+    def n_open():
+        links = [os.readlink(link) for link in Path("/proc/self/fd").iterdir() if link.is_symlink()]
+        return sum(str(tmp_path / "memory.entries") in link for link in links)
+
+    entries = load_experience(tmp_path).entries
+    part = entries[2:5]
+    assert n_open() == 1
+    del entries
+    assert same(part[0], MANY[2])
+    del part
+    gc.collect()
+    assert n_open() == 0

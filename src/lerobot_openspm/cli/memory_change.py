@@ -157,16 +157,16 @@ def restore(args: list[str]) -> None:
     folder = Path(config.path)
     with changing(folder):
         before = load_experience(folder)
-        old = [e for e in before.superseded if e.source == config.source]
-        found = [e for e in old if config.version in (None, e.version)]
+        old = [(e.version, i) for i, e in enumerate(before.superseded) if e.source == config.source]
+        found = [(version, i) for version, i in old if config.version in (None, version)]
         if not found:
-            versions = ", ".join(str(e.version) for e in old) or "none"
+            versions = ", ".join(str(version) for version, _ in old) or "none"
             raise OpenSPMError(
                 f"the memory at {config.path} holds no such superseded entry of {config.source!r}, of its "
                 f"versions: {versions}; `openspm memory list --path={config.path} --all=true` lists them"
             )
-        entry = max(found, key=lambda e: e.version)
-        after = before.restored(entry)
+        _, newest = max(found)
+        after = before.restored(newest)
         save_experience(after, folder)
     _report(after, restored=config.source, version=after.entries[-1].version)
 

@@ -8,7 +8,8 @@ from __future__ import annotations
 
 import hashlib
 import json
-import mmap
+import os
+import weakref
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
@@ -54,16 +55,54 @@ class Lines:
         n = len(self.ends)
         if self.ends.dtype != np.int64 or self.ends.shape != (n,):
             raise MemoryFormatError(
-                f"{where}: array 'entries.ends' is {self.ends.dtype} of {self.ends.shape}"
+                f"{where}: array 'entries.ends' is {self.ends.dtype} of {self.ends.shape}, expected int64 of "
+                f"{(n,)}; train or pull it again"
             )
         if self.digests.dtype != np.uint8 or self.digests.shape != (n, DIGEST_BYTES):
             raise MemoryFormatError(
                 f"{where}: array 'entries.digests' is {self.digests.dtype} of {self.digests.shape}, expected "
-                f"uint8 of {(n, DIGEST_BYTES)}"
+                f"uint8 of {(n, DIGEST_BYTES)}; train or pull it again"
             )
         lengths = np.diff(self.ends, prepend=len(HEAD) - len(BETWEEN)) - len(BETWEEN)
         if n and not (lengths.min() > 0 and lengths.max() <= MAX_LINE_BYTES):
-            raise MemoryFormatError(f"{where}: array 'entries.ends' does not count up line by line")
+            raise MemoryFormatError(
+                f"{where}: array 'entries.ends' does not count up line by line: lines of {lengths.min()} to "
+                f"{lengths.max()} bytes, expected 1 to {MAX_LINE_BYTES}; train or pull it again"
+            )
+
+
+class _Opened:
+    """A file that is read here and there, and closed when nobody has it any more.
+
+    It is not mapped: reading a mapped file that somebody has truncated ends the process.
+    """
+
+    def __init__(self, path: Path, n_bytes: int):
+        self._path = path
+        try:
+            self._descriptor = os.open(path, os.O_RDONLY)
+        except OSError as error:
+            raise MemoryFormatError(
+                f"no memory at {path}: {error}; not pulled; train again, or pull the whole checkpoint"
+            ) from error
+        weakref.finalize(self, os.close, self._descriptor)
+        if (size := os.fstat(self._descriptor).st_size) != n_bytes:
+            raise MemoryFormatError(
+                f"{path}: {size} bytes, expected {n_bytes}: truncated or changed; train or pull it again"
+            )
+
+    def read(self, start: int, n_bytes: int, what: str) -> bytes:
+        """So many bytes from a place on. Raises MemoryFormatError where there are fewer."""
+        try:
+            found = os.pread(self._descriptor, n_bytes, start)
+        except OSError as error:
+            raise MemoryFormatError(f"{self._path}: {what} cannot be read: {error}; try again") from error
+        if len(found) != n_bytes:
+            raise MemoryFormatError(
+                f"{self._path}: {what} has {len(found)} bytes, expected {n_bytes}: truncated since it was "
+                "opened; train or pull it again"
+            )
+        return found
 
 
 class EntryBank(Sequence[MemoryEntry]):
@@ -80,6 +119,7 @@ class EntryBank(Sequence[MemoryEntry]):
         columns: Columns,
         objects: frozenset[str],
         rows: range | None = None,
+        opened: _Opened | None = None,
     ):
         """Open a file.
 
@@ -89,6 +129,7 @@ class EntryBank(Sequence[MemoryEntry]):
             columns: What is kept of all its entries, to find one by.
             objects: The objects that its entries have key poses at.
             rows: Which of them this is about; all if not given.
+            opened: The file, where it is open already.
 
         Raises:
             MemoryFormatError: The file is missing, of another size, or the lines cannot be.
@@ -97,7 +138,7 @@ class EntryBank(Sequence[MemoryEntry]):
         self._rows = range(len(lines.ends)) if rows is None else rows
         lines.check(str(path))
         _check_columns(columns, len(lines.ends), str(path))
-        self._bytes = _mapped(path, lines.n_bytes)
+        self._opened = _Opened(path, lines.n_bytes) if opened is None else opened
         self._entry = lru_cache(KEPT_ENTRIES)(self._read)
 
     def __reduce__(self) -> tuple[type[EntryBank], tuple[Path, Lines, Columns, frozenset[str], range]]:
@@ -112,7 +153,8 @@ class EntryBank(Sequence[MemoryEntry]):
     def __getitem__(self, index: slice) -> EntryBank: ...
     def __getitem__(self, index: int | slice) -> MemoryEntry | EntryBank:
         if isinstance(index, slice):
-            return EntryBank(self._path, self._lines, self._columns, self.objects, self._rows[index])
+            rows = self._rows[index]
+            return EntryBank(self._path, self._lines, self._columns, self.objects, rows, self._opened)
         return self._entry(self._rows[index])
 
     def __iter__(self) -> Iterator[MemoryEntry]:
@@ -130,7 +172,7 @@ class EntryBank(Sequence[MemoryEntry]):
 
     def _text(self, row: int) -> bytes:
         start = int(self._lines.ends[row - 1]) + len(BETWEEN) if row else len(HEAD)
-        text = self._bytes[start : int(self._lines.ends[row])]
+        text = self._opened.read(start, int(self._lines.ends[row]) - start, f"entries[{row}]")
         if _digest(text) != self._lines.digests[row].tobytes():
             raise MemoryFormatError(
                 f"{self._path}: entries[{row}] is not what its digest says: changed or damaged; train or "
@@ -194,6 +236,9 @@ def write_texts(file: BinaryIO, texts: Iterable[bytes]) -> tuple[Lines, str]:
 
     Returns:
         Where the lines are, and the SHA-256 of the file in hexadecimal.
+
+    Raises:
+        MemoryFormatError: An entry is longer than what is read again.
     """
     sha256, position = hashlib.sha256(), 0
     ends: list[int] = []
@@ -206,6 +251,7 @@ def write_texts(file: BinaryIO, texts: Iterable[bytes]) -> tuple[Lines, str]:
 
     position = write(HEAD)
     for text in texts:
+        _check_length(text, len(ends))
         position = write(BETWEEN + text if ends else text)
         ends.append(position)
         digests.append(_digest(text))
@@ -214,21 +260,14 @@ def write_texts(file: BinaryIO, texts: Iterable[bytes]) -> tuple[Lines, str]:
     return Lines(np.array(ends, np.int64), rows), sha256.hexdigest()
 
 
+def _check_length(text: bytes, row: int) -> None:
+    if len(text) > MAX_LINE_BYTES:
+        raise MemoryFormatError(
+            f"entries[{row}] has {len(text)} bytes as JSON, expected up to {MAX_LINE_BYTES}: it could never "
+            f"be loaded again, so nothing was saved. It begins with {text[:80].decode(errors='replace')}; "
+            "shorten its texts, or leave it out"
+        )
+
+
 def _digest(text: bytes) -> bytes:
     return hashlib.blake2b(text, digest_size=DIGEST_BYTES).digest()
-
-
-def _mapped(path: Path, n_bytes: int) -> mmap.mmap:
-    try:
-        with path.open("rb") as file:
-            mapped = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
-    except (OSError, ValueError) as error:  # ValueError: it is empty
-        raise MemoryFormatError(
-            f"no memory at {path}: {error}; truncated, or not pulled; train again, or pull the whole "
-            "checkpoint"
-        ) from error
-    if len(mapped) != n_bytes:
-        raise MemoryFormatError(
-            f"{path}: {len(mapped)} bytes, expected {n_bytes}: truncated or changed; train or pull it again"
-        )
-    return mapped

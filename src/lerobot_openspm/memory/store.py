@@ -23,17 +23,22 @@ from lerobot_openspm.memory.entry import (
     SubTask,
 )
 from lerobot_openspm.memory.fields import (
+    LIMIT,
     MALFORMED,
     Fields,
+    choice,
     flag,
     integer,
     known,
+    line,
     number,
     numbers,
+    readable,
     text,
     texts,
 )
 from lerobot_openspm.memory.robot import RobotModel
+from lerobot_openspm.memory.vocabulary import REFERENCES, RELATIONS, VERBS
 
 ENTRY = frozenset(
     ("source", "language", "version", "quality", "trials", "successes", "key", "layout", "key_poses")
@@ -45,6 +50,13 @@ KEY_POSE = frozenset(
     )
 )  # fmt: skip
 SUB_TASK = frozenset(SubTask.__dataclass_fields__)
+# "center" is what the grammar has for "in the middle of"; a goal has none where nothing is moved anywhere.
+GOALS = (*RELATIONS, "center", "")
+# What the numbers of a robot are between, wide enough for any units.
+ROBOT = {
+    "close_command": (-LIMIT, LIMIT), "open_command": (-LIMIT, LIMIT), "open_width": (0.0, LIMIT),
+    "metres_per_action": (-1e3, 1e3), "radians_per_action": (-1e3, 1e3), "metres_per_step": (0.0, 1e3),
+}  # fmt: skip
 
 
 def entry_to_fields(entry: MemoryEntry) -> dict[str, Any]:
@@ -103,6 +115,8 @@ def entry_from_fields(fields: Any) -> MemoryEntry:
     if not rows or not sub_tasks:
         raise ValueError("an entry needs a sub-task and a key pose")
     named = known(fields["layout"], frozenset(fields["layout"]), "'layout'")
+    for name in named:
+        readable(name, "a name in 'layout'", line=True)
     poses = _transforms([row["T_obj_ee"] for row in rows], "T_obj_ee of the key poses")
     layout = dict(zip(named, _transforms(list(named.values()), "'layout'"), strict=True))
     key_poses = tuple(_key_pose(row, T, len(sub_tasks)) for row, T in zip(rows, poses, strict=True))
@@ -116,15 +130,24 @@ def entry_from_fields(fields: Any) -> MemoryEntry:
     if successes > trials:
         raise ValueError(f"'successes' is {successes}, more than the {trials} 'trials'")
     return MemoryEntry(
-        RetrievalKey(sub_tasks, phases), text(fields, "language"), key_poses,
-        number(fields, "quality", 0, 1), integer(fields, "version", 1), text(fields, "source"), layout,
+        RetrievalKey(sub_tasks, phases), _instruction(fields), key_poses,
+        number(fields, "quality", 0, 1), integer(fields, "version", 1), line(fields, "source"), layout,
         trials, successes,
     )  # fmt: skip
+
+
+def _instruction(fields: Fields) -> str:
+    if not (language := text(fields, "language")).strip():
+        raise ValueError("'language' is empty, expected the instruction of the demonstration")
+    return language
 
 
 def _sub_task(fields: Any) -> SubTask:
     fields = known(fields, SUB_TASK, "a sub-task")
     words = {name: text(fields, name) for name in fields if not name.endswith("_where")}
+    for name, choices in (("operation", VERBS), ("relation", GOALS)):
+        if name in words:
+            choice(fields, name, choices)
     return SubTask(
         **words,
         target_where=_reference(fields.get("target_where")),
@@ -136,7 +159,7 @@ def _reference(fields: Any) -> Reference | None:
     if fields is None:
         return None
     fields = known(fields, frozenset(("relation", "landmarks")), "which of several objects is meant")
-    return Reference(text(fields, "relation"), texts(fields, "landmarks"))
+    return Reference(choice(fields, "relation", REFERENCES), texts(fields, "landmarks"))
 
 
 def _key_pose(fields: Fields, T_obj_ee: Array, n_sub_tasks: int) -> MemoryKeyPose:
@@ -202,8 +225,13 @@ def robot_from_dict(fields: Mapping[str, Any], where: str) -> RobotModel:
     """Inverse of :func:`robot_to_dict`. Raises MemoryFormatError naming file and field."""
     try:
         fields = known(fields, frozenset(RobotModel.__dataclass_fields__), "the robot")
-        own = {name: number(fields, name) for name in RobotModel.__dataclass_fields__ if name != "workspace"}
-        return RobotModel(workspace=numbers(fields["workspace"], (2, 3), "'workspace'"), **own)
+        own = {name: number(fields, name, *within) for name, within in ROBOT.items()}
+        workspace = numbers(fields["workspace"], (2, 3), "'workspace'")
+        if not (workspace[0] <= workspace[1]).all():
+            raise ValueError(
+                f"'workspace' is {workspace.tolist()}, expected the lowest, then the highest corner"
+            )
+        return RobotModel(workspace=workspace, **own)
     except MALFORMED as error:
         raise MemoryFormatError(
             f"{where}: 'robot' is malformed: {error!r}; train or pull it again"

@@ -133,6 +133,16 @@ RELATION_OF_PLACE = {
     "front": "front of", "back": "behind", "left": "left of", "right": "right of", "middle": "center",
 }  # fmt: skip
 
+# The relations of a Reference: places of a thing among others, and prepositions as those name them.
+REFERENCES = tuple(
+    dict.fromkeys(
+        (
+            *PLACES.values(), *HEIGHTS.values(), "center",
+            *({"behind": "back"}.get(name, name.removesuffix(" of")) for name in RELATIONS),
+        )
+    )
+)  # fmt: skip
+
 # Parts, and the thing they belong to where it is not said.
 PART_OF = {"drawer": "cabinet", "burner": "stove", "knob": "stove", "compartment": "caddy"}
 # Things in whose left, right, front or back there is a part: "in the front of the caddy".
