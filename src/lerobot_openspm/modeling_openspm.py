@@ -39,7 +39,7 @@ from lerobot_openspm.flow.training_set import TrainingSet
 from lerobot_openspm.geometry.camera import check_sizes
 from lerobot_openspm.memory.entry import MemoryEntry
 from lerobot_openspm.memory.indexed_entries import indexed
-from lerobot_openspm.memory.names import TABLE_NAMES, Model2VecNames, NameSimilarity
+from lerobot_openspm.memory.names import NameSimilarity, names_from
 from lerobot_openspm.observation import Observation, split_batch
 from lerobot_openspm.perceive import Eyes
 from lerobot_openspm.perception.tracker import TrackerSettings
@@ -216,8 +216,7 @@ class OpenSPMPolicy(PreTrainedPolicy):
     @cached_property
     def names(self) -> NameSimilarity:
         """What says which names mean the same thing: the table of words, or with embeddings beside it."""
-        weights = self.config.name_embeddings
-        return TABLE_NAMES if weights is None else Model2VecNames(weights)
+        return names_from(self.config.name_embeddings)
 
     def _chunk(self, row: Row, query: Query) -> np.ndarray:
         """Generate one chunk ``(chunk_size, 7)`` in the world. Rows go one by one, so batches act alike."""

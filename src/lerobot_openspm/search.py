@@ -3,17 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from lerobot_openspm.errors import DatasetError, InstructionError
+from lerobot_openspm.memory.compound import Candidate, plan_parts
 from lerobot_openspm.memory.entry import MemoryEntry, SubTask
 from lerobot_openspm.memory.indexed_entries import indexed, near
 from lerobot_openspm.memory.instruction import parse_instruction
 from lerobot_openspm.memory.key_vector import key_vector, key_vectors
-from lerobot_openspm.memory.retrieval import ScoreWeights, semantic_candidates, semantic_score
+from lerobot_openspm.memory.names import TABLE_NAMES, NameSimilarity
+from lerobot_openspm.memory.retrieval import ScoreWeights, semantic_score
 from lerobot_openspm.observation import Observation, split_batch
 
 if TYPE_CHECKING:
@@ -25,13 +28,15 @@ class Hit:
     """An entry with the three terms of its score.
 
     Attributes:
-        entry: The entry.
+        entry: What would be executed: an entry of the memory, or one sub-task of it.
+        source: The entry of the memory.
         semantic: ``S_sem``.
         geometric: ``S_geo``; None where no scene was looked at.
         total: The weighted sum of the terms there are.
     """
 
     entry: MemoryEntry
+    source: MemoryEntry
     semantic: float
     geometric: float | None
     total: float
@@ -43,49 +48,61 @@ class Found:
 
     Attributes:
         asked: The instruction's task elements.
-        hits: The best entries first: those that retrieval considers, then the best one of each other key that
-            is near, the nearest key first.
+        parts: What the instruction would be carried out by: for each part, in order, what retrieval
+            considers, best first. Empty where it is refused.
+        others: The best entry of each other key that is near, the nearest key first.
         refusal: Why the policy would not act on the instruction; "" if it would.
-        considered: How many of the hits retrieval considers.
-        seen: By name, whether the objects of the considered entries were found; empty without a scene.
+        seen: By name, whether the objects of the first part's entries were found; empty without a scene.
         status: What the policy would do in the scene; "" without one.
     """
 
     asked: tuple[SubTask, ...]
-    hits: tuple[Hit, ...]
+    parts: tuple[tuple[Hit, ...], ...]
+    others: tuple[Hit, ...]
     refusal: str
-    considered: int
     seen: dict[str, bool]
     status: str = ""
 
 
-def search_memory(instruction: str, entries: Sequence[MemoryEntry], weights: ScoreWeights) -> Found:
-    """The entries for an instruction, without a scene: by ``S_sem`` and quality.
+def search_memory(
+    instruction: str,
+    entries: Sequence[MemoryEntry],
+    weights: ScoreWeights,
+    names: NameSimilarity = TABLE_NAMES,
+) -> Found:
+    """What an instruction would be carried out by, without a scene: by ``S_sem`` and quality.
+
+    Args:
+        instruction: What is asked.
+        entries: The memory.
+        weights: Of the terms of the score.
+        names: Says which names mean the same thing.
 
     Raises:
         InstructionError: The instruction cannot be read.
     """
     asked = parse_instruction(instruction)
-    entries = near(asked, indexed(entries), semantic_score)
-    refusal, considered = "", list[tuple[MemoryEntry, float]]()
+    score = partial(semantic_score, names=names)
+    entries = near(asked, indexed(entries), score)
+    refusal, plan = "", tuple[tuple[Candidate, ...], ...]()
     try:
-        considered = semantic_candidates(instruction, entries)
+        plan = plan_parts(instruction, entries, names)
     except InstructionError as error:
         refusal = str(error)
-    hits = [_without_scene(entry, semantic, weights) for entry, semantic in considered]
-    hits.sort(key=lambda hit: -hit.total)
-    keys = {entry.key.sub_tasks for entry, _ in considered}
+    hits = ([_without_scene(one.entry, one.source, one.semantic, weights) for one in part] for part in plan)
+    parts = tuple(tuple(sorted(part, key=lambda hit: -hit.total)) for part in hits)
+    keys = {one.source.key.sub_tasks for part in plan for one in part}
     others = [
-        _without_scene(entry, semantic_score(asked, entry.key.sub_tasks), weights)
+        _without_scene(entry, entry, score(asked, entry.key.sub_tasks), weights)
         for entry in _one_of_each_key(asked, entries)
         if entry.key.sub_tasks not in keys
     ]
     others.sort(key=lambda hit: -hit.semantic)  # of equal ones the nearer stays first
-    return Found(asked, (*hits, *others), refusal, len(hits), {})
+    return Found(asked, parts, tuple(others), refusal, {})
 
 
-def _without_scene(entry: MemoryEntry, semantic: float, weights: ScoreWeights) -> Hit:
-    return Hit(entry, semantic, None, weights.semantic * semantic + weights.quality * entry.quality)
+def _without_scene(entry: MemoryEntry, source: MemoryEntry, semantic: float, weights: ScoreWeights) -> Hit:
+    return Hit(entry, source, semantic, None, weights.semantic * semantic + weights.quality * entry.quality)
 
 
 def _one_of_each_key(asked: Sequence[SubTask], entries: Sequence[MemoryEntry]) -> list[MemoryEntry]:
@@ -102,23 +119,31 @@ def _one_of_each_key(asked: Sequence[SubTask], entries: Sequence[MemoryEntry]) -
 def search_scene(policy: OpenSPMPolicy, observation: Observation) -> Found:
     """The entries for an observation's instruction, scored as the policy does when it begins to act.
 
+    What comes after the first part will be chosen in the scene that the first one leaves, so the entries of
+    later parts have no ``S_geo``.
+
     Raises:
         InstructionError: The instruction cannot be read.
         ObservationError: The observation lacks a camera, or its images are no pictures.
     """
     in_words = search_memory(
-        observation.instruction, policy.require_experience().entries, policy.config.score_weights
+        observation.instruction,
+        policy.require_experience().entries,
+        policy.config.score_weights,
+        policy.names,
     )
     if in_words.refusal:
         return in_words
     policy.reset()
     policy.act([observation])
     row = policy.rows[0]
-    ranked = [Hit(one.entry, one.semantic, one.geometric, one.total) for one in row.ranked]
-    others = in_words.hits[in_words.considered :]
-    names = dict.fromkeys(name for hit in ranked for name in hit.entry.objects)
-    seen = {name: name in row.layout for name in names}
-    return Found(in_words.asked, (*ranked, *others), "", len(ranked), seen, row.status.value)
+    sources = {id(one.entry): one.source for one in row.candidates[0]}
+    ranked = tuple(
+        Hit(one.entry, sources[id(one.entry)], one.semantic, one.geometric, one.total) for one in row.ranked
+    )
+    needed = dict.fromkeys(name for hit in ranked for name in hit.entry.objects)
+    seen = {name: name in row.layout for name in needed}
+    return replace(in_words, parts=(ranked, *in_words.parts[1:]), seen=seen, status=row.status.value)
 
 
 def observation_of(

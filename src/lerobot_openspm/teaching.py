@@ -26,18 +26,23 @@ class Lesson:
     """What a memory was taught.
 
     Attributes:
-        entries: The new entries.
+        learned: The new entries, and the models of their objects: what is appended to an experience.
         known_before: How many entries each taught instruction had in the memory before.
         skipped: Episodes that gave no entry.
         objects_learned: Objects that were not known before.
         objects_recognised: Objects of the taught tasks that were.
     """
 
-    entries: tuple[MemoryEntry, ...]
+    learned: Experience
     known_before: dict[str, int]
     skipped: tuple[int, ...]
     objects_learned: tuple[str, ...]
     objects_recognised: tuple[str, ...]
+
+    @property
+    def entries(self) -> tuple[MemoryEntry, ...]:
+        """The new entries."""
+        return tuple(self.learned.entries)
 
     @property
     def instructions(self) -> tuple[str, ...]:
@@ -90,12 +95,13 @@ def teach(
             raise DatasetError(_nothing_learned(dataset_meta.repo_id, task, tasks, mined))
     named = dict.fromkeys(name for entry in added for name in entry.layout)
     objects = {name: mined.objects[name] for name in named if name in mined.objects}
-    result = experience.appended(replace(mined, entries=added, objects=objects))
+    learned = replace(mined, entries=added, objects=objects)
+    result = experience.appended(learned)
     check_labels(result, config.mask_labels, f"the checkpoint of {config.type}")
     before = Counter(entry.language for entry in experience.entries)
     used = {entry.source for entry in added}
     lesson = Lesson(
-        entries=added,
+        learned=learned,
         known_before={task: before[task] for task in dict.fromkeys(entry.language for entry in added)},
         skipped=tuple(i for i in wanted if f"{dataset_meta.repo_id}#{i}" not in used),
         objects_learned=tuple(name for name in named if name not in experience.objects),

@@ -84,6 +84,7 @@ def test_list(openspm: Openspm, memory: Path):
     code, out, _ = openspm("memory", "list", f"--path={memory}", "--tasks=true", "--instruction=bowl")
     assert out.splitlines()[0].split() == ["2", "entries", "mean", "quality", "0.75", *repr(BOWL).split()]
     assert len(out.splitlines()) == 2
+    assert "limit is -1, expected" in refused(openspm, memory, "list", "--limit=-1")
     assert "2 more; --limit=3" in openspm("memory", "list", f"--path={memory}", "--limit=1")[1]
 
 

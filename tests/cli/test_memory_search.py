@@ -62,6 +62,19 @@ def test_what_the_policy_refuses_says_why_and_what_is_nearest(
         assert [hit["geometric"] for hit in found["entries"]] == [None, None]
 
 
+def test_in_a_scene_a_sequence_of_known_tasks_is_shown_part_by_part(
+    openspm: Openspm, checkpoint: Path, tiny_dataset: Path
+):
+    asked, scene = f"turn on the stove and {BOWL}", f"--dataset.root={tiny_dataset}"
+    text, found = search(openspm, asked, f"--path={checkpoint}", scene, "--limit=2")
+    assert (found["refusal"], found["parts"], found["considered"]) == (None, 2, 6)
+    assert [hit["part"] for hit in found["entries"]] == [1, 1, 2, 2]
+    assert [hit["language"] for hit in found["entries"]] == ["turn on the stove"] * 2 + [BOWL] * 2
+    assert [hit["geometric"] is None for hit in found["entries"]] == [False, False, True, True]
+    assert found["status"] == "running"
+    assert text.index("part 1 of 2:") < text.index("part 2 of 2:") < text.index(f"{BOWL!r} from")
+
+
 def test_a_mined_memory_can_be_searched_too(openspm: Openspm, checkpoint: Path, tmp_path: Path):
     for file in ("memory.json", "cameras.json", *data_files(checkpoint)):
         (tmp_path / file).write_bytes((checkpoint / file).read_bytes())
@@ -77,6 +90,9 @@ def test_a_mined_memory_can_be_searched_too(openspm: Openspm, checkpoint: Path, 
         ((BOWL, "--dataset.root=nowhere"), "no dataset at --dataset.root=nowhere"),
         ((BOWL, "--dataset.root={dataset}", "--episode=6"), "has episodes 0 to 5, got --episode=6"),
         ((BOWL, "--dataset.root={dataset}", "--frame=-1"), "got --frame=-1"),
+        ((BOWL, "--episode=1"), "--episode of which dataset? pass --dataset.root=FOLDER"),
+        ((BOWL, "--frame=0"), "--frame of which dataset? pass --dataset.root=FOLDER"),
+        ((BOWL, "--limit=-1"), "limit is -1, expected"),
     ],
 )
 def test_mistakes_are_one_line(

@@ -1,19 +1,26 @@
 """`openspm teach`, typed as a user types it, on the tests' small checkpoint."""
 
 import json
+import math
 import shutil
 import signal
 import subprocess
 import sys
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import pandas as pd
 import pytest
+from filelock import FileLock
 from tests.cli.conftest import Openspm
 from tests.conftest import record
+from tests.memory.memory_files import names
 
-from lerobot_openspm.experience import load_experience
+from lerobot_openspm.experience import Experience, load_experience, save_experience
+from lerobot_openspm.experience_files import LOCK
+from lerobot_openspm.files import LOCK_WAIT_S
+from lerobot_openspm.modeling_openspm import OpenSPMPolicy
 
 PUSH = "push the plate to the front of the stove"
 BOX = "put the cream cheese box in the bowl"
@@ -60,9 +67,9 @@ def test_a_task_is_appended_and_the_weights_stay(openspm: Openspm, into: Path, o
     }  # fmt: skip
     assert f"{PUSH!r}: 1 new entry\n" in out
     after = contents(into)
-    kept = {name for name in before if before[name] == after.get(name)}
-    others = {name for name in {*before, *after} if not name.startswith("memory.")}
-    assert kept >= others - {".memory.lock"}, others - kept
+    same = {name for name in before if before[name] == after.get(name)}
+    assert {"config.json", "model.safetensors", "cameras.json"} <= same
+    assert set(after) == {*same, *names(into), LOCK}
     taught = load_experience(into)
     assert [entry.language for entry in taught.entries] == [e.language for e in known.entries] + [PUSH]
     assert taught.entries[-1].source.endswith("#1")
@@ -96,6 +103,67 @@ def test_what_the_memory_knows_already_is_said(openspm: Openspm, into: Path, oth
     code, out, _ = openspm(*arguments[:-1], "--dataset.episodes=[1]")
     assert last_line(out)["entries_in_memory"] == 8
     assert load_experience(into).entries[-1].version == 2
+
+
+class Meanwhile:
+    """Another process that changes the memory at the end of the first lesson."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch, folder: Path, change: Callable[..., Experience]):
+        self.lessons, teach, load = 0, OpenSPMPolicy.teach, load_experience
+        self.locked: list[bool] = []
+
+        def teach_slowly(policy: OpenSPMPolicy, *arguments):
+            lesson = teach(policy, *arguments)
+            self.lessons += 1
+            if self.lessons == 1:
+                save_experience(change(load(folder), policy.require_experience()), folder)
+            return lesson
+
+        def load_and_look(directory: Path) -> Experience:
+            self.locked.append(FileLock(directory / LOCK, LOCK_WAIT_S, is_singleton=True).is_locked)
+            return load(directory)
+
+        monkeypatch.setattr(OpenSPMPolicy, "teach", teach_slowly)
+        monkeypatch.setattr("lerobot_openspm.cli.teach.load_experience", load_and_look)
+
+
+def test_what_others_changed_during_the_lesson_is_kept(
+    openspm: Openspm, into: Path, other_dataset: Path, monkeypatch: pytest.MonkeyPatch
+):
+    known = load_experience(into)
+
+    def without_the_first(now: Experience, _: Experience) -> Experience:
+        return replace(now, entries=now.entries[1:], superseded=now.entries[:1])
+
+    meanwhile = Meanwhile(monkeypatch, into, without_the_first)
+    code, out, err = openspm(
+        "teach", f"--dataset.root={other_dataset}", "--dataset.episodes=[1]", f"--into={into}"
+    )
+    assert code == 0, err
+    taught = load_experience(into)
+    assert [e.source for e in taught.entries[:-1]] == [e.source for e in known.entries[1:]]
+    assert [e.source for e in taught.superseded] == [known.entries[0].source]
+    assert taught.entries[-1].language == PUSH
+    assert last_line(out)["entries_in_memory"] == len(known.entries)
+    assert (meanwhile.lessons, meanwhile.locked) == (1, [True])
+
+
+def test_an_object_that_others_learned_during_the_lesson_is_theirs(
+    openspm: Openspm, into: Path, box_dataset: Path, monkeypatch: pytest.MonkeyPatch
+):
+    def with_another_box(now: Experience, taught: Experience) -> Experience:
+        model = taught.objects["cream cheese box"]
+        return replace(now, objects={**now.objects, model.name: replace(model, yaw_period=math.pi / 2)})
+
+    meanwhile = Meanwhile(monkeypatch, into, with_another_box)
+    code, out, err = openspm("teach", f"--dataset.root={box_dataset}", f"--into={into}")
+    assert code == 0, err
+    assert meanwhile.lessons == 2
+    assert last_line(out)["objects_learned"] == []
+    assert "cream cheese box" in last_line(out)["objects_recognised"]
+    taught = load_experience(into)
+    assert taught.objects["cream cheese box"].yaw_period == math.pi / 2
+    assert taught.entries[-1].language == BOX
 
 
 def rename_state(dataset: Path) -> None:

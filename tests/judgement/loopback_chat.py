@@ -20,7 +20,10 @@ class Reply:
         body: Sent as it is.
         status: HTTP's.
         wait_s: Before anything is sent.
-        drip_s: Between any two bytes.
+        drip_s: Between any two bytes of the body.
+        head_drip_s: Between any two bytes of the headers.
+        has_length: Whether the length is told; else the body ends where the connection does.
+        location: Where a redirect leads.
         promised: Content-Length, where it is not the body's: the connection is closed too early then.
     """
 
@@ -29,6 +32,9 @@ class Reply:
     wait_s: float = 0.0
     drip_s: float = 0.0
     promised: int | None = None
+    head_drip_s: float = 0.0
+    has_length: bool = True
+    location: str = ""
 
 
 def completion(content: Any) -> bytes:
@@ -86,17 +92,20 @@ class _Handler(BaseHTTPRequestHandler):
         time.sleep(reply.wait_s)
         try:
             self.send_response(reply.status)
-            self.send_header("Content-Length", str(reply.promised or len(reply.body)))
-            self.end_headers()
-            if not reply.drip_s:
-                self.wfile.write(reply.body)
-            for byte in reply.body if reply.drip_s else b"":
-                self.wfile.write(bytes([byte]))
-                self.wfile.flush()
-                time.sleep(reply.drip_s)
+            if reply.has_length:
+                self.send_header("Content-Length", str(reply.promised or len(reply.body)))
+            if reply.location:
+                self.send_header("Location", reply.location)
+            self._send(b"".join([*self._headers_buffer, b"\r\n"]), reply.head_drip_s)
+            self._send(reply.body, reply.drip_s)
         except ConnectionError:  # the client has had enough
             pass
         self.close_connection = True
+
+    def _send(self, blob: bytes, drip_s: float) -> None:
+        for piece in [blob[i : i + 1] for i in range(len(blob))] if drip_s else [blob]:
+            self.wfile.write(piece)
+            time.sleep(drip_s)
 
     def log_message(self, format: str, *args: Any) -> None:
         """Say nothing."""

@@ -103,7 +103,6 @@ def test_the_key_comes_from_the_environment_and_is_never_told(monkeypatch, caplo
     [
         (Reply(b"out of memory", 500), "code 500: 'out of memory', 3 times", 3),
         (Reply(b"", 503), "code 503", 3),
-        (Reply(b"", 307), "code 307", 1),
         (Reply(b"no such model", 404), "code 404: 'no such model'", 1),
         (Reply(b"\x00\xff garbage"), "gave no chat completion", 1),
         (Reply(b"[" * 200_000), "gave no chat completion", 1),
@@ -126,7 +125,15 @@ def test_what_is_no_answer_is_one_error(reply: Reply, words: str, requests: int)
     assert len(chat.requests) == requests
 
 
-@pytest.mark.parametrize("reply", [Reply(say(["lift"] * N), wait_s=3), Reply(say(["lift"] * N), drip_s=0.05)])
+@pytest.mark.parametrize(
+    "reply",
+    [
+        Reply(say(["lift"] * N), wait_s=3),
+        Reply(say(["lift"] * N), drip_s=0.05),
+        Reply(say(["lift"] * N), drip_s=0.05, has_length=False),
+        Reply(say(["lift"] * N), head_drip_s=0.05),
+    ],
+)
 def test_a_slow_server_is_waited_for_once_and_no_longer_than_asked(reply: Reply):
     chat = LoopbackChat(lambda _: reply)
     begin = time.monotonic()
@@ -134,6 +141,18 @@ def test_a_slow_server_is_waited_for_once_and_no_longer_than_asked(reply: Reply)
         judge(chat.api_base, 0.5).judge(pick_and_place())
     assert time.monotonic() - begin < 2.5
     assert len(chat.requests) == 1
+
+
+def test_a_redirect_is_not_followed(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setenv(API_KEY_VARIABLE, KEY)
+    with LoopbackChat(sensible).running() as elsewhere:
+        there = f"{elsewhere.api_base}/chat/completions"
+        with (
+            LoopbackChat(lambda _: Reply(b"", 307, location=there)).running() as chat,
+            pytest.raises(JudgementError, match="code 307"),
+        ):
+            judge(chat.api_base).judge(pick_and_place())
+    assert (len(chat.requests), elsewhere.requests) == (1, [])
 
 
 def test_a_server_that_is_gone():

@@ -9,9 +9,11 @@ from typing import Any
 
 import draccus
 
+from lerobot_openspm.cli.memory_show import check_limit
 from lerobot_openspm.errors import OpenSPMError
 from lerobot_openspm.experience import load_experience
 from lerobot_openspm.memory.entry import Reference, SubTask
+from lerobot_openspm.memory.names import TABLE_NAMES, NameSimilarity, names_from
 from lerobot_openspm.memory.retrieval import ScoreWeights
 from lerobot_openspm.search import Found, Hit, observation_of, search_memory, search_scene
 
@@ -30,7 +32,7 @@ class SearchConfig:
 
     Args:
         path: Folder of the checkpoint or of a mined memory; to look at a scene it has to be a checkpoint.
-        limit: Show at most this many entries.
+        limit: Show at most this many entries, of an instruction in several parts for each of them.
         dataset: The demonstrations or recordings to take the scene from.
         episode: Number of the episode in it.
         frame: Number of the frame in the episode.
@@ -39,8 +41,17 @@ class SearchConfig:
     path: str = "outputs/memory"
     limit: int = 10
     dataset: SceneOption = field(default_factory=SceneOption)
-    episode: int = 0
-    frame: int = 0
+    episode: int | None = None  # the first if not given
+    frame: int | None = None  # the first if not given
+
+    def __post_init__(self) -> None:
+        check_limit(self.limit)
+        given = [f"--{name}" for name in ("episode", "frame") if getattr(self, name) is not None]
+        if given and self.dataset.root is None and self.dataset.repo_id is None:
+            raise ValueError(
+                f"{' and '.join(given)} of which dataset? pass --dataset.root=FOLDER with the demonstrations "
+                "to take the scene from, or leave it out to search without a scene"
+            )
 
 
 def search(args: list[str]) -> None:
@@ -60,7 +71,8 @@ def search(args: list[str]) -> None:
 
 def _search(instruction: str, config: SearchConfig) -> Found:
     if config.dataset.root is None and config.dataset.repo_id is None:
-        return search_memory(instruction, load_experience(Path(config.path)).entries, _weights(config.path))
+        entries = load_experience(Path(config.path)).entries
+        return search_memory(instruction, entries, *_scoring(config.path))
     if config.dataset.root is not None and not (Path(config.dataset.root) / "meta/info.json").is_file():
         raise FileNotFoundError(f"no dataset at --dataset.root={config.dataset.root}")
     from lerobot.datasets import LeRobotDataset
@@ -70,16 +82,18 @@ def _search(instruction: str, config: SearchConfig) -> Found:
     policy = OpenSPMPolicy.from_pretrained(config.path)
     name = config.dataset.repo_id or f"local/{Path(str(config.dataset.root)).name}"
     dataset = LeRobotDataset(name, root=config.dataset.root, video_backend="pyav")
-    return search_scene(policy, observation_of(policy, dataset, config.episode, config.frame, instruction))
+    episode, frame = config.episode or 0, config.frame or 0
+    return search_scene(policy, observation_of(policy, dataset, episode, frame, instruction))
 
 
-def _weights(path: str) -> ScoreWeights:
-    """The weights that a checkpoint was given; a mined memory has none of its own."""
+def _scoring(path: str) -> tuple[ScoreWeights, NameSimilarity]:
+    """The weights and names that a checkpoint was given; a mined memory has none of its own."""
     if not (Path(path) / "config.json").is_file():
-        return ScoreWeights()
+        return ScoreWeights(), TABLE_NAMES
     from lerobot_openspm.configuration_openspm import OpenSPMConfig
 
-    return OpenSPMConfig.from_pretrained(path).score_weights  # pyright: ignore[reportAttributeAccessIssue]
+    config: Any = OpenSPMConfig.from_pretrained(path)
+    return config.score_weights, names_from(config.name_embeddings)
 
 
 def _lines(found: Found, limit: int) -> list[str]:
@@ -90,19 +104,26 @@ def _lines(found: Found, limit: int) -> list[str]:
         )
     lines += [f"refused: {found.refusal}"] if found.refusal else []
     lines += [f"status: {found.status}"] if found.status else []
-    if found.hits:
+    if found.parts or found.others:
         lines.append(f"  {'total':>6s} {'S_sem':>6s} {'S_geo':>6s} {'r':>6s}  entry")
-    for i, hit in enumerate(found.hits[:limit]):
-        if i == found.considered:
-            lines.append("  not considered, the best entry of each task:")
-        lines.append(_hit(hit))
+    for number, part in enumerate(found.parts, start=1):
+        lines += [f"  part {number} of {len(found.parts)}:"] if len(found.parts) > 1 else []
+        lines += [_hit(hit) for hit in part[:limit]]
+    if others := _others(found, limit):
+        lines += ["  not considered, the best entry of each task:", *map(_hit, others)]
     return lines
+
+
+def _others(found: Found, limit: int) -> tuple[Hit, ...]:
+    """As many of those that are not considered as there is room for."""
+    return found.others[: max(0, limit - sum(len(part) for part in found.parts))]
 
 
 def _hit(hit: Hit) -> str:
     geometric = "-" if hit.geometric is None else f"{hit.geometric:.3f}"
     terms = f"{hit.total:6.3f} {hit.semantic:6.3f} {geometric:>6s} {hit.entry.quality:6.3f}"
-    return f"  {terms}  {hit.entry.language!r} from {hit.entry.source}, version {hit.entry.version}"
+    of = f", a part of {hit.source.language!r}," if hit.entry is not hit.source else ""
+    return f"  {terms}  {hit.entry.language!r}{of} from {hit.entry.source}, version {hit.entry.version}"
 
 
 def _sub_task(sub_task: SubTask) -> str:
@@ -119,16 +140,18 @@ def _reference(reference: Reference) -> str:
 
 
 def _summary(found: Found, limit: int) -> dict[str, Any]:
+    shown = [(number, hit) for number, part in enumerate(found.parts, start=1) for hit in part[:limit]]
     entries = [
         {
             "language": hit.entry.language, "source": hit.entry.source, "semantic": hit.semantic,
-            "geometric": hit.geometric, "quality": hit.entry.quality, "total": hit.total,
+            "geometric": hit.geometric, "quality": hit.entry.quality, "total": hit.total, "part": number,
         }
-        for hit in found.hits[:limit]
+        for number, hit in [*shown, *((None, hit) for hit in _others(found, limit))]
     ]  # fmt: skip
     return {
         "asked": [asdict(sub_task) for sub_task in found.asked],
-        "considered": found.considered,
+        "parts": len(found.parts),
+        "considered": sum(map(len, found.parts)),
         "refusal": found.refusal or None,
         "status": found.status or None,
         "objects": found.seen,

@@ -35,6 +35,9 @@ class ListConfig:
     all: bool = False
     limit: int = 50
 
+    def __post_init__(self) -> None:
+        check_limit(self.limit)
+
 
 @dataclass
 class ShowConfig:
@@ -51,6 +54,15 @@ class ShowConfig:
     source: str = ""
     instruction: str = ""
     limit: int = 10
+
+    def __post_init__(self) -> None:
+        check_limit(self.limit)
+
+
+def check_limit(limit: int) -> None:
+    """Raise ValueError where a limit is negative."""
+    if limit < 0:
+        raise ValueError(f"limit is {limit}, expected a number of lines to show, at least 0: --limit=10")
 
 
 def list_entries(args: list[str]) -> None:

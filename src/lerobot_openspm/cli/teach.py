@@ -6,15 +6,22 @@ import json
 import shutil
 import time
 from collections import Counter
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import draccus
 
 from lerobot_openspm.datasets import dataset_metadata
 from lerobot_openspm.errors import OpenSPMError
-from lerobot_openspm.experience import MEMORY_JSON, Experience, save_experience
+from lerobot_openspm.experience import MEMORY_JSON, Experience, load_experience, save_experience
+from lerobot_openspm.experience_exchange import digest
+from lerobot_openspm.experience_files import changing
 from lerobot_openspm.teaching import Lesson
+
+if TYPE_CHECKING:
+    from lerobot_openspm.modeling_openspm import OpenSPMPolicy
 
 
 @dataclass
@@ -51,10 +58,13 @@ def main(args: list[str]) -> None:
     config = draccus.parse(TeachConfig, args=args)
     into, output = Path(config.into), Path(config.output) if config.output else None
     _check_folders(into, output)
-    experience, lesson = _taught(config)
+    meta = dataset_metadata(config.dataset.repo_id, config.dataset.root)
+    policy = _policy(config)
+    known, lesson = policy.require_experience(), policy.teach(meta, config.dataset.episodes)
     if output is None:
-        save_experience(experience, into)
+        experience, lesson = _appended(known, lesson, into, lambda now: _taught(policy, now, meta, config))
     else:
+        experience = policy.require_experience()
         _write_copy(experience, into, output)
     print("\n".join(_lines(lesson)))
     summary = {
@@ -82,16 +92,42 @@ def _check_folders(into: Path, output: Path | None) -> None:
         raise OpenSPMError(f"{output} exists already; choose another --output, or remove it")
 
 
-def _taught(config: TeachConfig) -> tuple[Experience, Lesson]:
-    """What the checkpoint knows after the lesson, and the lesson."""
+def _policy(config: TeachConfig) -> OpenSPMPolicy:
     from lerobot_openspm.modeling_openspm import OpenSPMPolicy
 
-    meta = dataset_metadata(config.dataset.repo_id, config.dataset.root)
     policy = OpenSPMPolicy.from_pretrained(config.into)
     given = {name: value for name, value in vars(config.policy).items() if value is not None}
     policy.config = replace(policy.config, **given)
-    lesson = policy.teach(meta, config.dataset.episodes)
-    return policy.require_experience(), lesson
+    return policy
+
+
+def _taught(policy: OpenSPMPolicy, known: Experience, meta: Any, config: TeachConfig) -> Lesson:
+    policy.experience = known
+    return policy.teach(meta, config.dataset.episodes)
+
+
+def _appended(
+    known: Experience, lesson: Lesson, into: Path, again: Callable[[Experience], Lesson]
+) -> tuple[Experience, Lesson]:
+    """Append a lesson to what the memory holds by now; what is saved, and the lesson.
+
+    A lesson takes long, so others may change the memory meanwhile. Its key poses mean nothing in the frames
+    of other models of its objects, so where these have changed the lesson is given again.
+    """
+    with changing(into):
+        now = load_experience(into)
+        if not all(_same_model(known, now, name) for name in lesson.learned.objects):
+            lesson = again(now)
+        experience = now.appended(lesson.learned)
+        save_experience(experience, into)
+    before = Counter(entry.language for entry in now.entries)
+    return experience, replace(lesson, known_before={task: before[task] for task in lesson.instructions})
+
+
+def _same_model(known: Experience, now: Experience, name: str) -> bool:
+    """Whether two memories know an object by the same model, or neither knows it."""
+    models = [one.objects.get(name) for one in (known, now)]
+    return len({digest(model) if model else "" for model in models}) == 1
 
 
 def _write_copy(experience: Experience, into: Path, output: Path) -> None:

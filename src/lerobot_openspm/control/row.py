@@ -143,6 +143,11 @@ class Row:
     # Planning.
 
     @property
+    def candidates(self) -> tuple[tuple[Candidate, ...], ...]:
+        """For each part of the instruction, in order, what it can be carried out by; none before a look."""
+        return self._parts
+
+    @property
     def _is_last_part(self) -> bool:
         return self._part + 1 >= len(self._parts)
 

@@ -14,6 +14,7 @@ import cv2
 import httpx
 
 from lerobot_openspm.errors import JudgementError
+from lerobot_openspm.judgement.cutoff import Cutoff
 from lerobot_openspm.judgement.prompt import Prompt
 from lerobot_openspm.judgement.types import Picture
 
@@ -72,7 +73,8 @@ class ChatEndpoint:
         self._patience, self._sleep = patience or Patience(), sleep
         self._key = os.environ.get(API_KEY_VARIABLE, "")
         self._with_schema = True
-        self._http = httpx.Client()
+        # Each request connects anew, so that its cutoff knows its connection.
+        self._http = httpx.Client(limits=httpx.Limits(max_keepalive_connections=0))
         self.model_id = model_id
 
     def complete(self, prompt: Prompt) -> str:
@@ -116,22 +118,34 @@ class ChatEndpoint:
         headers = {"Accept-Encoding": "identity"}
         if self._key:
             headers["Authorization"] = f"Bearer {self._key}"
+        with Cutoff(left_s) as cutoff:
+            try:
+                answer = self._read(request, headers, timeout, cutoff)
+            except httpx.TimeoutException as error:
+                raise JudgementError(self._too_slow()) from error
+            except (httpx.TransportError, httpx.InvalidURL) as error:
+                if cutoff.passed:
+                    raise JudgementError(self._too_slow()) from error
+                why = f"{type(error).__name__}: {error}"
+                raise _TryAgainError(f"{self._url} could not be asked ({why})") from error
+            if cutoff.passed:  # what has no length ends, cut off, like a whole one
+                raise JudgementError(self._too_slow())
+            return answer
+
+    def _read(
+        self, request: Mapping[str, Any], headers: Mapping[str, str], timeout: httpx.Timeout, cutoff: Cutoff
+    ) -> tuple[int, bytes]:
         body = bytearray()
-        try:
-            ask = self._http.stream("POST", self._url, json=request, headers=headers, timeout=timeout)
-            with ask as response:
-                for piece in response.iter_raw():
-                    body += piece
-                    if len(body) > MAX_ANSWER_BYTES:
-                        raise JudgementError(f"{self._url} answered with more than {MAX_ANSWER_BYTES} bytes")
-                    if time.monotonic() > deadline:
-                        raise JudgementError(self._too_slow())
-                return response.status_code, bytes(body)
-        except httpx.TimeoutException as error:
-            raise JudgementError(self._too_slow()) from error
-        except (httpx.TransportError, httpx.InvalidURL) as error:
-            why = f"{type(error).__name__}: {error}"
-            raise _TryAgainError(f"{self._url} could not be asked ({why})") from error
+        ask = self._http.stream(
+            "POST", self._url, json=request, headers=headers, timeout=timeout,
+            extensions={"trace": cutoff.trace},
+        )  # fmt: skip
+        with ask as response:
+            for piece in response.iter_raw():
+                body += piece
+                if len(body) > MAX_ANSWER_BYTES:
+                    raise JudgementError(f"{self._url} answered with more than {MAX_ANSWER_BYTES} bytes")
+            return response.status_code, bytes(body)
 
     def _too_slow(self) -> str:
         return f"{self._url} took longer than {self._patience.timeout_s:g} s"

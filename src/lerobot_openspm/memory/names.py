@@ -150,3 +150,8 @@ class Model2VecNames:
         if name not in self._embedded:
             self._embedded[name] = np.asarray(self._model.encode(name), float)
         return self._embedded[name]
+
+
+def names_from(weights: str | None) -> NameSimilarity:
+    """The table of words, or with a model2vec model beside it. Raises InstructionError, as that one does."""
+    return TABLE_NAMES if weights is None else Model2VecNames(weights)
