@@ -231,8 +231,8 @@ def entry_to_json(entry: MemoryEntry) -> bytes:
     for name in ("version", "trials"):
         if (count := getattr(entry, name)) > LIMIT:
             raise MemoryFormatError(
-                f"the entry of {entry.source!r} has {name!r} {count}, expected up to {LIMIT:g}: it could never "
-                "be loaded again, so nothing was saved; export it, correct the number, and add it again"
+                f"the entry of {entry.source!r} has {name!r} {count}, expected up to {LIMIT:g}: it could "
+                "never be loaded again, so nothing was saved; export it, correct the number, and add it again"
             )
     return json.dumps(entry_to_fields(entry), allow_nan=False, ensure_ascii=False).encode()
 
