@@ -147,3 +147,12 @@ def test_the_file_is_open_once_and_closed_with_the_last_slice(tmp_path, monkeypa
     del part
     gc.collect()
     assert n_open() == 0
+
+
+@pytest.mark.parametrize("name", ["version", "trials"])
+def test_what_counts_further_than_is_read_again_is_not_saved(tmp_path, name):
+    most = replace(entry(), **{name: 10**9})
+    save_experience(experience(entries=(most,)), tmp_path)
+    with pytest.raises(MemoryFormatError, match=rf"'{name}' 1000000001, expected up to 1e\+09"):
+        save_experience(experience(entries=(replace(most, **{name: 10**9 + 1}),)), tmp_path)
+    assert same(load_experience(tmp_path).entries, (most,))

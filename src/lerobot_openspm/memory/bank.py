@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from lerobot_openspm.errors import MemoryFormatError
 from lerobot_openspm.memory.columns import Columns
 from lerobot_openspm.memory.entry import MemoryEntry
-from lerobot_openspm.memory.fields import MALFORMED
+from lerobot_openspm.memory.fields import LIMIT, MALFORMED
 from lerobot_openspm.memory.store import entry_from_fields, entry_to_fields
 from lerobot_openspm.memory.strict_json import loads
 
@@ -222,7 +222,18 @@ def entry_from_json(text: bytes, where: str) -> MemoryEntry:
 
 
 def entry_to_json(entry: MemoryEntry) -> bytes:
-    """One entry as JSON on one line. Raises ValueError for a number that is not finite."""
+    """One entry as JSON on one line.
+
+    Raises:
+        ValueError: A number is not finite.
+        MemoryFormatError: It has counted further than what is read again.
+    """
+    for name in ("version", "trials"):
+        if (count := getattr(entry, name)) > LIMIT:
+            raise MemoryFormatError(
+                f"the entry of {entry.source!r} has {name!r} {count}, expected up to {LIMIT:g}: it could "
+                "never be loaded again, so nothing was saved; export it, correct the number, and add it again"
+            )
     return json.dumps(entry_to_fields(entry), allow_nan=False, ensure_ascii=False).encode()
 
 
