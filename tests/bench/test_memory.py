@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from tests.cli.conftest import openspm  # noqa: F401
 
+from lerobot_openspm.bench import memory
 from lerobot_openspm.bench.synthetic_bank import synthetic_experience
 from lerobot_openspm.bench.synthetic_keys import distinct_keys, said_otherwise
 from lerobot_openspm.memory import index
@@ -16,6 +17,7 @@ KEYS = ("entries", "query_ms_p50", "query_ms_p99", "recall", "load_s_100k", "exa
 
 def test_it_prints_what_it_measured(openspm, monkeypatch):  # noqa: F811
     monkeypatch.setattr(index, "EXACT_LIMIT", 2000)
+    monkeypatch.setattr(memory, "SEMANTIC_ENTRIES", 1000)
     code, out, err = openspm(
         "bench", "memory", "--entries=3000", "--queries=50", "--loaded=200", "--threads=1"
     )
@@ -27,6 +29,7 @@ def test_it_prints_what_it_measured(openspm, monkeypatch):  # noqa: F811
     assert 0 < measured["query_ms_p50"] <= measured["query_ms_p99"]
     assert measured["recall"] > 0.9
     assert measured["tasks"]["semantic_recall"] > 0.9
+    assert (measured["tasks"]["semantic_index"], measured["tasks"]["semantic_entries"]) == ("faiss", 1000)
     assert measured["load_s_100k"] > 0
     assert measured["exact_10k_ms_p50"] > 0
 

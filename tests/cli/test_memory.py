@@ -311,6 +311,18 @@ def test_rate(openspm: Openspm, memory: Path):
     )
 
 
+def test_of_entries_of_one_source_and_instruction_one_is_rated_by_its_number(openspm: Openspm, memory: Path):
+    twin = entry(BOWL, source="local/demos#2", quality=0.3)
+    save_experience(replace(made(), entries=(*made().entries, twin)), memory)
+    which = ("rate", "--source=local/demos#2", f"--instruction={BOWL}", "--success=true")
+    error = refused(openspm, memory, *which)
+    assert "2 entries come from 'local/demos#2'; pass --entry=NUMBER with one of: 2 (" in error
+    assert f"; 3 ({BOWL!r}, version 1, 8 key poses, quality 0.30, succeeded 0 of 0)" in error
+    assert run(openspm, memory, *which, "--entry=3")["trials"] == 1
+    assert [e.trials for e in load_experience(memory).entries] == [0, 0, 0, 1]
+    assert "entry 0 is none of those that come from" in refused(openspm, memory, *which, "--entry=0")
+
+
 def test_another_calibration_is_put_into_a_memory(openspm: Openspm, memory: Path, tmp_path: Path):
     file = tmp_path / "cameras.json"
     file.write_text((memory / "cameras.json").read_text().replace("50.1", "60.5"))

@@ -166,7 +166,8 @@ def test_a_server_that_says_the_same_of_everything_breaks_nothing(mined: Mined, 
 def test_a_server_that_fails_is_asked_no_more_after_some_episodes(mined: Mined, asked, caplog, reply: Reply):
     with LoopbackChat(lambda _: reply).running() as chat:
         assert asked(chat, phase_judge_timeout_s=0.5) == mined.episodes
-    assert MAX_FAILURES <= len(chat.requests) <= 3 * MAX_FAILURES
+    # There is no time for second attempts, so a request is an episode.
+    assert len(chat.requests) == MAX_FAILURES < len(mined.episodes)
     assert caplog.text.count("gave no answer, mining goes on") == 1
     assert caplog.text.count("is asked no more") == 1
 

@@ -4,6 +4,7 @@ from tests.memory.builders import entry
 from lerobot_openspm.errors import InstructionError
 from lerobot_openspm.memory.instruction import parse_instruction
 from lerobot_openspm.memory.retrieval import (
+    MARGIN,
     ScoreWeights,
     retrieve,
     semantic_candidates,
@@ -158,6 +159,16 @@ def test_what_may_mean_two_things_is_not_guessed(instruction, known):
     # Where only one of them is known it is meant, and so is what is said in its very words.
     assert first(instruction, [entries[0], entries[0]]) is entries[0]
     assert first(known[1], entries) is entries[1]
+
+
+def test_of_two_things_that_fit_nearly_as_well_none_is_guessed():
+    red = "pick up the red mug on the stove and put it on the plate"
+    white = "put the white mug on the plate"
+    asked = "pick up the mug on the rack and put it on the plate"
+    assert 0.75 < score(asked, red) < score(asked, white) < score(asked, red) + MARGIN
+    with pytest.raises(InstructionError, match="may mean different things") as caught:
+        semantic_candidates(asked, [entry(red), entry(white)])
+    assert all(repr(language) in str(caught.value) for language in (red, white))
 
 
 def test_only_what_means_the_same_as_the_best_is_a_candidate():

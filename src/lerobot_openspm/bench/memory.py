@@ -23,6 +23,7 @@ WARM_UP = 100
 EXACT_ENTRIES, LOADED_ENTRIES = 10_000, 100_000
 # Of uniform vectors: length of the noise added to a unit vector to ask for it; the cosine is then about 0.86.
 UNIFORM_NOISE = 0.6
+INDICES: dict[str, type[ExactIndex | FaissIndex]] = {"exact": ExactIndex, "faiss": FaissIndex}
 # Every key is scored for every query, in Python.
 SEMANTIC_ENTRIES, SEMANTIC_QUERIES = 20_000, 200
 
@@ -65,7 +66,7 @@ def measure(options: Options) -> dict[str, Any]:
         "queries": options.queries,
         "threads": options.threads,
         "loaded": options.loaded,
-        "tasks": tasks | _semantic_recall(keys[:SEMANTIC_ENTRIES], rng),
+        "tasks": tasks | _semantic_recall(keys[:SEMANTIC_ENTRIES], INDICES[tasks["index"]], rng),
         "uniform": _search(*_uniform(options.entries, options.queries, rng)),
         "near_ms_p50": _percentile(near_ms, 50),
     }
@@ -79,13 +80,17 @@ def _search(vectors: Vectors, queries: Vectors) -> dict[str, Any]:
     (wall_ms, cpu_ms), found = _timed_with_cpu(index, queries)
     nearest = _nearest(vectors, queries)
     return {
-        "index": "faiss" if isinstance(index, FaissIndex) else "exact",
+        "index": _kind(index),
         "query_ms_p50": _percentile(wall_ms, 50),
         "query_ms_p99": _percentile(wall_ms, 99),
         "query_cpu_ms_p99": _percentile(cpu_ms, 99),
         "recall": round(float((found == nearest[:, None]).any(axis=1).mean()), 4),
         "build_s": round(build_s, 1),
     }
+
+
+def _kind(index: KeyIndex) -> str:
+    return "faiss" if isinstance(index, FaissIndex) else "exact"
 
 
 def _timed(index: KeyIndex, queries: Vectors) -> tuple[np.ndarray, np.ndarray]:
@@ -123,15 +128,21 @@ def _unit(vectors: np.ndarray) -> Vectors:
     return (vectors / np.linalg.norm(vectors, axis=1, keepdims=True)).astype(np.float32)
 
 
-def _semantic_recall(keys: list[Key], rng: np.random.Generator) -> dict[str, Any]:
-    """How often the best ``S_sem`` of all keys is reached by those that the index finds."""
+def _semantic_recall(
+    keys: list[Key], kind: type[ExactIndex | FaissIndex], rng: np.random.Generator
+) -> dict[str, Any]:
+    """How often the best ``S_sem`` of all keys is reached by those that an index of this kind finds."""
     asked = [said_otherwise(keys[i], rng) for i in rng.integers(len(keys), size=SEMANTIC_QUERIES)]
-    _, found = make_index(key_vectors(keys)).search(key_vectors(asked), NEAREST_KEYS)
+    index = kind(key_vectors(keys))
+    _, found = index.search(key_vectors(asked), NEAREST_KEYS)
     reached = 0
     for key, numbers in zip(asked, found, strict=True):
-        among = max(semantic_score(key, keys[int(i)]) for i in numbers)
+        among = max((semantic_score(key, keys[int(i)]) for i in numbers if i >= 0), default=0.0)
         reached += among >= max(semantic_score(key, known) for known in keys)
-    return {"semantic_recall": round(reached / len(asked), 4), "semantic_n": len(asked)}
+    return {
+        "semantic_recall": round(reached / len(asked), 4), "semantic_n": len(asked),
+        "semantic_index": _kind(index), "semantic_entries": len(keys),
+    }  # fmt: skip
 
 
 def _load(count: int, n_queries: int, rng: np.random.Generator) -> tuple[float, np.ndarray]:

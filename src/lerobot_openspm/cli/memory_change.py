@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -93,12 +93,14 @@ class RateConfig:
         path: Folder of the checkpoint or memory.
         source: Dataset and episode of the entry, as ``list`` names them.
         instruction: Its very instruction, where several entries have the same source.
+        entry: Its number among the memory's entries, from 0, where several have the same of both.
         success: Whether it succeeded.
     """
 
     path: str = "outputs/memory"
     source: str = ""
     instruction: str = ""
+    entry: int | None = None
     success: bool | None = None
 
 
@@ -199,18 +201,41 @@ def rate(args: list[str]) -> None:
     folder = Path(config.path)
     with changing(folder):
         before = load_experience(folder)
-        chosen = _chosen(before, config.source, config.instruction, config.path)
-        if len(chosen) > 1:
-            raise OpenSPMError(
-                f"{len(chosen)} entries come from {config.source!r}; pass --instruction=TEXT with one of: "
-                + "; ".join(sorted({entry.language for entry in chosen.values()}))
-            )
-        [(index, entry)] = chosen.items()
+        index, entry = _the_one(before, config)
         rated = with_outcome(entry, config.success)
         entries = tuple(rated if i == index else other for i, other in enumerate(before.entries))
         after = replace(before, entries=entries)
         save_experience(after, folder)
     _report(after, quality=rated.quality, trials=rated.trials, successes=rated.successes)
+
+
+def _the_one(experience: Experience, config: RateConfig) -> tuple[int, MemoryEntry]:
+    """The entry to rate, and its number. Raises if it is none or several, with the option that tells."""
+    chosen = _chosen(experience, config.source, config.instruction, config.path)
+    if config.entry is not None:
+        if config.entry not in chosen:
+            raise OpenSPMError(
+                f"entry {config.entry} is none of those that come from {config.source!r}; pass "
+                f"--entry=NUMBER with one of: {_numbered(chosen)}"
+            )
+        return config.entry, chosen[config.entry]
+    if len(chosen) > 1:
+        languages = sorted({entry.language for entry in chosen.values()})
+        how = f"--instruction=TEXT with one of: {'; '.join(languages)}"
+        if len(languages) == 1:
+            how = f"--entry=NUMBER with one of: {_numbered(chosen)}"
+        raise OpenSPMError(f"{len(chosen)} entries come from {config.source!r}; pass {how}")
+    [one] = chosen.items()
+    return one
+
+
+def _numbered(entries: Mapping[int, MemoryEntry]) -> str:
+    """Entries by number, with what may tell them apart."""
+    return "; ".join(
+        f"{i} ({entry.language!r}, version {entry.version}, {len(entry.key_poses)} key poses, quality "
+        f"{entry.quality:.2f}, succeeded {entry.successes} of {entry.trials})"
+        for i, entry in entries.items()
+    )
 
 
 def cameras(args: list[str]) -> None:
