@@ -43,13 +43,16 @@ def test_teaching_is_measured_and_goes_on_where_it_was(openspm: Openspm, tiny_da
     assert list(result)[:4] == ["teach_s", "success_1_demo", "success_3_demos", "n"]
     assert result["n"] == 1
     assert 0 < result["teach_s"] < 60
-    # The policy that is taught has never seen the task, and the taught ones hold what they were taught.
+    # The policy that is taught has never seen the task. In its first demonstration no stove is found, because
+    # the images are small, so one is not enough; three are.
     nine = load_experience(output / "without_turn_on_stove")
     assert {entry.language for entry in nine.entries} == {"put the bowl on the plate"}
     assert set(nine.objects) == {"bowl", "plate"}
     taught = [load_experience(output / f"taught_turn_on_stove_{n}").entries for n in (1, 3)]
-    assert [len(entries) for entries in taught] == [4, 6]
-    assert [lesson["objects_learned"] for lesson in result["lessons"]] == [["stove"], ["stove"]]
+    assert [len(entries) for entries in taught] == [3, 6]
+    failed, learned = result["lessons"]
+    assert "the objects they belong to were found in none" in failed["error"]
+    assert (learned["error"], learned["objects_learned"]) == (None, ["stove"])
     weights = [
         (output / name / "model.safetensors") for name in ("without_turn_on_stove", "taught_turn_on_stove_1")
     ]
