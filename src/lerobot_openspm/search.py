@@ -13,10 +13,9 @@ from lerobot_openspm.errors import DatasetError, InstructionError
 from lerobot_openspm.memory.compound import Candidate, plan_parts
 from lerobot_openspm.memory.entry import MemoryEntry, SubTask
 from lerobot_openspm.memory.indexed_entries import indexed, near
-from lerobot_openspm.memory.instruction import parse_instruction
 from lerobot_openspm.memory.key_vector import key_vector, key_vectors
 from lerobot_openspm.memory.names import TABLE_NAMES, NameSimilarity
-from lerobot_openspm.memory.retrieval import ScoreWeights, semantic_score
+from lerobot_openspm.memory.retrieval import ScoreWeights, read_instruction, semantic_score
 from lerobot_openspm.observation import Observation, split_batch
 
 if TYPE_CHECKING:
@@ -81,9 +80,10 @@ def search_memory(
     Raises:
         InstructionError: The instruction cannot be read.
     """
-    asked = parse_instruction(instruction)
+    entries = indexed(entries)
+    asked = read_instruction(instruction, entries)
     score = partial(semantic_score, names=names)
-    entries = near(asked, indexed(entries), score)
+    entries = near(asked, entries, score)
     refusal, plan = "", tuple[tuple[Candidate, ...], ...]()
     try:
         plan = plan_parts(instruction, entries, names)

@@ -5,6 +5,8 @@ import numpy as np
 from lerobot_openspm.geometry import se3
 from lerobot_openspm.memory.entry import Anchor, MemoryEntry, MemoryKeyPose, RetrievalKey
 from lerobot_openspm.memory.instruction import parse_instruction
+from lerobot_openspm.memory.names import TABLE_NAMES
+from lerobot_openspm.memory.retrieval import candidates_for, read_instruction
 from lerobot_openspm.memory.robot import RobotModel
 
 OPEN_WIDTH = 0.08
@@ -60,3 +62,8 @@ def entry(instruction="put the bowl on the plate", key_poses=None, layout=None, 
     fields = {"quality": 0.9, "version": 1, "source": "local/demos#0", **changes}
     key = RetrievalKey(sub_tasks, tuple(pose.phase for pose in key_poses))
     return MemoryEntry(key, instruction, tuple(key_poses), layout=layout, **fields)
+
+
+def semantic_candidates(instruction, entries, names=TABLE_NAMES):
+    """Entries that are about all that an instruction says, with their semantic score."""
+    return candidates_for(read_instruction(instruction, entries), instruction, entries, names)

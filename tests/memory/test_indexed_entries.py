@@ -2,7 +2,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from tests.memory.builders import entry
+from tests.memory.builders import entry, semantic_candidates
 
 from lerobot_openspm.bench.synthetic_keys import distinct_keys, said_otherwise
 from lerobot_openspm.errors import InstructionError
@@ -18,7 +18,7 @@ from lerobot_openspm.memory.indexed_entries import (
     near,
 )
 from lerobot_openspm.memory.instruction import parse_instruction
-from lerobot_openspm.memory.retrieval import MIN_SEMANTIC, semantic_candidates, semantic_score
+from lerobot_openspm.memory.retrieval import MIN_SEMANTIC, semantic_score
 
 BOWL, STOVE = "put the bowl on the plate", "turn on the stove"
 DIGEST_OF_BOWL = 13536161139241641483

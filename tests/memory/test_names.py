@@ -6,14 +6,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from tests.memory.builders import entry
+from tests.memory.builders import entry, semantic_candidates
 from tests.memory.text_model import make_model
 
 from lerobot_openspm.errors import InstructionError
 from lerobot_openspm.memory.instruction import parse_instruction
 from lerobot_openspm.memory.meaning import semantic_score
 from lerobot_openspm.memory.names import MIN_COSINE, TABLE_NAMES, Model2VecNames
-from lerobot_openspm.memory.retrieval import semantic_candidates
 
 VECTORS = {
     "goblet": (1.0, 0.1, 0.0), "chalice": (1.0, 0.0, 0.0), "bowl": (0.0, 1.0, 0.0), "red": (0.0, 0.0, 0.01),

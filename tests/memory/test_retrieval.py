@@ -1,5 +1,5 @@
 import pytest
-from tests.memory.builders import entry
+from tests.memory.builders import entry, semantic_candidates
 
 from lerobot_openspm.errors import InstructionError
 from lerobot_openspm.memory.instruction import parse_instruction
@@ -7,7 +7,6 @@ from lerobot_openspm.memory.retrieval import (
     MARGIN,
     ScoreWeights,
     retrieve,
-    semantic_candidates,
     semantic_score,
 )
 

@@ -11,11 +11,11 @@ from pathlib import Path
 from typing import Any
 
 from lerobot_openspm.errors import InstructionError, OpenSPMError
+from lerobot_openspm.memory.compound import plan_parts
 from lerobot_openspm.memory.entry import MemoryEntry, Reference, RetrievalKey, SubTask
 from lerobot_openspm.memory.instruction import parse_instruction
 from lerobot_openspm.memory.meaning import same_meaning
 from lerobot_openspm.memory.names import TABLE_NAMES, Model2VecNames, NameSimilarity
-from lerobot_openspm.memory.retrieval import semantic_candidates
 
 # The instructions and their elements, which were checked by reading every line.
 KNOWN, PARAPHRASES, OUT_OF_DOMAIN = "known.json", "paraphrases.json", "out_of_domain.json"
@@ -121,7 +121,7 @@ def _elements() -> dict[str, tuple[SubTask, ...]]:
 def is_refused(row: Row, entries: Sequence[MemoryEntry], names: NameSimilarity = TABLE_NAMES) -> bool:
     """Whether an instruction is not read, or nothing in the memory is about it."""
     try:
-        semantic_candidates(row["instruction"], entries, names)
+        plan_parts(row["instruction"], entries, names)
     except InstructionError:
         return True
     return False
@@ -130,12 +130,13 @@ def is_refused(row: Row, entries: Sequence[MemoryEntry], names: NameSimilarity =
 def is_first(row: Row, entries: Sequence[MemoryEntry], names: NameSimilarity = TABLE_NAMES) -> bool:
     """Whether the best entries for a paraphrase are all of its original's meaning."""
     try:
-        found = semantic_candidates(row["paraphrase"], entries, names)
+        found = plan_parts(row["paraphrase"], entries, names)
     except InstructionError:
         return False
-    best = max(score for _, score in found)
-    original = _elements()[row["of"]]
-    return all(same_meaning(entry.key.sub_tasks, original) for entry, score in found if score == best)
+    if len(found) != 1:
+        return False  # of the parts of other tasks
+    best, original = max(one.semantic for one in found[0]), _elements()[row["of"]]
+    return all(same_meaning(c.entry.key.sub_tasks, original) for c in found[0] if c.semantic == best)
 
 
 def measure(options: Options) -> dict[str, Any]:

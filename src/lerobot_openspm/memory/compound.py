@@ -14,10 +14,9 @@ from functools import partial
 from lerobot_openspm.errors import InstructionError
 from lerobot_openspm.memory.entry import MemoryEntry, MemoryKeyPose, Reference, RetrievalKey, SubTask
 from lerobot_openspm.memory.indexed_entries import near
-from lerobot_openspm.memory.instruction import parse_instruction
 from lerobot_openspm.memory.meaning import semantic_score
 from lerobot_openspm.memory.names import TABLE_NAMES, NameSimilarity
-from lerobot_openspm.memory.retrieval import candidates_for
+from lerobot_openspm.memory.retrieval import candidates_for, read_instruction
 
 # A sub-task takes hold of something and lets it go again.
 TRANSITIONS_PER_SUB_TASK = 2
@@ -124,7 +123,7 @@ def plan_parts(
         InstructionError: The instruction cannot be read, or there is no experience of one of its sub-tasks;
             the error names the sub-task and lists what the memory knows.
     """
-    asked = parse_instruction(instruction)
+    asked = read_instruction(instruction, entries)
     entries = near(asked, entries, partial(semantic_score, names=names))
     chain: list[tuple[Candidate, ...]] = []
     left = asked

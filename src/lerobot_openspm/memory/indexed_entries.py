@@ -7,7 +7,7 @@ keys, they are scored exactly, and of the best keys the best entries are handed 
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import overload
 
 import numpy as np
@@ -38,6 +38,9 @@ class IndexedEntries(Sequence[MemoryEntry]):
         entries: The bank. If it :class:`HasColumns`, one entry of every different key is read, else all.
         where: Names the bank in errors.
 
+    Attributes:
+        names: Of all objects that the entries are about.
+
     Raises:
         MemoryFormatError: An entry cannot be read.
     """
@@ -54,6 +57,7 @@ class IndexedEntries(Sequence[MemoryEntry]):
             for row in dict.fromkeys([key, *((sub_task,) for sub_task in key if len(key) > 1)]):
                 self._rows.setdefault(row, []).append(number)
         self._row_keys, self._keys = list(self._rows), keys
+        self.names = _names(keys)
         self._index = make_index(key_vectors(self._row_keys), where)
 
     def __len__(self) -> int:
@@ -109,6 +113,17 @@ def indexed(entries: Sequence[MemoryEntry], where: str = "the memory") -> Sequen
     if len(entries) <= INDEX_FROM or isinstance(entries, IndexedEntries):
         return entries
     return IndexedEntries(entries, where)
+
+
+def known_names(entries: Sequence[MemoryEntry]) -> frozenset[str]:
+    """Names of all objects that a bank, as :func:`indexed` gave it, is about."""
+    if isinstance(entries, IndexedEntries):
+        return entries.names
+    return _names({entry.key.sub_tasks for entry in entries})
+
+
+def _names(keys: Iterable[Key]) -> frozenset[str]:
+    return frozenset(name for key in keys for sub_task in key for name in sub_task.objects)
 
 
 def near(asked: Sequence[SubTask], entries: Sequence[MemoryEntry], score: Score) -> Sequence[MemoryEntry]:

@@ -8,7 +8,7 @@ from functools import partial
 
 from lerobot_openspm.errors import InstructionError
 from lerobot_openspm.memory.entry import MemoryEntry, SubTask
-from lerobot_openspm.memory.indexed_entries import near
+from lerobot_openspm.memory.indexed_entries import known_names, near
 from lerobot_openspm.memory.instruction import parse_instruction
 from lerobot_openspm.memory.loose_words import THINGS
 from lerobot_openspm.memory.meaning import semantic_score
@@ -42,23 +42,13 @@ class Scored:
     total: float
 
 
-def semantic_candidates(
-    instruction: str, entries: Sequence[MemoryEntry], names: NameSimilarity = TABLE_NAMES
-) -> list[tuple[MemoryEntry, float]]:
-    """Entries that are about what the instruction says, with their ``S_sem``.
-
-    Args:
-        instruction: What is asked.
-        entries: The memory.
-        names: Says which names mean the same thing.
+def read_instruction(instruction: str, entries: Sequence[MemoryEntry]) -> tuple[SubTask, ...]:
+    """The task elements of an instruction, read by someone who knows the names of the memory's things.
 
     Raises:
-        InstructionError: It cannot be read, no entry is about it, or entries about different things fit it as
-            well. The error names the instructions that the memory knows, or those that may be meant.
+        InstructionError: It cannot be read.
     """
-    keys = {entry.key.sub_tasks for entry in entries}
-    things = THINGS | {name for key in keys for sub_task in key for name in sub_task.objects}
-    return candidates_for(parse_instruction(instruction, things), instruction, entries, names)
+    return parse_instruction(instruction, THINGS | known_names(entries))
 
 
 def candidates_for(
@@ -67,7 +57,7 @@ def candidates_for(
     entries: Sequence[MemoryEntry],
     names: NameSimilarity = TABLE_NAMES,
 ) -> list[tuple[MemoryEntry, float]]:
-    """Entries that are about some sub-tasks, as :func:`semantic_candidates` finds them.
+    """Entries that are about some sub-tasks, with their ``S_sem``.
 
     Args:
         sub_tasks: What is asked.
@@ -76,7 +66,8 @@ def candidates_for(
         names: Says which names mean the same thing.
 
     Raises:
-        InstructionError: As there.
+        InstructionError: No entry is about them, or entries about different things fit them as well. The
+            error names the instructions that the memory knows, or those that may be meant.
     """
     entries = near(sub_tasks, entries, partial(semantic_score, names=names))
     # Demonstrations of one task share their key, so there are far fewer keys than entries.
