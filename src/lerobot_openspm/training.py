@@ -158,7 +158,7 @@ def mine(
     if config.perception == "oracle":
         layouts, names = oracle_layouts(demonstrations, mined.mined, objects.models)
     yaw_periods = {name: model.yaw_period for name, model in objects.models.items()}
-    entries = build_entries(mined.mined, layouts, yaw_periods, demonstrations.name)
+    entries = build_entries(mined.mined, layouts, objects.ends, yaw_periods, demonstrations.name)
     if not entries:
         raise DatasetError(
             f"dataset {demonstrations.name} has key poses in {len(mined.mined)} episodes, but the objects "

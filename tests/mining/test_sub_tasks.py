@@ -37,7 +37,7 @@ def drawn():
 def test_every_key_pose_of_a_demonstration_of_two_sub_tasks_knows_its_own():
     episode = drawn()
     mined = MinedEpisode(episode, tuple(find_key_poses(episode, robot())), parse_instruction(TASK))
-    (entry,) = build_entries([mined], [LAYOUT], {}, "local/demos")
+    (entry,) = build_entries([mined], [LAYOUT], [{}], {}, "local/demos")
     by_sub_task = [[pose.phase for pose in entry.key_poses if pose.sub_task == i] for i in (0, 1)]
     assert by_sub_task[0][-4:] == ["grasp", "open", "release", "retreat"]
     assert "open" not in by_sub_task[1]

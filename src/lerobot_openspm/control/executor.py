@@ -135,7 +135,7 @@ class Executor:
         """
         while self.status is Status.RUNNING:
             if self._lost_grip(hand):
-                return self._retry("the fingers hold nothing")
+                return self.try_again("the fingers hold nothing")
             if not self._finished(hand):
                 break
             if self.index + 1 == len(self.plan):
@@ -150,7 +150,7 @@ class Executor:
             self._enter(self.index + 1, hand)
         elif self.status is Status.RUNNING and given_up:
             metres, radians = se3.distances(hand.T_world_ee, self.plan[self.index].T_world_ee)
-            return self._retry(f"it stays {1000 * metres:.1f} mm and {radians:.3f} rad away")
+            return self.try_again(f"it stays {1000 * metres:.1f} mm and {radians:.3f} rad away")
         return False
 
     def next_action(self, hand: Hand) -> Array | None:
@@ -161,6 +161,8 @@ class Executor:
             action = self._toward(hand)
         elif self._queue:
             action = self._queue.popleft()
+            if self.plan[self.index].memory.phase == "push":
+                action = self._kept_on_way(action, hand)
         elif self._settings.execution == "closed_loop_trc" and self._steps >= self._nominal_steps():
             action = self._correct(hand)
         else:
@@ -199,6 +201,22 @@ class Executor:
         motion: Array = np.where(gains > 0, share * residual / np.maximum(gains, 1e-9), 0.0)
         motion = motion / max(1.0, float(np.abs(motion).max()))
         return np.append(motion, self._robot.command(target.memory.closed))
+
+    def _kept_on_way(self, action: Array, hand: Hand) -> Array:
+        """An action whose motion across the straight way to the key pose leads back to it.
+
+        Nothing holds what is pushed: a hand that strays by millimetres slips over or past it.
+        """
+        here, target = self._here(hand)[:3, 3], self.plan[self.index].T_world_ee[:3, 3]
+        way = target - self._start[:3, 3]
+        length = float(np.linalg.norm(way))
+        if length < 1e-9 or self._robot.metres_per_action <= 0:
+            return action
+        way = way / length
+        left = target - here
+        across = left - (left @ way) * way
+        motion = (action[:3] @ way) * way + CORRECTION_SHARE * across / self._robot.metres_per_action
+        return np.concatenate([motion, action[3:]])
 
     def _gains(self) -> Array:
         """How far the hand moves per unit of each of the six numbers of an action."""
@@ -281,8 +299,8 @@ class Executor:
             return False
         return hand.opening < HELD_SHARE * grasped.opening
 
-    def _retry(self, why: str) -> bool:
-        """Give the key poses of this contact another try, from its approach on, if attempts are left."""
+    def try_again(self, why: str) -> bool:
+        """Count another attempt at the present key pose; without one left there is no progress."""
         self.attempts += 1
         phase = self.plan[self.index].memory.phase
         if self.attempts > self._settings.max_attempts:

@@ -16,12 +16,12 @@ import numpy as np
 from lerobot_openspm.control.executor import Executor, Hand, Status
 from lerobot_openspm.control.knowledge import Knowledge
 from lerobot_openspm.control.referents import Referents, references
-from lerobot_openspm.control.transfer import Target, rise
+from lerobot_openspm.control.transfer import PushWays, Target, rise
 from lerobot_openspm.flow.condition import Query
 from lerobot_openspm.geometry import se3
 from lerobot_openspm.geometry.se3 import Array
 from lerobot_openspm.memory.compound import Candidate, plan_parts
-from lerobot_openspm.memory.entry import MemoryEntry
+from lerobot_openspm.memory.entry import MemoryEntry, Outcome
 from lerobot_openspm.memory.retrieval import Scored
 from lerobot_openspm.perception.camera_watch import Fault
 from lerobot_openspm.perception.tracker import Tracker, TrackStatus
@@ -36,6 +36,12 @@ SECOND_LOOK_S = 0.15
 
 # Without a sound picture of every camera the hand goes on for so long, then holds still, then gives up.
 BLIND_S, GIVE_UP_S = 0.5, 2.0
+
+# So many looks may be taken after the last key pose to see how it went; then it stays unknown.
+LOOKS_AT_OUTCOME = 3
+
+# A hand that has gone this far beyond what it pushes has lost it.
+LEFT_BEHIND_M = 0.025
 
 # An object that is this far from where the key poses took it to be takes them along; less is noise.
 MOVED_M, MOVED_RAD = 0.002, 0.05
@@ -70,6 +76,8 @@ class Row:
         layout: Poses ``T_world_obj`` that the plan was made with: of what the hand has touched, from before.
         seen: What the last look brought; None before the first.
         is_paused: Whether the hand holds still until something is seen again.
+        succeeded: Whether what was to be done is seen to be done; None before the end, and where it cannot be
+            seen.
     """
 
     def __init__(self, knowledge: Knowledge, instruction: str, fingerprint: int, noise_seed: int):
@@ -81,6 +89,8 @@ class Row:
         self.layout: dict[str, Array] = {}
         self.seen: Seen | None = None
         self.is_paused = False
+        self.succeeded: bool | None = None
+        self._looks_left = LOOKS_AT_OUTCOME  # at how the present part ended
         # What the instruction is carried out by; made at the first look, because it may be refused.
         self._parts: tuple[tuple[Candidate, ...], ...] = ()
         self._part = 0
@@ -121,12 +131,14 @@ class Row:
             index = self.executor.index
             is_to_retry = not self.is_paused and self.executor.advance(hand)
             self._carry(index, hand)
-            if self._is_to_go_on():
-                self._begin_next_part(hand, look)
+            if self.executor.status is Status.DONE:
+                self._check_outcomes(hand, look)
             elif is_to_retry:
                 self._try_again(hand, look)
             elif self._is_time_to_look(index):
                 self._look_around(hand, look)
+        elif self.status is Status.DONE and self._looks_left > 0:
+            self._check_outcomes(hand, look)
 
     def next_action(self, hand: Hand) -> Array | None:
         """The next canonical action ``(7,)``, or None when a chunk is needed."""
@@ -191,9 +203,46 @@ class Row:
         said = {k: where for one in self._parts[self._part] for k, where in references(one, meant).items()}
         self.tracker.forget(self._referents.hear(said))
 
-    def _is_to_go_on(self) -> bool:
-        """Whether a part is done that others follow."""
-        return self.status is Status.DONE and not self._is_last_part
+    def _check_outcomes(self, hand: Hand, look: Look) -> None:
+        """Look whether what was to be done is done: go on if so, else go back to what can mend it."""
+        if self._looks_left < LOOKS_AT_OUTCOME and self._waited_steps < self._second_look_steps:
+            return
+        missed = self._missed(hand, look) if self._is_tracking else ()
+        if self.status is Status.CAMERA_FAULT or (missed is None and self._looks_left > 0):
+            return
+        self._looks_left = 0
+        if missed:
+            self._go_back(missed[0], hand)
+        elif not self._is_last_part:
+            self._begin_next_part(hand, look)
+
+    def _missed(self, hand: Hand, look: Look) -> tuple[Outcome, ...] | None:
+        """Look at what was moved: the outcomes that are not met, in order; None where that is not seen."""
+        expected = self.ranked[0].entry.outcomes
+        names = dict.fromkeys(name for one in expected for name in one.objects)
+        if not names:
+            return ()
+        self._looks_left -= 1
+        self._see([name for name in names if name not in self._altered], hand, look)
+        poses = self.tracker.poses(hand.T_world_ee)
+        seen = [
+            one for one in expected if self.tracker.is_seen(one.target) and poses.keys() >= set(one.objects)
+        ]
+        missed = tuple(one for one in seen if not one.is_met(poses))
+        if len(seen) < len(expected) and not missed:
+            return None
+        self.succeeded = not missed
+        return missed
+
+    def _go_back(self, missed: Outcome, hand: Hand) -> None:
+        """Do a sub-task again, from where its target is now, if an attempt is left."""
+        if not self.executor.try_again(f"the {missed.target} is not where it should be"):
+            return
+        self._looks_left = LOOKS_AT_OUTCOME
+        poses = self.ranked[0].entry.key_poses
+        index = next(i for i, pose in enumerate(poses) if pose.sub_task == missed.sub_task)
+        self._update(self._anchors(index), hand)
+        self._begin(index, hand)
 
     def _begin_next_part(self, hand: Hand, look: Look) -> None:
         """Look at what the hand has left behind, and go on from there."""
@@ -201,6 +250,7 @@ class Row:
         self._refer()
         logger.info("%r: part %d of %d", self.instruction, self._part + 1, len(self._parts))
         self.executor.finish_part()
+        self._looks_left, self.succeeded = LOOKS_AT_OUTCOME, None
         self._plan(hand, look)
 
     def _try_again(self, hand: Hand, look: Look) -> None:
@@ -270,7 +320,7 @@ class Row:
         moved = self._see([*untouched, *(held - set(untouched))], hand, look)
         if self.status is Status.CAMERA_FAULT:
             return
-        if dropped := moved & held:
+        if dropped := {name for name in moved & held if self._is_left_behind(name, hand)}:
             logger.info("%r: dropped: %s", self.instruction, ", ".join(sorted(dropped)))
             index = self.executor.retry_index()
             self._update(self._anchors(index), hand)
@@ -304,14 +354,31 @@ class Row:
         for i in range(index_before, self.executor.index):
             passed, after = self.executor.plan[i].memory, self.executor.plan[i + 1].memory
             is_carried = passed.phase == "grasp" and after.phase not in ("open", "turn")
-            if is_carried or (after.phase == "push" and passed.phase != "push"):
+            # What is pushed a known way moves only once the hand has met it.
+            is_pushed = after.phase == "push" != passed.phase and self.executor.plan[i + 1].push is None
+            if is_carried or is_pushed:
                 self.tracker.hold(passed.anchor.place, hand.T_world_ee)
             elif passed.phase in ("release", "push"):
                 self.tracker.release(self.tracker.held, hand.T_world_ee)
             elif passed.phase in ("open", "turn"):
                 self._altered.add(passed.anchor.place)
+        target = self.executor.target
+        if target and target.push and self._beyond(target, target.push, hand) >= 0:
+            self.tracker.hold(target.push.target, hand.T_world_ee)
         if self.status is Status.DONE:
             self.tracker.release(self.tracker.held, hand.T_world_ee)
+
+    def _beyond(self, target: Target, push: PushWays, hand: Hand) -> float:
+        """Metres by which the hand has gone beyond where it meets what it pushes."""
+        place = self.tracker.poses(hand.T_world_ee)[push.target][:3, 3]
+        return push.beyond(hand.T_world_ee, target.T_world_ee, place)
+
+    def _is_left_behind(self, name: str, hand: Hand) -> bool:
+        """Whether an object that turned out to be elsewhere than in the hand does not go along with it."""
+        target = self.executor.target
+        if target is None or target.push is None or target.push.target != name:
+            return True
+        return self._beyond(target, target.push, hand) > LEFT_BEHIND_M
 
     def _anchors(self, index: int) -> list[str]:
         """Objects of the key poses from one on that look as they did in the demonstrations."""

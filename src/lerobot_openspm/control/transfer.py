@@ -29,6 +29,56 @@ SHAPE_SCALE_M = 0.1
 MIN_USABLE_SCORE = 1e-3
 
 
+# A way shorter than this has no direction that could be told from where the object is seen.
+LEAST_WAY_M = 0.005
+
+
+@dataclass(frozen=True)
+class PushWays:
+    """A push in the demonstration and here, each from where its target is to where it should end.
+
+    What is pushed moves the way that the hand moves, and ends before the hand. So the hand's place is kept
+    relative to the way: beside the target at its start, and beside the outcome at its end.
+
+    Attributes:
+        target: The object that is pushed.
+        shown: Start and end ``(2, 3)`` of the target in the demonstration, in the world.
+        now: Start and end ``(2, 3)`` of the target here.
+    """
+
+    target: str
+    shown: Array
+    now: Array
+
+    def position(self, pose: MemoryKeyPose, layout_shown: Mapping[str, Array]) -> Array:
+        """Where the hand goes ``(3,)`` for a key pose of the push."""
+        place = 0 if pose.anchor.place == self.target else 1
+        T_world_ee = pose.anchor.frame(layout_shown) @ pose.T_obj_ee
+        turn = _heading(self.now) - _heading(self.shown)
+        if min(_length(self.shown), _length(self.now)) < LEAST_WAY_M:
+            turn = 0.0
+        offset = T_world_ee[:3, 3] - self.shown[place]
+        position = self.now[place] + se3.apply(se3.from_yaw(np.zeros(3), turn), offset[None])[0]
+        # All of the way lies at one height, which is known best from what stands still.
+        position[2] = self.now[1, 2] + T_world_ee[2, 3] - self.shown[1, 2]
+        return position
+
+    def beyond(self, T_world_ee: Array, T_world_end: Array, target: Array) -> float:
+        """How far the hand has gone beyond where it meets its target, along the way, in metres.
+
+        Where it meets the target it leads, or follows, it by as much as it does at the end of the push.
+
+        Args:
+            T_world_ee: The hand ``(4, 4)``.
+            T_world_end: Where the push ends ``(4, 4)``.
+            target: Where the target is ``(3,)``.
+        """
+        way = (self.now[1] - self.now[0])[:2]
+        meeting = T_world_end[:3, 3] + target - self.now[1]
+        gone = float((T_world_ee[:3, 3] - meeting)[:2] @ way)
+        return gone / max(_length(self.now), LEAST_WAY_M)
+
+
 @dataclass(frozen=True)
 class Target:
     """A key pose in the present scene.
@@ -38,12 +88,14 @@ class Target:
         memory: The key pose it was carried over from.
         precise: Whether it is met by terminal residual correction, or only passed by.
         axis: The constraint that the way here follows, its direction in the world; None in free space.
+        push: The way of what is pushed on the way here; None where it is not known, or nothing is pushed.
     """
 
     T_world_ee: Array
     memory: MemoryKeyPose
     precise: bool
     axis: Axis | None = None
+    push: PushWays | None = None
 
 
 def transfer_pose(T_world_obj: Array, T_obj_ee: Array) -> Array:
@@ -68,12 +120,16 @@ def transfer(
     chosen: dict[str, Array] = {}
     targets: list[Target] = []
     before = T_world_ee
+    pushes = push_ways(entry, layout)
     for i, pose in enumerate(entry.key_poses):
         for name in pose.anchor.objects:
             if name not in chosen:
                 chosen[name] = _nearest_equivalent(name, pose, {**layout, **chosen}, yaw_periods, before)
         T_world_anchor = pose.anchor.frame(chosen)
         before = transfer_pose(T_world_anchor, pose.T_obj_ee)
+        ways = pushes.get(pose.sub_task)
+        if ways is not None:
+            before = se3.transform(before[:3, :3], ways.position(pose, entry.layout))
         after = entry.key_poses[i + 1] if i + 1 < len(entry.key_poses) else None
         # The arrival before the fingers move is where a grasp or a release is decided.
         precise = pose.phase in PRECISE_PHASES or (
@@ -82,10 +138,33 @@ def transfer(
         axis = pose.axis
         if axis is not None:
             axis = replace(axis, direction=T_world_anchor[:3, :3] @ axis.direction)
-        targets.append(Target(before, pose, precise, axis))
+        targets.append(Target(before, pose, precise, axis, ways if pose.phase == "push" else None))
     if targets and entry.key.sub_tasks[-1].operation == "put":
         targets += _release(targets)
     return tuple(targets) + _retreat(targets)
+
+
+def _heading(way: Array) -> float:
+    return float(np.arctan2(way[1, 1] - way[0, 1], way[1, 0] - way[0, 0]))
+
+
+def _length(way: Array) -> float:
+    return float(np.linalg.norm(way[1, :2] - way[0, :2]))
+
+
+def push_ways(entry: MemoryEntry, layout: Mapping[str, Array]) -> dict[int, PushWays]:
+    """The ways of an entry's pushes by sub-task, of those whose outcome is known."""
+    pushing = {pose.sub_task for pose in entry.key_poses if pose.phase == "push"}
+    ways: dict[int, PushWays] = {}
+    for outcome in entry.outcomes:
+        if outcome.sub_task not in pushing or any(
+            name not in where for name in outcome.objects for where in (entry.layout, layout)
+        ):
+            continue
+        shown = np.stack([entry.layout[outcome.target][:3, 3], outcome.place_shown(entry.layout)])
+        now = np.stack([layout[outcome.target][:3, 3], outcome.place(layout)])
+        ways[outcome.sub_task] = PushWays(outcome.target, shown, now)
+    return ways
 
 
 def _release(targets: Sequence[Target]) -> list[Target]:

@@ -68,15 +68,16 @@ def parts(entry: MemoryEntry) -> tuple[MemoryEntry, ...]:
         return (entry,)
     serves = _sub_tasks_of(entry)
     found: list[MemoryEntry] = []
-    for i, sub_task in enumerate(sub_tasks):
+    for i in range(len(sub_tasks)):
         own = [pose for pose, served in zip(entry.key_poses, serves, strict=True) if served == i]
-        part = _part(entry, sub_task, own)
+        part = _part(entry, i, own)
         if part is not None:
             found.append(part)
     return tuple(found)
 
 
-def _part(entry: MemoryEntry, sub_task: SubTask, own: Sequence[MemoryKeyPose]) -> MemoryEntry | None:
+def _part(entry: MemoryEntry, number: int, own: Sequence[MemoryKeyPose]) -> MemoryEntry | None:
+    sub_task = entry.key.sub_tasks[number]
     kept = tuple(
         replace(pose, sub_task=0)
         for pose in own
@@ -91,6 +92,7 @@ def _part(entry: MemoryEntry, sub_task: SubTask, own: Sequence[MemoryKeyPose]) -
         language=phrase(sub_task),
         key_poses=kept,
         layout={name: T for name, T in entry.layout.items() if name in sub_task.objects},
+        outcomes=tuple(replace(one, sub_task=0) for one in entry.outcomes if one.sub_task == number),
     )
 
 

@@ -160,6 +160,45 @@ class MemoryKeyPose:
 
 
 @dataclass(frozen=True)
+class Outcome:
+    """Where a sub-task leaves its target: what "done" means for it.
+
+    Attributes:
+        sub_task: Which of the entry's sub-tasks, counted from 0.
+        target: The object that was moved.
+        anchor: The frame in which the demonstrations agree most on where it ended.
+        position: Origin ``(3,)`` of the target in that frame, metres; what the demonstrations have in common.
+        shown: The same of this demonstration alone.
+        tolerance_m: The sub-task is done while the target is at most this far from there.
+    """
+
+    sub_task: int
+    target: str
+    anchor: Anchor
+    position: Array
+    shown: Array
+    tolerance_m: float
+
+    @property
+    def objects(self) -> tuple[str, ...]:
+        """The objects whose poses are needed to judge it."""
+        return tuple(dict.fromkeys((self.target, *self.anchor.objects)))
+
+    def place_shown(self, layout: Mapping[str, Array]) -> Array:
+        """Where the demonstration left the target ``(3,)`` in the world, given its objects' poses."""
+        return se3.apply(self.anchor.frame(layout), self.shown[None])[0]
+
+    def place(self, layout: Mapping[str, Array]) -> Array:
+        """Where the target should end ``(3,)`` in the world, given the objects' poses ``T_world_obj``."""
+        return se3.apply(self.anchor.frame(layout), self.position[None])[0]
+
+    def is_met(self, layout: Mapping[str, Array]) -> bool:
+        """Whether the target is where it should be, given the objects' poses ``T_world_obj``."""
+        off = np.linalg.norm(layout[self.target][:3, 3] - self.place(layout))
+        return bool(off <= self.tolerance_m)
+
+
+@dataclass(frozen=True)
 class MemoryEntry:
     """One demonstration, compressed.
 
@@ -174,6 +213,7 @@ class MemoryEntry:
         layout: Poses ``T_world_obj`` ``(4, 4)`` of the objects at the start of the demonstration.
         trials: How often the entry was acted by at deployment, where the outcome is known.
         successes: How many of these succeeded.
+        outcomes: Where the sub-tasks leave what they move, for those of which it is known.
     """
 
     key: RetrievalKey
@@ -185,6 +225,7 @@ class MemoryEntry:
     layout: dict[str, Array] = field(default_factory=dict[str, Array])
     trials: int = 0
     successes: int = 0
+    outcomes: tuple[Outcome, ...] = ()
 
     @property
     def objects(self) -> tuple[str, ...]:

@@ -18,6 +18,7 @@ from lerobot_openspm.memory.entry import (
     AxisKind,
     MemoryEntry,
     MemoryKeyPose,
+    Outcome,
     Reference,
     RetrievalKey,
     SubTask,
@@ -41,14 +42,18 @@ from lerobot_openspm.memory.robot import RobotModel
 from lerobot_openspm.memory.vocabulary import REFERENCES, RELATIONS, VERBS
 
 ENTRY = frozenset(
-    ("source", "language", "version", "quality", "trials", "successes", "key", "layout", "key_poses")
-)
+    (
+        "source", "language", "version", "quality", "trials", "successes", "key", "layout", "key_poses",
+        "outcomes",
+    )
+)  # fmt: skip
 KEY_POSE = frozenset(
     (
         "phase", "anchor", "T_obj_ee", "closed", "opening", "n_steps", "dwell", "confidence", "sub_task",
         "axis", "covariance",
     )
 )  # fmt: skip
+OUTCOME = frozenset(Outcome.__dataclass_fields__)
 SUB_TASK = frozenset(SubTask.__dataclass_fields__)
 # "center" is what the grammar has for "in the middle of"; a goal has none where nothing is moved anywhere.
 GOALS = (*RELATIONS, "center", "")
@@ -61,7 +66,7 @@ ROBOT = {
 
 def entry_to_fields(entry: MemoryEntry) -> dict[str, Any]:
     """The JSON form of an entry. Transforms are their first three rows; what is empty is left out."""
-    return {
+    fields: dict[str, Any] = {
         "source": entry.source,
         "language": entry.language,
         "version": entry.version,
@@ -74,6 +79,20 @@ def entry_to_fields(entry: MemoryEntry) -> dict[str, Any]:
         },
         "layout": {name: T[:3].tolist() for name, T in entry.layout.items()},
         "key_poses": [_key_pose_fields(pose) for pose in entry.key_poses],
+    }
+    if entry.outcomes:
+        fields["outcomes"] = [_outcome_fields(outcome) for outcome in entry.outcomes]
+    return fields
+
+
+def _outcome_fields(outcome: Outcome) -> dict[str, Any]:
+    return {
+        "sub_task": outcome.sub_task,
+        "target": outcome.target,
+        "anchor": {"place": outcome.anchor.place, "axes": outcome.anchor.axes},
+        "position": outcome.position.tolist(),
+        "shown": outcome.shown.tolist(),
+        "tolerance_m": outcome.tolerance_m,
     }
 
 
@@ -120,7 +139,9 @@ def entry_from_fields(fields: Any) -> MemoryEntry:
     poses = _transforms([row["T_obj_ee"] for row in rows], "T_obj_ee of the key poses")
     layout = dict(zip(named, _transforms(list(named.values()), "'layout'"), strict=True))
     key_poses = tuple(_key_pose(row, T, len(sub_tasks)) for row, T in zip(rows, poses, strict=True))
-    if unknown := {name for pose in key_poses for name in pose.anchor.objects} - set(layout):
+    outcomes = tuple(_outcome(row, len(sub_tasks)) for row in fields.get("outcomes", []))
+    needed = [pose.anchor.objects for pose in key_poses] + [outcome.objects for outcome in outcomes]
+    if unknown := {name for names in needed for name in names} - set(layout):
         raise ValueError(f"anchors {sorted(unknown)} are not in its layout {sorted(layout)}")
     phases = texts(key, "phases")
     if phases != tuple(pose.phase for pose in key_poses):
@@ -132,7 +153,7 @@ def entry_from_fields(fields: Any) -> MemoryEntry:
     return MemoryEntry(
         RetrievalKey(sub_tasks, phases), _instruction(fields), key_poses,
         number(fields, "quality", 0, 1), integer(fields, "version", 1), line(fields, "source"), layout,
-        trials, successes,
+        trials, successes, outcomes,
     )  # fmt: skip
 
 
@@ -163,15 +184,12 @@ def _reference(fields: Any) -> Reference | None:
 
 
 def _key_pose(fields: Fields, T_obj_ee: Array, n_sub_tasks: int) -> MemoryKeyPose:
-    phase, sub_task = text(fields, "phase"), integer(fields, "sub_task")
+    phase = text(fields, "phase")
     if phase not in PHASES:
         raise ValueError(f"phase is {phase!r}, expected one of {PHASES}")
-    if sub_task >= n_sub_tasks:
-        raise ValueError(f"'sub_task' is {sub_task}, but the entry has {n_sub_tasks} sub-tasks from 0 on")
-    anchor = known(fields["anchor"], frozenset(("place", "axes")), "'anchor'")
     axis, covariance = fields.get("axis"), fields.get("covariance")
     return MemoryKeyPose(
-        Anchor(text(anchor, "place"), text(anchor, "axes")),
+        _anchor(fields),
         T_obj_ee,
         phase,
         number(fields, "confidence", 0, 1),
@@ -180,8 +198,31 @@ def _key_pose(fields: Fields, T_obj_ee: Array, n_sub_tasks: int) -> MemoryKeyPos
         integer(fields, "n_steps"),
         flag(fields, "dwell"),
         None if axis is None else _axis(axis),
-        sub_task,
+        _sub_task_number(fields, n_sub_tasks),
         None if covariance is None else _covariance(covariance),
+    )
+
+
+def _anchor(fields: Fields) -> Anchor:
+    anchor = known(fields["anchor"], frozenset(("place", "axes")), "'anchor'")
+    return Anchor(text(anchor, "place"), text(anchor, "axes"))
+
+
+def _sub_task_number(fields: Fields, n_sub_tasks: int) -> int:
+    if (sub_task := integer(fields, "sub_task")) >= n_sub_tasks:
+        raise ValueError(f"'sub_task' is {sub_task}, but the entry has {n_sub_tasks} sub-tasks from 0 on")
+    return sub_task
+
+
+def _outcome(fields: Any, n_sub_tasks: int) -> Outcome:
+    fields = known(fields, OUTCOME, "an outcome")
+    return Outcome(
+        _sub_task_number(fields, n_sub_tasks),
+        line(fields, "target"),
+        _anchor(fields),
+        numbers(fields["position"], (3,), "the outcome's 'position'"),
+        numbers(fields["shown"], (3,), "the outcome's 'shown'"),
+        number(fields, "tolerance_m", 0),
     )
 
 

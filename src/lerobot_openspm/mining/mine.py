@@ -31,6 +31,7 @@ from lerobot_openspm.mining.anchors import (
 from lerobot_openspm.mining.axes import constrained_axes
 from lerobot_openspm.mining.dataset import Demonstrations
 from lerobot_openspm.mining.key_poses import KeyPose, find_key_poses
+from lerobot_openspm.mining.outcomes import carried_to, outcomes
 from lerobot_openspm.mining.signals import Episode
 from lerobot_openspm.perception.learning import Shape, learn_objects
 from lerobot_openspm.perception.localise import localise_all
@@ -39,6 +40,9 @@ from lerobot_openspm.perception.object_shape import ShapeBackend
 from lerobot_openspm.perception.types import Hint, PoseEstimate, Scene, Segmenter
 
 logger = logging.getLogger(__name__)
+
+# Least confidence at which a pushed object is believed to be where it is seen in the end.
+SURE = 0.8
 
 
 @dataclass(frozen=True)
@@ -115,10 +119,17 @@ def learn_scenes(
 
 @dataclass(frozen=True)
 class LearnedObjects:
-    """Object models by name, and per scene the poses ``T_world_obj`` of the objects found in it."""
+    """Object models by name, and poses ``T_world_obj`` ``(4, 4)`` of the objects found in each scene.
+
+    Attributes:
+        models: The objects.
+        layouts: Per scene, where they stood in its first frame.
+        ends: Per scene, where those that were moved ended.
+    """
 
     models: dict[str, KnownObject]
     layouts: list[dict[str, Array]]
+    ends: list[dict[str, Array]]
 
 
 def layouts_in_scenes(
@@ -149,14 +160,33 @@ def layouts_in_scenes(
         models |= learned
         if missing := [name for name in named if name not in learned]:
             logger.warning("could not learn what %s looks like; no key pose will be anchored there", missing)
-    layouts = []
+    layouts, ends = [], []
     for scene, item in tqdm(zip(scenes, mined, strict=True), "Finding objects", len(scenes), unit="episode"):
         wanted = dict.fromkeys(name for sub_task in item.sub_tasks for name in sub_task.objects)
         sought = {name: models[name] for name in wanted if name in models}
         estimates = localise_all(scene.views, sought, segmenter)
         places = {name: _place(name, estimate, scene.hints) for name, estimate in estimates.items()}
         layouts.append({name: T for name, T in places.items() if T is not None})
-    return LearnedObjects(models, layouts)
+        ends.append(_ends(scene, item, layouts[-1], models, segmenter))
+    return LearnedObjects(models, layouts, ends)
+
+
+def _ends(
+    scene: Scene,
+    item: MinedEpisode,
+    layout: Mapping[str, Array],
+    models: Mapping[str, KnownObject],
+    segmenter: Segmenter | None,
+) -> dict[str, Array]:
+    """Where an episode leaves what it moves: the carried by the hand's path, the pushed by the images."""
+    carried = carried_to(Demonstration(item.key_poses, layout), item.sub_tasks)
+    pushed = {sub_task_of(p, item.sub_tasks).target for p in item.key_poses if p.phase == "push"}
+    sought = {name: models[name] for name in sorted(pushed) if name in models}
+    if not sought or scene.later_views is None:
+        return carried
+    seen = localise_all(scene.later_views, sought, segmenter)
+    sure = {k: e.T_world_obj for k, e in seen.items() if e.status == "found" and e.confidence >= SURE}
+    return {**carried, **sure}
 
 
 def _place(name: str, estimate: PoseEstimate, touched: Sequence[Hint]) -> Array | None:
@@ -232,6 +262,7 @@ def _carried_off(key_poses: Sequence[KeyPose]) -> int | None:
 def build_entries(
     mined: Sequence[MinedEpisode],
     layouts: Sequence[Mapping[str, Array]],
+    ends: Sequence[Mapping[str, Array]],
     yaw_periods: Mapping[str, float],
     source: str,
 ) -> tuple[MemoryEntry, ...]:
@@ -244,8 +275,11 @@ def build_entries(
         sub_tasks = mined[members[0]].sub_tasks
         group = align_symmetric([Demonstration(mined[i].key_poses, layouts[i]) for i in members], yaw_periods)
         anchors = consensus(group, sub_tasks)
-        judged = zip(members, group, constrained_axes(group, anchors), qualities(group, anchors), strict=True)
-        for i, demonstration, axes, quality in judged:
+        ended = outcomes(group, [ends[i] for i in members], sub_tasks)
+        judged = zip(
+            members, group, constrained_axes(group, anchors), qualities(group, anchors), ended, strict=True
+        )
+        for i, demonstration, axes, quality, shown in judged:
             key_poses = _remember(demonstration, anchors, axes, len(sub_tasks))
             if key_poses is None:
                 logger.warning(
@@ -259,7 +293,10 @@ def build_entries(
                 for name, T in demonstration.layout.items()
                 if any(name in s.objects for s in sub_tasks)
             }
-            entries.append(MemoryEntry(key, mined[i].episode.task, key_poses, quality, 1, where, layout))
+            known = tuple(one for one in shown if all(name in layout for name in one.objects))
+            entries.append(
+                MemoryEntry(key, mined[i].episode.task, key_poses, quality, 1, where, layout, outcomes=known)
+            )
     return tuple(entries)
 
 

@@ -1,0 +1,96 @@
+"""Outcomes by consensus: where, relative to what, do the demonstrations of a task leave its targets?"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from lerobot_openspm.geometry import se3
+from lerobot_openspm.geometry.se3 import Array
+from lerobot_openspm.memory.entry import WORLD, Anchor, Outcome, SubTask
+from lerobot_openspm.mining.anchors import Demonstration, sub_task_of
+
+# How exactly an object is found again where it was put: what deviates by less is no miss.
+FOUND_AGAIN_M = 0.010
+# Nor is this, however well the demonstrations agree.
+LEAST_TOLERANCE_M = 0.020
+# Demonstrations that leave the target further apart than this say nothing about where it belongs.
+MOST_SPREAD_M = 0.050
+
+
+def carried_to(demonstration: Demonstration, sub_tasks: Sequence[SubTask]) -> dict[str, Array]:
+    """Where the hand put what it carried, as if held rigidly: ``T_world_obj`` ``(4, 4)`` by name.
+
+    Needs no image, so it is also known of demonstrations that end with the hand around the object. An object
+    that was carried twice is where it was put last.
+    """
+    poses = dict(demonstration.layout)
+    carried: dict[str, Array] = {}
+    T_ee_obj: tuple[str, Array] | None = None
+    for pose in demonstration.key_poses:
+        target = sub_task_of(pose, sub_tasks).target
+        if pose.phase == "grasp" and target in poses:
+            T_ee_obj = target, se3.inverse(pose.T_world_ee) @ poses[target]
+        elif pose.phase == "place" and T_ee_obj is not None and T_ee_obj[0] == target:
+            carried[target] = poses[target] = pose.T_world_ee @ T_ee_obj[1]
+        elif pose.phase == "release":
+            T_ee_obj = None
+    return carried
+
+
+def outcomes(
+    demonstrations: Sequence[Demonstration],
+    ends: Sequence[Mapping[str, Array]],
+    sub_tasks: Sequence[SubTask],
+) -> list[tuple[Outcome, ...]]:
+    """What the demonstrations of one task have in common about where its targets end.
+
+    Args:
+        demonstrations: The demonstrations, with their objects' poses at the start.
+        ends: For each, poses ``T_world_obj`` ``(4, 4)`` at its end of the objects that were moved and found.
+        sub_tasks: What the instruction asks for.
+
+    Returns:
+        For each demonstration, one for every sub-task that names a landmark and of which enough is known.
+    """
+    found: list[list[Outcome]] = [[] for _ in demonstrations]
+    for i, sub_task in enumerate(sub_tasks):
+        # A target that a later sub-task moves on ends where that one leaves it.
+        moved_on = any(later.target == sub_task.target for later in sub_tasks[i + 1 :])
+        if sub_task.landmark and sub_task.landmark != sub_task.target and not moved_on:
+            for n, outcome in _outcomes(i, sub_task, demonstrations, ends).items():
+                found[n].append(outcome)
+    return [tuple(one) for one in found]
+
+
+def _outcomes(
+    number: int,
+    sub_task: SubTask,
+    demonstrations: Sequence[Demonstration],
+    ends: Sequence[Mapping[str, Array]],
+) -> dict[int, Outcome]:
+    """The outcome of one sub-task by demonstration; none where too few show it, or they disagree."""
+    layouts = [{**one.layout, **end} for one, end in zip(demonstrations, ends, strict=True)]
+    known = [
+        i
+        for i, (end, layout) in enumerate(zip(ends, layouts, strict=True))
+        if sub_task.target in end and sub_task.landmark in layout
+    ]
+    if not known or 2 * len(known) < len(demonstrations):
+        return {}
+    places = np.stack([ends[i][sub_task.target][:3, 3] for i in known])
+    choices = []
+    for anchor in (Anchor(sub_task.landmark, sub_task.landmark), Anchor(sub_task.landmark, WORLD)):
+        T_anchor_world = se3.inverse(np.stack([anchor.frame(layouts[i]) for i in known]))
+        shown = se3.apply(T_anchor_world, places[:, None])[:, 0]
+        middle = np.median(shown, axis=0)
+        choices.append((float(np.linalg.norm(shown - middle, axis=-1).max()), anchor, middle, shown))
+    spread, anchor, middle, shown = min(choices, key=lambda choice: choice[0])
+    if spread > MOST_SPREAD_M:
+        return {}
+    tolerance_m = max(LEAST_TOLERANCE_M, spread + FOUND_AGAIN_M)
+    return {
+        i: Outcome(number, sub_task.target, anchor, middle, own, tolerance_m)
+        for i, own in zip(known, shown, strict=True)
+    }

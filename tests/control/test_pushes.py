@@ -1,0 +1,200 @@
+"""Pushes are carried over along their way: from where the target is to where it should end."""
+
+import numpy as np
+from hypothesis import given
+from hypothesis import strategies as st
+from numpy.testing import assert_allclose
+from tests.control.test_row import HAND, Eyes, row, shifted, watch
+from tests.memory.builders import entry, hand_pose, key_pose, robot
+
+from lerobot_openspm.control.executor import ControlSettings, Executor, Hand, Status
+from lerobot_openspm.control.row import LEFT_BEHIND_M
+from lerobot_openspm.control.transfer import Target, transfer
+from lerobot_openspm.geometry import se3
+from lerobot_openspm.memory.entry import Anchor, Outcome
+from lerobot_openspm.perception.tracker import TrackStatus
+
+INSTRUCTION = "push the plate to the front of the stove"
+LAYOUT = {"plate": se3.from_yaw([0.3, 0.1, 0.0], 0.0), "stove": se3.from_yaw([-0.1, 0.0, 0.0], 0.0)}
+GOAL = np.array([0.22, 0.0, 0.0])
+# The hand leads the plate by this much: it drags it by its rim.
+LEAD_M = 0.07
+
+
+def push(goal=GOAL, shown=GOAL):
+    """A plate that is dragged from where it stands to a place before the stove."""
+    start, end = LAYOUT["plate"][:3, 3], se3.apply(LAYOUT["stove"], shown[None])[0]
+    way = (end - start) / np.linalg.norm(end - start)
+    inside, done = start + 0.03 * way, end + LEAD_M * way
+
+    def at(name, point, z):
+        T_world_ee = hand_pose(point[0], point[1], z)
+        return se3.inverse(LAYOUT[name]) @ T_world_ee
+
+    poses = (
+        key_pose("plate", at("plate", inside, 0.1), "approach", closed=True),
+        key_pose("plate", at("plate", inside, 0.02), "approach", closed=True),
+        key_pose("stove", at("stove", done, 0.02), "push", closed=True),
+        key_pose("stove", at("stove", done, 0.12), "retreat", closed=True),
+    )
+    outcome = Outcome(0, "plate", Anchor("stove", "stove"), goal, shown, 0.02)
+    return entry(INSTRUCTION, poses, LAYOUT, outcomes=(outcome,))
+
+
+def ends(memory, layout):
+    """Where the hand enters the plate and where it stops pushing, (3,) each."""
+    targets = transfer(memory, layout, {}, HAND.T_world_ee)
+    return targets[1].T_world_ee[:3, 3], targets[2].T_world_ee[:3, 3]
+
+
+def test_in_the_demonstrated_scene_the_hand_does_what_was_demonstrated():
+    memory = push()
+    for target, pose in zip(transfer(memory, LAYOUT, {}, HAND.T_world_ee), memory.key_poses, strict=True):
+        assert_allclose(target.T_world_ee, pose.anchor.frame(LAYOUT) @ pose.T_obj_ee, atol=1e-12)
+
+
+@given(st.floats(-0.3, 0.3), st.floats(-0.3, 0.3), st.floats(-0.3, 0.3))
+def test_from_wherever_the_plate_stands_the_hand_leads_it_to_its_place(x, y, yaw):
+    layout = {
+        "plate": se3.from_yaw([0.4 + x, y, 0.0], 2.0),
+        "stove": LAYOUT["stove"] @ se3.from_yaw([0.0, 0.0, 0.0], yaw),
+    }
+    goal = se3.apply(layout["stove"], GOAL[None])[0]
+    way = (goal - layout["plate"][:3, 3])[:2]
+    if np.linalg.norm(way) < 0.01:
+        return
+    inside, done = ends(push(), layout)
+    lead = way / np.linalg.norm(way)
+    assert_allclose(inside[:2], layout["plate"][:2, 3] + 0.03 * lead, atol=1e-9)
+    assert_allclose(done[:2], goal[:2] + LEAD_M * lead, atol=1e-9)
+
+
+def test_the_height_of_a_push_is_that_of_what_stands_still():
+    layout = {**LAYOUT, "plate": se3.from_yaw([0.3, 0.1, 0.006], 0.0)}
+    inside, done = ends(push(), layout)
+    assert_allclose([inside[2], done[2]], 0.02, atol=1e-12)
+
+
+def test_a_demonstration_that_stopped_short_is_pushed_to_where_the_others_end():
+    short = GOAL + np.array([0.015, 0.0, 0.0])
+    _, done = ends(push(GOAL, short), LAYOUT)
+    _, expected = ends(push(), LAYOUT)
+    assert_allclose(done, expected, atol=1e-3)
+
+
+def test_a_plate_that_is_almost_there_is_not_turned_about():
+    memory, goal = push(), se3.apply(LAYOUT["stove"], GOAL[None])[0]
+    layout = {**LAYOUT, "plate": se3.from_yaw(goal + np.array([0.001, -0.001, 0.0]), 0.0)}
+    inside, _ = ends(memory, layout)
+    shown, _ = ends(memory, LAYOUT)
+    assert_allclose(inside - layout["plate"][:3, 3], shown - LAYOUT["plate"][:3, 3], atol=1e-9)
+
+
+def test_a_push_without_a_known_outcome_ends_where_the_demonstration_did():
+    memory = push()
+    unknown = entry(INSTRUCTION, memory.key_poses, LAYOUT)
+    layout = {**LAYOUT, "plate": se3.from_yaw([0.3, -0.2, 0.0], 0.0)}
+    _, done = ends(unknown, layout)
+    assert_allclose(done, ends(memory, LAYOUT)[1], atol=1e-12)
+
+
+def test_a_hand_that_strays_while_it_pushes_is_led_back_to_its_way():
+    executor = Executor(ControlSettings(), robot())
+    memory = push().key_poses[2]
+    start, end = hand_pose(0.3, 0.0, 0.02), hand_pose(0.1, 0.0, 0.02)
+    executor.begin([Target(end, memory, precise=True)], Hand(start, 0.0))
+    strayed = Hand(hand_pose(0.2, 0.004, 0.028), 0.0)
+    executor.push_chunk(np.tile([-0.5, 0.3, 0.3, 0, 0, 0.1, 1.0], (5, 1)))
+    action = executor.next_action(strayed)
+    assert action[0] == -0.5, "along the way the flow model decides"
+    assert action[1] < 0
+    assert action[2] < 0
+    assert_allclose(action[3:], [0, 0, 0.1, 1.0])
+
+
+def pushing(one, eyes, ahead_m):
+    """The hand during a push, so far ahead of where it entered the plate."""
+    one.observe(HAND, eyes)
+    one.executor.begin(one.executor.plan, HAND, 1)
+    inside = one.executor.plan[1].T_world_ee
+    one.observe(Hand(inside, 0.0), eyes)
+    assert one.executor.target.memory.phase == "push"
+    way = one.executor.target.T_world_ee[:3, 3] - inside[:3, 3]
+    T = inside.copy()
+    T[:3, 3] += ahead_m * way / np.linalg.norm(way)
+    return Hand(T, 0.0)
+
+
+def test_the_plate_goes_along_from_where_the_hand_meets_its_rim():
+    eyes, one = Eyes(LAYOUT), row(push(), instruction=INSTRUCTION)
+    hand = pushing(one, eyes, 0.5 * (LEAD_M - 0.03))
+    watch(one, eyes, hand, 1)
+    assert one.tracker.held == frozenset()
+    hand = pushing(one, eyes, LEAD_M - 0.03 + 0.001)
+    watch(one, eyes, hand, 1)
+    assert one.tracker.held == {"plate"}
+
+
+def test_a_plate_that_slides_under_the_hand_is_pushed_on_and_one_left_behind_is_fetched():
+    for behind, is_fetched in ((0.4 * LEFT_BEHIND_M, False), (3 * LEFT_BEHIND_M, True)):
+        eyes, one = Eyes(LAYOUT), row(push(), instruction=INSTRUCTION)
+        hand = pushing(one, eyes, LEAD_M - 0.03 + 0.1)
+        watch(one, eyes, hand, 1)
+        met = hand.T_world_ee[:3, 3].copy()
+        way = se3.apply(LAYOUT["stove"], GOAL[None])[0] - LAYOUT["plate"][:3, 3]
+        way /= np.linalg.norm(way)
+        eyes.layout["plate"] = se3.from_yaw([*(met - (LEAD_M + behind) * way)[:2], 0.0], 0.0)
+        watch(one, eyes, hand, 20)
+        assert one.status is Status.RUNNING
+        assert (one.executor.index < 2) is is_fetched, behind
+
+
+def done(one, eyes, end):
+    """The push, finished, with the plate where it is told, looked at once."""
+    one.observe(HAND, eyes)
+    last = one.executor.plan[-1]
+    eyes.layout["plate"] = end
+    one.tracker.forget(["plate"])
+    one.executor.begin(one.executor.plan, HAND, len(one.executor.plan) - 1)
+    hand = Hand(last.T_world_ee, 0.0)
+    watch(one, eyes, hand, 1)
+    return hand
+
+
+def test_a_plate_in_its_place_is_a_success():
+    eyes, one = Eyes(LAYOUT), row(push(), instruction=INSTRUCTION)
+    goal = se3.from_yaw(se3.apply(LAYOUT["stove"], GOAL[None])[0], 0.0)
+    done(one, eyes, goal)
+    assert one.status is Status.DONE
+    assert one.succeeded is True
+
+
+def test_a_plate_that_stopped_short_is_pushed_on_until_attempts_are_used_up():
+    eyes, one = Eyes(LAYOUT), row(push(), instruction=INSTRUCTION)
+    goal = se3.from_yaw(se3.apply(LAYOUT["stove"], GOAL[None])[0], 0.0)
+    hand = done(one, eyes, shifted(goal, 0.05))
+    for attempt in range(1, ControlSettings().max_attempts + 1):
+        assert one.status is Status.RUNNING
+        assert one.executor.attempts == attempt
+        assert one.executor.index == 0
+        inside = one.executor.plan[1].T_world_ee[:3, 3]
+        assert_allclose(inside[:2], goal[:2, 3] + [0.05 - 0.03, 0.0], atol=2e-3)
+        one.executor.begin(one.executor.plan, HAND, 3)
+        hand = Hand(one.executor.plan[-1].T_world_ee, 0.0)
+        watch(one, eyes, hand, 10)
+    assert one.status is Status.NO_PROGRESS
+    assert one.succeeded is False
+
+
+def test_what_cannot_be_seen_in_the_end_is_done_and_not_known():
+    eyes, one = Eyes(LAYOUT), row(push(), instruction=INSTRUCTION)
+    one.observe(HAND, eyes)
+    one.executor.begin(one.executor.plan, HAND, 3)
+    eyes.visible = 0.0
+    watch(one, eyes, Hand(one.executor.plan[-1].T_world_ee, 0.0), 40)
+    assert one.status is Status.DONE
+    assert one.succeeded is None
+    assert one.tracker.status("plate") is TrackStatus.HIDDEN
+    asked = len(eyes.asked)
+    watch(one, eyes, Hand(one.executor.plan[-1].T_world_ee, 0.0), 40)
+    assert len(eyes.asked) == asked, "it is not looked for on and on"

@@ -1,0 +1,92 @@
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+from tests.mining.test_anchors import SUB_TASKS, demonstrations
+
+from lerobot_openspm.geometry import se3
+from lerobot_openspm.memory.entry import WORLD
+from lerobot_openspm.memory.instruction import parse_instruction
+from lerobot_openspm.mining.anchors import Demonstration
+from lerobot_openspm.mining.outcomes import LEAST_TOLERANCE_M, MOST_SPREAD_M, carried_to, outcomes
+
+PUSH = parse_instruction("push the plate to the front of the stove")
+
+
+def ends(shown, sub_tasks=SUB_TASKS):
+    return [carried_to(one, sub_tasks) for one in shown]
+
+
+def pushed(n, error_m=0.0, turned=0.0, seed=0):
+    """Plates that are pushed to one place before the stove, wherever and however turned that stands."""
+    rng, shown, ended = np.random.default_rng(seed), [], []
+    for _ in range(n):
+        stove = se3.from_yaw([*rng.uniform(-0.2, 0.2, 2), 0.0], rng.uniform(-turned, turned))
+        plate = se3.from_yaw([0.4, rng.uniform(-0.2, 0.2), 0.0], 0.0)
+        shown.append(Demonstration((), {"plate": plate, "stove": stove}))
+        goal = se3.apply(stove, np.array([[0.22, 0.0, 0.0]]))[0] + error_m * rng.uniform(-1, 1, 3)
+        ended.append({"plate": se3.from_yaw(goal, 0.0)})
+    return shown, ended
+
+
+def test_what_is_carried_ends_where_the_hand_lets_it_go():
+    (shown,) = demonstrations(1)
+    grasp, place = shown.key_poses
+    expected = place.T_world_ee @ se3.inverse(grasp.T_world_ee) @ shown.layout["bowl"]
+    assert_allclose(carried_to(shown, SUB_TASKS)["bowl"], expected, atol=1e-12)
+
+
+def test_what_was_not_seen_at_the_start_has_no_end():
+    (shown,) = demonstrations(1)
+    unseen = Demonstration(shown.key_poses, {"plate": shown.layout["plate"]})
+    assert carried_to(unseen, SUB_TASKS) == {}
+
+
+@pytest.mark.parametrize("n", [1, 3, 10])
+def test_the_outcome_is_where_the_demonstrations_leave_the_target(n):
+    shown, ended = pushed(n, error_m=0.005, turned=1.0)
+    found = outcomes(shown, ended, PUSH)
+    assert len(found) == n
+    for demonstration, end, (outcome,) in zip(shown, ended, found, strict=True):
+        assert outcome.target == "plate"
+        assert outcome.anchor.place == "stove"
+        assert_allclose(outcome.position, [0.22, 0, 0], atol=0.01)
+        layout = {**demonstration.layout, **end}
+        assert_allclose(outcome.place_shown(layout), end["plate"][:3, 3], atol=1e-12)
+        assert outcome.is_met(layout)
+
+
+def test_axes_are_those_in_which_the_demonstrations_agree():
+    shown, ended = pushed(8, turned=1.0)
+    assert all(outcome.anchor.axes == "stove" for (outcome,) in outcomes(shown, ended, PUSH))
+    rng = np.random.default_rng(1)
+    for one, end in zip(shown, ended, strict=True):
+        one.layout["stove"][:3, :3] = se3.from_yaw(np.zeros(3), rng.uniform(-1, 1))[:3, :3]
+        end["plate"][:3, 3] = one.layout["stove"][:3, 3] + [0.22, 0, 0]
+    assert all(outcome.anchor.axes == WORLD for (outcome,) in outcomes(shown, ended, PUSH))
+
+
+def test_an_object_beside_its_place_misses_the_outcome():
+    shown, ended = pushed(5)
+    outcome = outcomes(shown, ended, PUSH)[0][0]
+    assert outcome.tolerance_m == LEAST_TOLERANCE_M
+    layout = {**shown[0].layout, **ended[0]}
+    for off, is_met in ((0.9, True), (1.1, False)):
+        place = se3.from_yaw(ended[0]["plate"][:3, 3] + [off * LEAST_TOLERANCE_M, 0, 0], 0.0)
+        assert outcome.is_met({**layout, "plate": place}) is is_met
+
+
+def test_demonstrations_that_disagree_tell_no_outcome():
+    shown, ended = pushed(5, error_m=4 * MOST_SPREAD_M)
+    assert outcomes(shown, ended, PUSH) == [()] * 5
+
+
+def test_an_outcome_that_hardly_any_demonstration_shows_is_not_known():
+    shown, ended = pushed(5)
+    assert outcomes(shown, [*ended[:2], {}, {}, {}], PUSH) == [()] * 5
+    assert [len(one) for one in outcomes(shown, [*ended[:3], {}, {}], PUSH)] == [1, 1, 1, 0, 0]
+
+
+def test_a_target_that_is_moved_on_has_one_outcome_the_last():
+    twice = (*SUB_TASKS, *SUB_TASKS)
+    shown = demonstrations(3)
+    assert all([one.sub_task for one in found] == [1] for found in outcomes(shown, ends(shown), twice))
