@@ -103,7 +103,12 @@ class OpenSPMPolicy(PreTrainedPolicy):
         self._eyes: list[Eyes] = []
         self._rated: list[Row] = []
 
-    def report_outcomes(self, successes: Sequence[bool | None]) -> None:
+    @property
+    def outcomes(self) -> list[bool | None]:
+        """Whether each running episode is seen to have done what was asked; None where that is not known."""
+        return [row.succeeded for row in self.rows]
+
+    def report_outcomes(self, successes: Sequence[bool | None] | None = None) -> None:
         """Tell how the running episodes ended, before the next :meth:`reset`; the memory learns from it.
 
         The quality of the entries that each episode was acted by follows, for the episodes to come and in
@@ -111,11 +116,13 @@ class OpenSPMPolicy(PreTrainedPolicy):
 
         Args:
             successes: For every environment, in the order of the observations, whether its episode succeeded;
-                None where that is not known.
+                None where that is not known. Without it what the policy has seen itself counts:
+                :attr:`outcomes`.
 
         Raises:
             OpenSPMError: There are more or fewer environments.
         """
+        successes = self.outcomes if successes is None else successes
         if len(successes) != len(self.rows):
             raise OpenSPMError(
                 f"got {len(successes)} outcomes, but {len(self.rows)} episodes are running; report one for "

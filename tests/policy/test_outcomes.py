@@ -41,6 +41,20 @@ def test_outcomes_change_the_entries_that_were_acted_by_and_are_saved(
     assert saved == expected
 
 
+def test_without_a_word_from_outside_what_the_policy_saw_itself_counts(
+    policy: OpenSPMPolicy, recorded: list[list[Frame]]
+):
+    policy.select_action(batch_of([recorded[0][0], recorded[3][0], recorded[4][0]]))
+    assert policy.outcomes == [None, None, None]
+    policy.report_outcomes()
+    assert trials(policy) == {}
+    seen, missed = (policy.rows[i].used_entries[0].source for i in (0, 1))
+    policy.rows[0].succeeded, policy.rows[1].succeeded = True, False
+    assert policy.outcomes == [True, False, None]
+    policy.report_outcomes()
+    assert trials(policy) == {seen: (1, 1), missed: (1, 0)}
+
+
 def test_the_next_episodes_choose_by_what_was_learned(policy: OpenSPMPolicy, recorded: list[list[Frame]]):
     frame = batch_of([recorded[0][0]])
     chosen = []

@@ -93,6 +93,7 @@ class Executor:
         self.index = 0
         self.attempts = 0
         self.corrections = 0
+        self.travelled = 0.0  # how far a drawer or a knob has followed the hand, metres or radians
         self.replans = 0  # chunks asked for so far; seeds the noise of each
         self._steps = 0
         self._late_steps = 0
@@ -134,8 +135,10 @@ class Executor:
             pose could not be met, and an attempt is left.
         """
         while self.status is Status.RUNNING:
-            if self._lost_grip(hand):
+            if self.has_lost_grip(hand):
                 return self.try_again("the fingers hold nothing")
+            if (axis := self.plan[self.index].axis) is not None:
+                self.travelled = max(self.travelled, axis.travel(self._start, hand.T_world_ee))
             if not self._finished(hand):
                 break
             if self.index + 1 == len(self.plan):
@@ -255,6 +258,7 @@ class Executor:
         self._start = self._here(hand)
         self.index, self._steps, self._late_steps, self.corrections = index, 0, 0, 0
         self._left, self._blocked = np.inf, False
+        self.travelled = 0.0
         self._queue.clear()
         target = self.plan[index]
         if target.axis is not None:
@@ -285,7 +289,7 @@ class Executor:
             return share <= 1 or (self._blocked and share <= BLOCKED_SHARE)
         return bool(metres <= settings.passing_m and radians <= settings.passing_rad)
 
-    def _lost_grip(self, hand: Hand) -> bool:
+    def has_lost_grip(self, hand: Hand) -> bool:
         """Whether the fingers closed further than the demonstration's did around the object."""
         if self._settings.execution != "closed_loop_trc" or self.index == 0:
             return False
@@ -298,6 +302,13 @@ class Executor:
         if grasped.opening < HOLDING_SHARE * self._robot.open_width:
             return False
         return hand.opening < HELD_SHARE * grasped.opening
+
+    def has_followed_axes(self) -> bool:
+        """Whether there were handles to lead, all were led to the end, and the fingers felt each of them."""
+        ends = [i for i, target in enumerate(self.plan) if target.axis is not None]
+        held = self._robot.open_width * HOLDING_SHARE
+        # A key pose of an axis was met by the hand; fingers that lose what they hold are noticed on the way.
+        return bool(ends) and all(i > 0 and self.plan[i - 1].memory.opening >= held for i in ends)
 
     def try_again(self, why: str) -> bool:
         """Count another attempt at the present key pose; without one left there is no progress."""

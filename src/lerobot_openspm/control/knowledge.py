@@ -85,10 +85,14 @@ class Knowledge:
         return retrieve(scored, score, self.weights)
 
     def transfer(
-        self, entry: MemoryEntry, layout: Mapping[str, Array], T_world_ee: Array
+        self,
+        entry: MemoryEntry,
+        layout: Mapping[str, Array],
+        T_world_ee: Array,
+        gone: Mapping[int, float] | None = None,
     ) -> tuple[Target, ...]:
         """An entry's key poses in a scene, see :func:`transfer`."""
-        return transfer(entry, layout, self.yaw_periods, T_world_ee)
+        return transfer(entry, layout, self.yaw_periods, T_world_ee, gone)
 
     def problems(self, entry: MemoryEntry, layout: Mapping[str, Array], T_world_ee: Array) -> list[str]:
         """What keeps the hand from following an entry in a scene, in words."""

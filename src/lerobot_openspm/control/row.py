@@ -97,6 +97,7 @@ class Row:
         self._used: list[MemoryEntry] = []
         self._referents = Referents()
         self._altered: set[str] = set()  # opened or turned: looks different now, and stands still
+        self._gone: dict[int, float] = {}  # how far drawers and knobs are on their way, by sub-task
         self._start_height = np.inf
         self._step = -1
         # Both at least one step; four looks a second whatever the robot's rate.
@@ -221,6 +222,7 @@ class Row:
         expected = self.ranked[0].entry.outcomes
         names = dict.fromkeys(name for one in expected for name in one.objects)
         if not names:
+            self.succeeded = self.executor.has_followed_axes() or None
             return ()
         self._looks_left -= 1
         self._see([name for name in names if name not in self._altered], hand, look)
@@ -251,11 +253,12 @@ class Row:
         logger.info("%r: part %d of %d", self.instruction, self._part + 1, len(self._parts))
         self.executor.finish_part()
         self._looks_left, self.succeeded = LOOKS_AT_OUTCOME, None
+        self._gone.clear()
         self._plan(hand, look)
 
     def _try_again(self, hand: Hand, look: Look) -> None:
-        """Find the objects of the remaining key poses again and go back to the approach of this contact."""
-        index = self.executor.retry_index()
+        """Find the objects of the remaining key poses again and go back to where this contact begins."""
+        index = self._retry_index(hand)
         self._planned_from = hand.T_world_ee
         if self._knowledge.tracking:
             # What should be in the hand is not, or what was to be met is not there: it may be anywhere.
@@ -267,6 +270,17 @@ class Row:
             self._update(ahead, hand)
         if self.status is Status.RUNNING:
             self._begin(index, hand)
+
+    def _retry_index(self, hand: Hand) -> int:
+        """Where to go back to: the approach to what is grasped or, with it in the hand, to its place."""
+        target = self.executor.plan[self.executor.index]
+        if target.axis is not None:
+            gone = self._gone.get(target.memory.sub_task, 0.0)
+            self._gone[target.memory.sub_task] = gone + self.executor.travelled
+        is_carrying = bool(self.tracker.held) and target.memory.phase == "place"
+        if is_carrying and not self.executor.has_lost_grip(hand):
+            return self.executor.entry_index()
+        return self.executor.retry_index()
 
     # Looking.
 
@@ -430,7 +444,7 @@ class Row:
         return changed
 
     def _transfer(self, entry: MemoryEntry, T_world_ee: Array) -> tuple[Target, ...]:
-        targets = self._knowledge.transfer(entry, self.layout, T_world_ee)
+        targets = self._knowledge.transfer(entry, self.layout, T_world_ee, self._gone)
         return targets if self._is_last_part else (*targets, *rise(targets[-1], self._start_height))
 
 

@@ -104,7 +104,11 @@ def transfer_pose(T_world_obj: Array, T_obj_ee: Array) -> Array:
 
 
 def transfer(
-    entry: MemoryEntry, layout: Mapping[str, Array], yaw_periods: Mapping[str, float], T_world_ee: Array
+    entry: MemoryEntry,
+    layout: Mapping[str, Array],
+    yaw_periods: Mapping[str, float],
+    T_world_ee: Array,
+    gone: Mapping[int, float] | None = None,
 ) -> tuple[Target, ...]:
     """Carry an entry's key poses over to the scene.
 
@@ -116,6 +120,7 @@ def transfer(
         layout: Present poses ``T_world_obj`` ``(4, 4)`` of its anchors.
         yaw_periods: Angle by object that turns it into itself, radians; 0 for a body of revolution.
         T_world_ee: Present hand pose ``(4, 4)``.
+        gone: How far a drawer or a knob has gone already, by sub-task, metres or radians.
     """
     chosen: dict[str, Array] = {}
     targets: list[Target] = []
@@ -139,9 +144,25 @@ def transfer(
         if axis is not None:
             axis = replace(axis, direction=T_world_anchor[:3, :3] @ axis.direction)
         targets.append(Target(before, pose, precise, axis, ways if pose.phase == "push" else None))
+    for sub_task, amount in (gone or {}).items():
+        targets = _gone_on(targets, sub_task, amount)
     if targets and entry.key.sub_tasks[-1].operation == "put":
         targets += _release(targets)
     return tuple(targets) + _retreat(targets)
+
+
+def _gone_on(targets: Sequence[Target], sub_task: int, amount: float) -> list[Target]:
+    """Key poses of a sub-task whose drawer or knob has gone part of its way: take it where it is."""
+    found = ((i, one.axis) for i, one in enumerate(targets) if one.axis and one.memory.sub_task == sub_task)
+    end, axis = next(found, (0, None))
+    if axis is None:
+        return list(targets)
+    so_far, left = replace(axis, amount=amount), replace(axis, amount=axis.amount - amount)
+    before = [
+        replace(one, T_world_ee=so_far.follow(one.T_world_ee)) if one.memory.sub_task == sub_task else one
+        for one in targets[:end]
+    ]
+    return [*before, replace(targets[end], axis=left), *targets[end + 1 :]]
 
 
 def _heading(way: Array) -> float:

@@ -125,6 +125,11 @@ class Axis:
             return se3.transform(T[:3, :3], T[:3, 3] + self.amount * self.direction)
         return se3.transform(se3.exp_so3(self.amount * self.direction) @ T[:3, :3], T[:3, 3])
 
+    def travel(self, T_start: Array, T: Array) -> float:
+        """How far a hand at ``T`` has gone along the constraint since ``T_start``, metres or radians."""
+        step = se3.increment(T_start, T)
+        return float((step[:3] if self.kind == "slide" else step[3:]) @ self.direction)
+
 
 @dataclass(frozen=True)
 class MemoryKeyPose:
