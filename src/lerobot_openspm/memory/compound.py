@@ -64,8 +64,8 @@ def parts(entry: MemoryEntry) -> tuple[MemoryEntry, ...]:
     relative to other objects is no part, because nothing would look for these.
     """
     sub_tasks = entry.key.sub_tasks
-    if len(sub_tasks) == 1:
-        return (entry,)
+    if len(sub_tasks) == 1 or sub_tasks[0].words:
+        return (entry,)  # no words say what each part of an instruction is that cannot be read
     serves = _sub_tasks_of(entry)
     found: list[MemoryEntry] = []
     for i in range(len(sub_tasks)):
@@ -172,6 +172,8 @@ def _about(
 
 def phrase(sub_task: SubTask) -> str:
     """A sub-task in words, as an instruction: "put the bowl in the top drawer of the cabinet"."""
+    if sub_task.words:
+        return sub_task.words
     verb = _VERBS.get(sub_task.operation, sub_task.operation)
     if not sub_task.landmark:
         return f"{verb} {_noun(sub_task.target, sub_task.part, sub_task.target_where)}"

@@ -1,12 +1,14 @@
 """From an instruction to its task elements, by a small grammar and a table of words. No download.
 
+:func:`read_task` is how mining, teaching and acting read: any wording is a task, structure a bonus.
+
 ``wording`` makes plain imperatives of other ways to ask, ``sentences`` splits them into clauses, ``clauses``
 reads a verb with its ``nouns`` and ``prepositions``; here clauses become sub-tasks and pronouns get nouns.
 """
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass, replace
 
 from lerobot_openspm.errors import InstructionError
@@ -17,10 +19,17 @@ from lerobot_openspm.memory.loose_reading import read_loosely
 from lerobot_openspm.memory.loose_words import THINGS
 from lerobot_openspm.memory.names import canonical_name
 from lerobot_openspm.memory.nouns import Noun
+from lerobot_openspm.memory.own_words import normal_words, unread
 from lerobot_openspm.memory.sense import makes_sense
 from lerobot_openspm.memory.sentences import MAX_CHARACTERS, Clause, read_clauses
 
 PICK = "pick"
+# Verbs that say all of what is to be done where nothing says where to. Others that mean putting or pushing
+# would be one with them: "move the box", "store the box", "pull the lever".
+_SAY_ALL = (
+    "pick up", "pick", "grab", "grasp", "grab hold of", "take hold of", "get hold of", "take", "lift",
+    "lift up", "get", "fetch", "push", "press",
+)  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -36,6 +45,44 @@ class _Meant:
     sub_tasks: tuple[SubTask, ...]
     step: int
     is_done: bool = False
+
+
+def read_task(instruction: str, names: Collection[str] = frozenset()) -> tuple[SubTask, ...]:
+    """Read any task: its elements where the grammar has them, else one sub-task kept by its own words.
+
+    Args:
+        instruction: What is asked or was demonstrated, in any words and any language.
+        names: Names of the things that the memory holds.
+
+    Raises:
+        InstructionError: There is not a word in it.
+    """
+    try:
+        found = parse_instruction(instruction, THINGS | frozenset(names))
+    except InstructionError:
+        return (unread(instruction),)
+    return found if _says_all(found, instruction) else (unread(instruction),)
+
+
+def read_tasks(
+    instructions: Iterable[str], names: Collection[str] = frozenset()
+) -> dict[str, tuple[SubTask, ...]]:
+    """Read tasks that belong together: what one of them names is known in all, as it will be when acting.
+
+    An instruction without a word is left out.
+    """
+    told = [one for one in dict.fromkeys(instructions) if normal_words(one)]
+    named = {name for one in told for sub_task in read_task(one, names) for name in sub_task.objects}
+    return {one: read_task(one, {*names, *named}) for one in told}
+
+
+def _says_all(found: Sequence[SubTask], instruction: str) -> bool:
+    """Whether sub-tasks say as much as their words: a single thing to move needs a place to go to."""
+    if len(found) > 1 or found[0].landmark or found[0].operation not in ("put", "push"):
+        return True
+    words = tuple(normal_words(instruction).split())
+    verb = v.match_verb(words, 0)
+    return verb is not None and " ".join(words[: verb.length]) in _SAY_ALL
 
 
 def parse_instruction(instruction: str, things: Collection[str] = THINGS) -> tuple[SubTask, ...]:

@@ -9,6 +9,7 @@ from itertools import permutations
 from lerobot_openspm.memory import vocabulary as v
 from lerobot_openspm.memory.entry import Reference, SubTask
 from lerobot_openspm.memory.names import TABLE_NAMES, NameSimilarity, canonical_name
+from lerobot_openspm.memory.own_words import words_similarity
 
 # What is lost where the part is not said, or another one; where the thing would end elsewhere.
 PART_UNSAID, OTHER_PART, OTHER_RELATION = 0.9, 0.5, 0.6
@@ -69,6 +70,9 @@ def semantic_score(
         known: What an entry is about.
         names: Says which names mean the same thing.
     """
+    if asked and known and asked[0].words and known[0].words:
+        # How many things the hand took shows in the demonstrations, and is not in the words.
+        return words_similarity(asked[0].words, known[0].words, names)
     if len(asked) != len(known) or not asked:
         return 0.0
     best = _in_order(asked, known, names)
@@ -89,6 +93,8 @@ def _may_be_reordered(sub_tasks: Sequence[SubTask]) -> bool:
 
 
 def _sub_task_score(asked: SubTask, known: SubTask, names: NameSimilarity) -> float:
+    if asked.words or known.words:
+        return 0.0  # one is read by the grammar, the other is not
     score = names.similarity(asked.target, known.target) * _landmarks_agree(asked, known, names)
     if score == 0.0:
         return 0.0
