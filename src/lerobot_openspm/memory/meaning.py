@@ -44,6 +44,39 @@ def same_meaning(one: Sequence[SubTask], other: Sequence[SubTask]) -> bool:
     return a == b or (_may_be_reordered(a) and sorted(a, key=repr) == sorted(b, key=repr))
 
 
+def means_the_same(one: Sequence[SubTask], other: Sequence[SubTask]) -> bool:
+    """Whether two keys are about things of the same names, one perhaps not saying which of several is meant.
+
+    Unlike :func:`same_meaning` it knows no other names of a thing: what is held under two names is two.
+    """
+    if not one or not other or len(one) != len(other) or one[0].words or other[0].words:
+        return bool(one and other) and one[0].words == other[0].words != ""
+    a, b = _without_wheres(one), _without_wheres(other)
+    orders = [(a, b)]
+    if _may_be_reordered(one) and _may_be_reordered(other):
+        orders.append((sorted(a, key=repr), sorted(b, key=repr)))
+    return any(
+        [x[0] for x in xs] == [y[0] for y in ys] and all(map(_no_other_where, xs, ys)) for xs, ys in orders
+    )
+
+
+_Wheres = tuple[Reference | None, Reference | None]
+
+
+def _without_wheres(sub_tasks: Sequence[SubTask]) -> list[tuple[SubTask, _Wheres]]:
+    """Sub-tasks in one form but with the names they have, apart from what tells which of several is meant."""
+    found: list[tuple[SubTask, _Wheres]] = []
+    for told, form in zip(sub_tasks, map(canonical, sub_tasks), strict=True):
+        named = replace(form, target=told.target, landmark=told.landmark)
+        wheres = form.target_where, form.landmark_where
+        found.append((replace(named, target_where=None, landmark_where=None), wheres))
+    return found
+
+
+def _no_other_where(one: tuple[SubTask, _Wheres], other: tuple[SubTask, _Wheres]) -> bool:
+    return all(a == b or a is None or b is None for a, b in zip(one[1], other[1], strict=True))
+
+
 def _canonical_relation(relation: str, landmark: str, part: str) -> str:
     """The relation that the landmark allows: "to the basket" and "on the basket" are "in" it."""
     if relation not in ("at", "on", "in") or not landmark:
