@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 from lerobot_openspm.errors import InstructionError
 from lerobot_openspm.memory import vocabulary as v
 from lerobot_openspm.memory.clauses import Said, read_clause
-from lerobot_openspm.memory.entry import SubTask
+from lerobot_openspm.memory.entry import Reference, SubTask
 from lerobot_openspm.memory.loose_reading import read_loosely
 from lerobot_openspm.memory.loose_words import THINGS
 from lerobot_openspm.memory.names import canonical_name
@@ -58,7 +58,7 @@ def read_task(instruction: str, names: Collection[str] = frozenset()) -> tuple[S
         InstructionError: There is not a word in it.
     """
     try:
-        found = parse_instruction(instruction, THINGS | frozenset(names))
+        found = parse_instruction(instruction, names)
     except InstructionError:
         return (unread(instruction),)
     return found if _says_all(found, instruction) else (unread(instruction),)
@@ -85,7 +85,7 @@ def _says_all(found: Sequence[SubTask], instruction: str) -> bool:
     return verb is not None and " ".join(words[: verb.length]) in _SAY_ALL
 
 
-def parse_instruction(instruction: str, things: Collection[str] = THINGS) -> tuple[SubTask, ...]:
+def parse_instruction(instruction: str, names: Collection[str] | None = None) -> tuple[SubTask, ...]:
     """Read what is to be done, in the order of execution.
 
     "open the top drawer and put the bowl inside" gives two sub-tasks, the second with the cabinet of the
@@ -95,17 +95,42 @@ def parse_instruction(instruction: str, things: Collection[str] = THINGS) -> tup
 
     Args:
         instruction: What is asked.
-        things: Names of things that are known, for the second reading.
+        names: Names of the things that the memory holds. A thing keeps the name that it is given, unless the
+            memory has none of that name and one of its kind: "cupboard", where a cabinet is known. Without a
+            memory, things are called by their kind.
 
     Raises:
         InstructionError: It is no instruction to do something (a question, a statement, a negation, a
             condition), no verb of the grammar is in it, or the verb has no object.
     """
     try:
-        return _read_twice(instruction, things)
+        found = _read_twice(instruction, THINGS | frozenset(names or ()))
+        return tuple(_as_known(sub_task, names) for sub_task in found)
     except InstructionError as error:
         shown = instruction if len(instruction) <= MAX_CHARACTERS else f"{instruction[:60]} ..."
         raise InstructionError(f"the instruction {shown!r} {error}") from None
+
+
+def _as_known(sub_task: SubTask, names: Collection[str] | None) -> SubTask:
+    """A sub-task with the names that the memory has for its things."""
+
+    def known(name: str) -> str:
+        kind = v.kind(name)
+        if names is None or not name:
+            return kind
+        alike = [] if name in names else [other for other in names if v.kind(other) == kind]
+        return alike[0] if len(alike) == 1 else name
+
+    def there(where: Reference | None) -> Reference | None:
+        return None if where is None else replace(where, landmarks=tuple(map(known, where.landmarks)))
+
+    return replace(
+        sub_task,
+        target=known(sub_task.target),
+        landmark=known(sub_task.landmark),
+        target_where=there(sub_task.target_where),
+        landmark_where=there(sub_task.landmark_where),
+    )
 
 
 def _read_twice(instruction: str, things: Collection[str]) -> tuple[SubTask, ...]:

@@ -29,6 +29,7 @@ class NameSimilarity(Protocol):
 
 def canonical_name(name: str) -> str:
     """The name that stands for all other names of a thing: "skillet" is the "frying pan"."""
+    name = v.kind(name)
     words = [word for word in v.replace_ending(name, v.ALIASES).split() if word not in v.DESCRIPTIONS]
     kept = " ".join(words) in v.ALIASES.values()
     if len(words) > 1 and words[-1] in v.CONTAINERS and not kept:

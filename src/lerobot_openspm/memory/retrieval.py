@@ -10,7 +10,6 @@ from lerobot_openspm.errors import InstructionError
 from lerobot_openspm.memory.entry import MemoryEntry, SubTask
 from lerobot_openspm.memory.indexed_entries import known_names, near
 from lerobot_openspm.memory.instruction import parse_instruction, read_task
-from lerobot_openspm.memory.loose_words import THINGS
 from lerobot_openspm.memory.meaning import means_the_same, semantic_score
 from lerobot_openspm.memory.names import TABLE_NAMES, AmongKnown, NameSimilarity
 from lerobot_openspm.memory.own_words import normal_words, unread
@@ -81,7 +80,7 @@ def read_instruction(
 def why_unread(instruction: str, entries: Sequence[MemoryEntry]) -> str:
     """Why the grammar cannot read an instruction; "" where it can."""
     try:
-        parse_instruction(instruction, THINGS | known_names(entries))
+        parse_instruction(instruction, known_names(entries))
     except InstructionError as error:
         return str(error)
     return ""
