@@ -13,7 +13,7 @@ from lerobot_openspm.errors import DatasetError, LayoutError
 from lerobot_openspm.experience import Experience, check_labels
 from lerobot_openspm.geometry.camera import load_cameras
 from lerobot_openspm.memory.entry import MemoryEntry
-from lerobot_openspm.memory.instruction import read_task
+from lerobot_openspm.memory.instruction import read_tasks
 from lerobot_openspm.memory.own_words import normal_words
 from lerobot_openspm.perception.types import Segmenter
 from lerobot_openspm.training import mine
@@ -176,7 +176,8 @@ def _nothing_learned(name: str, task: str, tasks: dict[int, str], mined: Experie
     own = [entry for entry in mined.entries if entry.language == task]
     unseen = sorted({name for entry in own for name in _unseen(entry)})
     if not unseen:
-        named = (one for sub_task in read_task(task, mined.objects) for one in sub_task.objects)
+        read = read_tasks([task], mined.objects)[task]
+        named = (one for sub_task in read for one in sub_task.objects)
         unseen = sorted(set(named) - set(mined.objects))
     why = f"could not find {' and '.join(unseen)}" if unseen else "found no key poses with all their anchors"
     return (

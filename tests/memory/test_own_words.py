@@ -100,6 +100,11 @@ def test_verbs_that_need_a_place_are_kept_by_their_words_without_one():
     assert pulled.words == "pull box"
 
 
+def test_what_is_learned_keeps_its_name_beside_another_of_its_kind():
+    (task,) = read_tasks(["put the pen in the organizer"], {"caddy"}).values()
+    assert task[0].landmark == "organizer"
+
+
 def test_tasks_are_read_together():
     tasks = read_tasks(["wipe the table", "put the bowl on the plate", "  "])
     assert list(tasks) == ["wipe the table", "put the bowl on the plate"]

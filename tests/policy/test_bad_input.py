@@ -252,7 +252,7 @@ def record_by_hand(root: Path, task: str, frames: int = 40) -> LeRobotDatasetMet
     ("task", "reason"),
     [
         ("put the bowl on the plate", "no key poses in the 1 episodes of dataset local/hand"),
-        ("dance", "say what to do"),
+        ("...", "its task '...' says nothing"),
     ],
 )
 def test_a_dataset_in_which_nothing_is_touched_is_refused(tmp_path: Path, task: str, reason: str):

@@ -67,12 +67,13 @@ def read_task(instruction: str, names: Collection[str] = frozenset()) -> tuple[S
 def read_tasks(
     instructions: Iterable[str], names: Collection[str] = frozenset()
 ) -> dict[str, tuple[SubTask, ...]]:
-    """Read tasks that belong together: what one of them names is known in all, as it will be when acting.
+    """Read tasks that are to be learned: what one of them names is known in all, as it will be when acting.
 
-    An instruction without a word is left out.
+    Things keep the names that they are given here, also where the memory has one of their kind: to take two
+    things for one is worse than to learn one twice. An instruction without a word is left out.
     """
     told = [one for one in dict.fromkeys(instructions) if normal_words(one)]
-    named = {name for one in told for sub_task in read_task(one, names) for name in sub_task.objects}
+    named = {name for one in told for sub_task in read_task(one) for name in sub_task.objects}
     return {one: read_task(one, {*names, *named}) for one in told}
 
 

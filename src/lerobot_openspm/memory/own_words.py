@@ -53,6 +53,7 @@ class _Clause:
     phrases: tuple[tuple[str, str], ...]
 
 
+@lru_cache(maxsize=16384)
 def normal_words(instruction: str) -> str:
     """An instruction's words without case, articles, courtesies and punctuation; in any language.
 
