@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection
+from functools import lru_cache
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -27,6 +28,7 @@ class NameSimilarity(Protocol):
         ...
 
 
+@lru_cache(maxsize=16384)
 def canonical_name(name: str) -> str:
     """The name that stands for all other names of a thing: "skillet" is the "frying pan"."""
     name = v.kind(name)
