@@ -83,9 +83,10 @@ def test_every_thing_that_such_a_task_takes_has_a_name_of_its_own():
     assert [s.target for s in item.sub_tasks] == ["set table object", "set table object 2"]
     assert [hint.name for hint in hints(item)] == ["set table object", "set table object 2"]
     layout = {"set table object": np.eye(4), "set table object 2": np.eye(4)}
-    (entry,) = build_entries([item], [layout], {}, "local/any")
+    (entry,) = build_entries([item], [layout], [layout], {}, "local/any")
     assert {pose.anchor.place for pose in entry.key_poses} == set(layout)
     assert entry.key.sub_tasks[0].words == "set table"
+    assert entry.outcomes == ()  # its words do not say where anything is to end
 
 
 def test_a_task_without_a_word_is_skipped():

@@ -25,9 +25,10 @@ from lerobot_openspm.memory.instruction import read_tasks
 from lerobot_openspm.memory.names import TABLE_NAMES, NameSimilarity
 from lerobot_openspm.memory.retrieval import ScoreWeights
 from lerobot_openspm.memory.robot import RobotModel
-from lerobot_openspm.mining.anchors import as_shown
+from lerobot_openspm.mining.anchors import Demonstration, as_shown
 from lerobot_openspm.mining.key_poses import find_key_poses
 from lerobot_openspm.mining.mine import MinedEpisode, build_entries, hints
+from lerobot_openspm.mining.outcomes import carried_to
 from lerobot_openspm.mining.signals import Episode
 
 ROBOT = RobotModel(1.0, -1.0, 0.08, 0.01, 0.1, 0.01, np.array([[-0.5, -0.5, 0.0], [0.5, 0.5, 0.5]]))
@@ -65,7 +66,8 @@ def _teach(
     layout = {
         hint.name: se3.transform(np.eye(3), [*hint.point_world[:2], 0.0]) for hint in reversed(hints(mined))
     }
-    found = build_entries([mined], [layout], {}, "drawn")
+    ends = carried_to(Demonstration(key_poses, layout), mined.sub_tasks)
+    found = build_entries([mined], [layout], [ends], {}, "drawn")
     if not found:
         raise OpenSPMError(f"a demonstration of {instruction!r} gave no entry; it touched {sorted(layout)}")
     return entry_from_json(entry_to_json(found[0]), instruction)
