@@ -68,9 +68,13 @@ def test_names_that_embeddings_alone_know_are_found(tmp_path):
     assert [sources(part) for part in found.parts] == [["good", "poor"]]
 
 
-def test_what_cannot_be_read_is_an_error():
-    with pytest.raises(InstructionError, match="sing a song"):
-        search_memory("sing a song", BANK, ScoreWeights())
+def test_what_cannot_be_read_is_refused_and_says_why():
+    found = search_memory("sing a song", BANK, ScoreWeights())
+    assert found.parts == ()
+    assert "no verb I know in 'sing a song'" in found.refusal
+    assert "it knows: " in found.refusal
+    with pytest.raises(InstructionError, match="says nothing"):
+        search_memory("...", BANK, ScoreWeights())
 
 
 def test_an_empty_memory_knows_nothing():

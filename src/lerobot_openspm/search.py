@@ -15,7 +15,7 @@ from lerobot_openspm.memory.entry import MemoryEntry, SubTask
 from lerobot_openspm.memory.indexed_entries import indexed, near
 from lerobot_openspm.memory.key_vector import key_vector, key_vectors
 from lerobot_openspm.memory.names import TABLE_NAMES, NameSimilarity
-from lerobot_openspm.memory.retrieval import ScoreWeights, read_instruction, semantic_score
+from lerobot_openspm.memory.retrieval import ScoreWeights, read_instruction, retrieve, semantic_score
 from lerobot_openspm.observation import Observation, split_batch
 
 if TYPE_CHECKING:
@@ -78,10 +78,10 @@ def search_memory(
         names: Says which names mean the same thing.
 
     Raises:
-        InstructionError: The instruction cannot be read.
+        InstructionError: There is not a word in the instruction.
     """
     entries = indexed(entries)
-    asked = read_instruction(instruction, entries)
+    asked = read_instruction(instruction, entries, names)
     score = partial(semantic_score, names=names)
     entries = near(asked, entries, score)
     refusal, plan = "", tuple[tuple[Candidate, ...], ...]()
@@ -89,8 +89,7 @@ def search_memory(
         plan = plan_parts(instruction, entries, names)
     except InstructionError as error:
         refusal = str(error)
-    hits = ([_without_scene(one.entry, one.source, one.semantic, weights) for one in part] for part in plan)
-    parts = tuple(tuple(sorted(part, key=lambda hit: -hit.total)) for part in hits)
+    parts = tuple(_ranked(part, weights) for part in plan)
     keys = {one.source.key.sub_tasks for part in plan for one in part}
     others = [
         _without_scene(entry, entry, score(asked, entry.key.sub_tasks), weights)
@@ -99,6 +98,15 @@ def search_memory(
     ]
     others.sort(key=lambda hit: -hit.semantic)  # of equal ones the nearer stays first
     return Found(asked, parts, tuple(others), refusal, {})
+
+
+def _ranked(part: Sequence[Candidate], weights: ScoreWeights) -> tuple[Hit, ...]:
+    """What a part can be carried out by, in the order of retrieval, where nothing is known of the scene."""
+    sources = {id(one.entry): one.source for one in part}
+    found = retrieve(
+        [(one.entry, one.semantic) for one in part], lambda _: 1.0, replace(weights, geometric=0.0)
+    )
+    return tuple(Hit(one.entry, sources[id(one.entry)], one.semantic, None, one.total) for one in found)
 
 
 def _without_scene(entry: MemoryEntry, source: MemoryEntry, semantic: float, weights: ScoreWeights) -> Hit:
@@ -123,7 +131,7 @@ def search_scene(policy: OpenSPMPolicy, observation: Observation) -> Found:
     later parts have no ``S_geo``.
 
     Raises:
-        InstructionError: The instruction cannot be read.
+        InstructionError: There is not a word in the instruction.
         ObservationError: The observation lacks a camera, or its images are no pictures.
     """
     in_words = search_memory(
@@ -137,6 +145,8 @@ def search_scene(policy: OpenSPMPolicy, observation: Observation) -> Found:
     policy.reset()
     policy.act([observation])
     row = policy.rows[0]
+    if row.refusal:
+        return replace(in_words, parts=(), refusal=row.refusal, status=row.status.value)
     sources = {id(one.entry): one.source for one in row.candidates[0]}
     ranked = tuple(
         Hit(one.entry, sources[id(one.entry)], one.semantic, one.geometric, one.total) for one in row.ranked

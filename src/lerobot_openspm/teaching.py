@@ -9,11 +9,12 @@ from pathlib import Path
 from typing import Any
 
 from lerobot_openspm.configuration_openspm import OpenSPMConfig, feature_names
-from lerobot_openspm.errors import DatasetError, InstructionError, LayoutError
+from lerobot_openspm.errors import DatasetError, LayoutError
 from lerobot_openspm.experience import Experience, check_labels
 from lerobot_openspm.geometry.camera import load_cameras
 from lerobot_openspm.memory.entry import MemoryEntry
-from lerobot_openspm.memory.instruction import parse_instruction
+from lerobot_openspm.memory.instruction import read_tasks
+from lerobot_openspm.memory.own_words import normal_words
 from lerobot_openspm.perception.types import Segmenter
 from lerobot_openspm.training import mine
 
@@ -73,9 +74,8 @@ def teach(
         The experience with the new entries and objects, and what is new in it.
 
     Raises:
-        DatasetError: There is no such episode, or an instruction's episodes show no key poses, or none of
-            them shows all objects of it where it begins.
-        InstructionError: An instruction cannot be parsed.
+        DatasetError: There is no such episode, or its instruction says nothing, or an instruction's episodes
+            show no key poses, or none of them shows all objects of it where it begins.
         LayoutError: The dataset's state or action is not laid out as the policy's.
         CalibrationError, MemoryFormatError: The cameras or the robot are others.
     """
@@ -143,21 +143,30 @@ def _check_layouts(dataset_meta: Any, config: OpenSPMConfig) -> None:
 
 
 def _tasks(dataset_meta: Any, wanted: Sequence[int]) -> dict[int, str]:
-    """Instruction by episode; each can be parsed."""
+    """Instruction by episode; each has words to find it by."""
     tasks = {}
     for index in wanted:
         told = dataset_meta.episodes[index]["tasks"]
         tasks[index] = str(told if isinstance(told, str) else told[0])
-        try:
-            parse_instruction(tasks[index])
-        except InstructionError as error:
-            raise InstructionError(f"episode {index} of dataset {dataset_meta.repo_id}: {error}") from error
+        if not normal_words(tasks[index]):
+            raise DatasetError(
+                f"episode {index} of dataset {dataset_meta.repo_id} has the task {tasks[index]!r}, expected "
+                "an instruction to find it by; give the episode a task, or leave it out of --dataset.episodes"
+            )
     return tasks
 
 
 def _unseen(entry: MemoryEntry) -> list[str]:
-    """Objects of an entry's instruction that were not found in the first frame."""
-    named = dict.fromkeys(name for sub_task in entry.key.sub_tasks for name in sub_task.objects)
+    """Objects of an entry's instruction that were not found in the first frame.
+
+    Where the instruction is kept by its words, only what the hand took counts: the words may name more than
+    what can be seen.
+    """
+    named = dict.fromkeys(
+        name
+        for sub_task in entry.key.sub_tasks
+        for name in ((sub_task.target,) if sub_task.words else sub_task.objects)
+    )
     return [name for name in named if name not in entry.layout]
 
 
@@ -167,7 +176,8 @@ def _nothing_learned(name: str, task: str, tasks: dict[int, str], mined: Experie
     own = [entry for entry in mined.entries if entry.language == task]
     unseen = sorted({name for entry in own for name in _unseen(entry)})
     if not unseen:
-        named = (one for sub_task in parse_instruction(task) for one in sub_task.objects)
+        read = read_tasks([task], mined.objects)[task]
+        named = (one for sub_task in read for one in sub_task.objects)
         unseen = sorted(set(named) - set(mined.objects))
     why = f"could not find {' and '.join(unseen)}" if unseen else "found no key poses with all their anchors"
     return (

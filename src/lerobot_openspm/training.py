@@ -145,10 +145,10 @@ def mine(
     demonstrations = open_demonstrations(dataset_meta, config)
     episodes = demonstrations.episodes(config.memory_episodes)
     robot = observe_robot(episodes, known.robot if known else None)
-    mined = mine_key_poses(demonstrations, robot, config.memory_episodes)
+    models = known.objects if known else {}
+    mined = mine_key_poses(demonstrations, robot, config.memory_episodes, models)
     mined = replace(mined, mined=judged(demonstrations, mined.mined, robot, config))
     scenes = learn_scenes(demonstrations, mined.mined, cameras)
-    models = known.objects if known else {}
     with shapes_of(config) as shapes:
         objects = layouts_in_scenes(
             scenes, mined.mined, models, np.random.default_rng(0), segmenter, config.shape, shapes

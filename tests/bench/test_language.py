@@ -4,18 +4,22 @@ import importlib.util
 import json
 import re
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import pytest
 
 from lerobot_openspm.bench import language
+from lerobot_openspm.bench.taught_words import acted_entries, teach_each
 from lerobot_openspm.cli import bench
 from lerobot_openspm.envs.tasks import TASKS
 from lerobot_openspm.errors import OpenSPMError
-from lerobot_openspm.memory.instruction import parse_instruction
+from lerobot_openspm.memory.instruction import parse_instruction, read_task
 
 KNOWN = language.known_instructions()
 PARAPHRASES = language.read_rows(language.PARAPHRASES)
 STRANGERS = language.read_rows(language.OUT_OF_DOMAIN)
+EVERYDAY = language.read_rows(language.EVERYDAY)
 SPLITS = sorted({row["split"] for row in PARAPHRASES})
 
 
@@ -54,22 +58,39 @@ def test_paraphrases_are_of_known_instructions_and_none_stands_twice():
         assert {row["split"] for row in rows} <= {"dev", "held_out"}
 
 
+def test_everyday_instructions_are_a_hundred_of_which_the_grammar_cannot_read_half():
+    told = [row["instruction"] for row in EVERYDAY]
+    assert len(set(told)) == len(told) == 100
+    assert not {row["reworded"] for row in EVERYDAY} & set(told)
+    assert sum(bool(read_task(one)[0].words) for one in told) >= 50
+
+
+@pytest.fixture(scope="module")
+def measured() -> dict[str, Any]:
+    """All rates, with what failed."""
+    return language.measure(language.Options(failures=True))
+
+
 @pytest.mark.parametrize("split", SPLITS)
-def test_the_rates_asked_for_are_reached(split: str):
-    paraphrases = [row for row in PARAPHRASES if row["split"] == split]
-    strangers = [row for row in STRANGERS if row["split"] == split]
-    assert len(paraphrases) >= 100
-    assert len(strangers) >= 80
-    missed = [row for row in paraphrases if not language.is_parsed(row)]
-    assert len(missed) <= 0.05 * len(paraphrases), missed
-    everything, demonstrated = language.bank(), language.bank(language.SUITES)
-    taken = [row for row in strangers if not language.is_refused(row, everything)]
-    assert len(taken) <= 0.01 * len(strangers), taken
-    of_demonstrated = {entry.language for entry in demonstrated}
-    to_find = [row for row in paraphrases if row["of"] in of_demonstrated]
-    lost = [row for row in to_find if not language.is_first(row, demonstrated)]
+def test_the_rates_asked_for_are_reached(split: str, measured: dict[str, Any]):
+    rates, failures = measured["splits"][split], measured["failures"]
+    assert rates["n"] >= 100
+    assert rates["n_out_of_domain"] >= 80
+    assert rates["paraphrases_parsed"] >= 0.95, failures[f"{split}_paraphrases_parsed"]
+    assert rates["out_of_domain_refused"] >= 0.99, failures[f"{split}_out_of_domain_refused"]
     # Asked for are 99 %; of the sentences that nothing was developed on, 91 of 95 were found.
-    assert len(lost) <= (0.01 if split == "dev" else 0.05) * len(to_find), lost
+    asked = 0.99 if split == "dev" else 0.95
+    assert rates["retrieved_first"] >= asked, failures[f"{split}_retrieved_first"]
+
+
+def test_any_wording_is_learned_and_the_entry_that_is_meant_acts(measured: dict[str, Any]):
+    failures = measured["failures"]
+    assert (measured["any_wording_learned"], measured["n_wordings"]) == (1.0, 100), failures[
+        "any_wording_learned"
+    ]
+    assert measured["acted_entry_right"] >= 0.99, failures["acted_entry_right"]
+    assert measured["n_acted"] + measured["n_refused"] >= 300
+    assert measured["n_refused"] <= 5
 
 
 def test_the_measures_can_fail():
@@ -79,6 +100,11 @@ def test_the_measures_can_fail():
     assert not language.is_first(wrong, bank)
     assert not language.is_parsed({"paraphrase": "sing", "of": "put the bowl on the plate"})
     assert not language.is_refused({"instruction": "put the bowl on the plate"}, bank)
+    taught = teach_each(["wipe the table", "put the cup on the tray"], np.random.default_rng(0))
+    assert [one.language for one in acted_entries("wipe a table", taught, lambda _: False)] == [
+        "wipe the table"
+    ]
+    assert acted_entries("wipe the window", taught, lambda _: False) == ()
 
 
 def test_bench_language_prints_the_rates(capsys: pytest.CaptureFixture[str], tmp_path: Path):
@@ -97,6 +123,11 @@ def test_bench_language_prints_the_rates(capsys: pytest.CaptureFixture[str], tmp
         {"instruction": "turn on the stove", "split": "dev"},
     ]
     (tmp_path / language.OUT_OF_DOMAIN).write_text(json.dumps(strangers))
+    everyday = [
+        {"instruction": "wipe the table", "reworded": "please wipe a table"},
+        {"instruction": "wipe the window", "reworded": "sing"},
+    ]
+    (tmp_path / language.EVERYDAY).write_text(json.dumps(everyday))
     bench.main(["language", f"--folder={tmp_path}", "--failures=true"])
     printed = json.loads(capsys.readouterr().out.splitlines()[-1])
     # The held-out half is what counts.
@@ -105,6 +136,9 @@ def test_bench_language_prints_the_rates(capsys: pytest.CaptureFixture[str], tmp
     assert printed["splits"]["dev"]["paraphrases_parsed"] == 1.0
     assert printed["splits"]["dev"]["out_of_domain_refused"] == 0.0
     assert printed["failures"]["held_out_paraphrases_parsed"] == ["turn the stove off"]
+    assert (printed["any_wording_learned"], printed["n_wordings"]) == (0.5, 2)
+    assert printed["failures"]["any_wording_learned"] == ["wipe the window"]
+    assert printed["failures"]["acted_entry_right"] == ["sing"]
     with pytest.raises(OpenSPMError, match=r"no paraphrases\.json"):
         bench.main(["language", f"--folder={tmp_path / 'nowhere'}"])
 
@@ -113,5 +147,7 @@ def test_without_out_of_domain_rows_there_is_no_rate(tmp_path: Path, capsys: pyt
     row = {"paraphrase": "switch on the stove", "of": "turn on the stove", "split": "dev"}
     (tmp_path / language.PARAPHRASES).write_text(json.dumps([row]))
     (tmp_path / language.OUT_OF_DOMAIN).write_text("[]")
+    (tmp_path / language.EVERYDAY).write_text("[]")
     bench.main(["language", f"--folder={tmp_path}"])
-    assert json.loads(capsys.readouterr().out.splitlines()[-1])["out_of_domain_refused"] is None
+    printed = json.loads(capsys.readouterr().out.splitlines()[-1])
+    assert (printed["out_of_domain_refused"], printed["any_wording_learned"]) == (None, None)

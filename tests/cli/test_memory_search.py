@@ -86,7 +86,7 @@ def test_a_mined_memory_can_be_searched_too(openspm: Openspm, checkpoint: Path, 
     [
         ((), "search for what? expected an instruction in quotes before the options"),
         ((BOWL, "--path=nowhere"), "no memory at nowhere"),
-        (("sing a song",), "sing a song"),
+        (("...",), "says nothing"),
         ((BOWL, "--dataset.root=nowhere"), "no dataset at --dataset.root=nowhere"),
         ((BOWL, "--dataset.root={dataset}", "--episode=6"), "has episodes 0 to 5, got --episode=6"),
         ((BOWL, "--dataset.root={dataset}", "--frame=-1"), "got --frame=-1"),

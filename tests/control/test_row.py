@@ -1,3 +1,5 @@
+import re
+
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
@@ -14,7 +16,6 @@ from lerobot_openspm.control.row import (
     Seen,
 )
 from lerobot_openspm.control.transfer import TransferLimits
-from lerobot_openspm.errors import InstructionError
 from lerobot_openspm.geometry import se3
 from lerobot_openspm.memory.retrieval import ScoreWeights
 from lerobot_openspm.perception.camera_watch import Fault
@@ -386,9 +387,23 @@ def test_the_open_loop_does_not_look_again():
     assert eyes.asked == []
 
 
-def test_an_unknown_instruction_raises():
-    with pytest.raises(InstructionError, match="put the bowl on the plate"):
-        row(instruction="put the box on the plate").observe(HAND, Eyes({}))
+@pytest.mark.parametrize(
+    ("instruction", "why"),
+    [
+        ("put the box on the plate", "it knows: put the bowl on the plate"),
+        ("sing a song", "no verb I know in 'sing a song'.*it knows"),
+        ("", "says nothing"),
+    ],
+)
+def test_what_is_not_understood_holds_still_and_says_why_once(instruction, why, caplog):
+    one, eyes = row(instruction=instruction), Eyes({})
+    for _ in range(10):
+        one.observe(HAND, eyes)
+        np.testing.assert_array_equal(one.next_action(HAND), [0, 0, 0, 0, 0, 0, -1])
+    assert one.status is Status.NOT_UNDERSTOOD
+    assert re.search(why, one.refusal)
+    assert [record.getMessage() for record in caplog.records] == [f"not acting: {one.refusal}"]
+    assert eyes.asked == []
 
 
 def test_noise_is_a_function_of_seed_episode_and_chunk_alone():

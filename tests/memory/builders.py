@@ -4,7 +4,7 @@ import numpy as np
 
 from lerobot_openspm.geometry import se3
 from lerobot_openspm.memory.entry import Anchor, MemoryEntry, MemoryKeyPose, RetrievalKey
-from lerobot_openspm.memory.instruction import parse_instruction
+from lerobot_openspm.memory.instruction import read_task
 from lerobot_openspm.memory.names import TABLE_NAMES
 from lerobot_openspm.memory.retrieval import candidates_for, read_instruction
 from lerobot_openspm.memory.robot import RobotModel
@@ -53,7 +53,7 @@ def pick_and_place(target="bowl", landmark="plate", yaw=0.3):
 
 
 def entry(instruction="put the bowl on the plate", key_poses=None, layout=None, **changes):
-    sub_tasks = parse_instruction(instruction)
+    sub_tasks = read_task(instruction)
     objects = [name for sub_task in sub_tasks for name in sub_task.objects]
     if key_poses is None:
         key_poses = pick_and_place(objects[0], objects[-1])

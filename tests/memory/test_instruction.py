@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from lerobot_openspm.envs.tasks import TASKS
 from lerobot_openspm.errors import InstructionError
 from lerobot_openspm.memory.entry import Reference, SubTask
-from lerobot_openspm.memory.instruction import parse_instruction
+from lerobot_openspm.memory.instruction import parse_instruction, read_task
 from lerobot_openspm.memory.meaning import same_meaning
 from lerobot_openspm.memory.vocabulary import VERBS
 
@@ -314,3 +314,41 @@ def test_any_words_are_read_or_refused(words):
     assert found
     assert all(sub_task.operation in VERBS and sub_task.target for sub_task in found)
     assert all(bool(sub_task.relation) == bool(sub_task.landmark) for sub_task in found)
+
+
+@pytest.mark.parametrize(
+    ("instruction", "expected"),
+    [
+        ("put block a on block b", [SubTask("put", "block a", "", "on", "block b")]),
+        ("pick up block 1 and put it on block 2.", [SubTask("put", "block 1", "", "on", "block 2")]),
+        ("put 3 mugs on the plate", [SubTask("put", "mug", "", "on", "plate")] * 3),
+        (
+            "put the can in the left bin",
+            [SubTask("put", "can", "", "in", "bin", landmark_where=Reference("left"))],
+        ),
+        ("put the pen in the organizer", [SubTask("put", "pen", "", "in", "organizer")]),
+        ("press the button", [SubTask("push", "button")]),
+        (
+            "1. open the top drawer 2. put the bowl in it",
+            [SubTask("open", "cabinet", "top drawer"), SubTask("put", "bowl", "top drawer", "in", "cabinet")],
+        ),
+    ],
+)
+def test_things_mean_what_they_say(instruction: str, expected: list[SubTask]):
+    assert list(read_task(instruction)) == expected
+
+
+@pytest.mark.parametrize(
+    ("names", "landmark"),
+    [
+        ((), "cupboard"),
+        (("cabinet",), "cabinet"),
+        (("cabinet", "cupboard"), "cupboard"),
+        (("dresser",), "dresser"),
+    ],
+)
+def test_a_thing_keeps_its_name_unless_the_memory_calls_its_kind_otherwise(
+    names: tuple[str, ...], landmark: str
+):
+    (sub_task,) = read_task("put the bowl in the cupboard", names)
+    assert sub_task.landmark == landmark

@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import pytest
 from tests.memory.builders import entry, semantic_candidates
 
@@ -52,7 +54,7 @@ def test_a_chain_is_as_good_as_its_weakest_link():
 
 def test_only_matching_entries_are_candidates_each_with_its_score():
     exact, other = entry("put the wine bottle on the rack"), entry("put the bowl on the plate")
-    near = entry("put the bottle on the rack")
+    near = entry("place the wine bottle on the left rack")
     found = semantic_candidates("put the wine bottle on the rack", [other, near, exact, exact])
     assert [item[0] for item in found] == [near, exact, exact]
     assert found[1][1] == pytest.approx(1)
@@ -63,6 +65,41 @@ def test_only_matching_entries_are_candidates_each_with_its_score():
         weights = ScoreWeights(semantic=weight, geometric=0.5, quality=0.0)
         ranked = retrieve(found, lambda e: better_place.get(id(e), 0.5), weights)
         assert ranked[0].entry is first
+
+
+@pytest.mark.parametrize(
+    ("asked", "rival"),
+    [
+        ("put the cup on the tray", "put the mug on the tray"),
+        ("put the mug on the tray", "put the cup on the tray"),
+        ("put the bowl on the plate", "put the black bowl on the plate"),
+        ("put the can in the right bin", "put the can in the left bin"),
+        ("put block a on block b", "put block b on block a"),
+        ("wipe the table", "wipe the table with the sponge"),
+        ("pull the lever", "push the lever"),
+    ],
+)
+def test_what_is_meant_acts_whatever_the_scene_and_the_quality_say_for_another(asked, rival):
+    meant, other = entry(asked, quality=0.0), entry(rival, quality=1.0)
+    found = semantic_candidates(asked, [other, meant])
+    for geometry in (0.1, 0.0):
+        scene = {id(meant): geometry, id(other): 1.0}
+        ranked = retrieve(found, lambda e, scene=scene: scene[id(e)], ScoreWeights())
+        assert ranked[0].entry is meant
+
+
+def test_another_name_finds_a_thing_that_the_memory_does_not_know_by_it():
+    mug, cup = entry("put the mug on the tray"), entry("put the cup on the tray")
+    asked = "set the cup on the tray"
+    assert [item[0] for item in semantic_candidates(asked, [mug])] == [mug]
+    assert [item[0] for item in semantic_candidates(asked, [mug, cup])] == [cup]
+    with pytest.raises(InstructionError, match="holds no experience"):  # it holds the two apart
+        semantic_candidates("put the cup on the shelf", [cup, entry("put the mug on the shelf")])
+
+
+def test_the_words_of_a_demonstration_find_it_however_it_was_read():
+    shown = replace(entry("put the bowl on the plate"), language="do the usual thing")
+    assert semantic_candidates("please do the usual thing", [shown]) == [(shown, 1.0)]
 
 
 @pytest.mark.parametrize("instruction", ["put the box on the plate", "open the bowl", "close the top drawer"])

@@ -2,13 +2,13 @@
 
 import numpy as np
 from tests.memory.builders import robot
-from tests.mining.episodes import Drawer
+from tests.mining.episodes import Drawer, pick_and_place
 
 from lerobot_openspm.geometry import se3
 from lerobot_openspm.memory.compound import parts
 from lerobot_openspm.memory.instruction import parse_instruction
 from lerobot_openspm.mining.key_poses import find_key_poses
-from lerobot_openspm.mining.mine import MinedEpisode, build_entries
+from lerobot_openspm.mining.mine import MinedEpisode, build_entries, hints, mine_key_poses
 
 TASK = "open the top drawer and put the bowl inside"
 LAYOUT = {"cabinet": se3.from_yaw([0.3, 0.0, 0.0], 0.0), "bowl": se3.from_yaw([-0.1, 0.2, 0.0], 0.0)}
@@ -48,3 +48,49 @@ def test_every_key_pose_of_a_demonstration_of_two_sub_tasks_knows_its_own():
     for part, served in ((opening, 0), (putting, 1)):
         own = [pose.T_obj_ee for pose in entry.key_poses if pose.sub_task == served]
         np.testing.assert_array_equal([pose.T_obj_ee for pose in part.key_poses], own)
+
+
+class _Recorded:
+    """Episodes as a dataset gives them."""
+
+    name = "local/any"
+
+    def __init__(self, *episodes):
+        self._episodes = list(episodes)
+
+    def episodes(self, indices=None):
+        return [one for one in self._episodes if indices is None or one.index in indices]
+
+
+def test_a_task_that_the_grammar_cannot_read_is_mined_with_the_things_that_the_hand_took():
+    one = pick_and_place()[0].episode(0, "pour the coffee into the cup")
+    (item,) = mine_key_poses(_Recorded(one), robot()).mined
+    assert [(s.operation, s.target, s.landmark) for s in item.sub_tasks] == [("do", "coffee", "cup")]
+    touched = [(hint.name, hint.kind) for hint in hints(item)]
+    assert touched == [("coffee", "grasp"), ("cup", "release")]
+
+
+def test_every_thing_that_such_a_task_takes_has_a_name_of_its_own():
+    drawer, _ = pick_and_place()
+    drawer.move([-0.1, 0.1, 0.14])
+    drawer.move([-0.1, 0.1, 0.02])
+    drawer.grip(True)
+    drawer.move([-0.1, 0.1, 0.16])
+    drawer.move([0.1, 0.1, 0.05])
+    drawer.grip(False)
+    drawer.move([0.1, 0.1, 0.2])
+    (item,) = mine_key_poses(_Recorded(drawer.episode(0, "set the table")), robot()).mined
+    assert [s.target for s in item.sub_tasks] == ["set table object", "set table object 2"]
+    assert [hint.name for hint in hints(item)] == ["set table object", "set table object 2"]
+    layout = {"set table object": np.eye(4), "set table object 2": np.eye(4)}
+    (entry,) = build_entries([item], [layout], [layout], {}, "local/any")
+    assert {pose.anchor.place for pose in entry.key_poses} == set(layout)
+    assert entry.key.sub_tasks[0].words == "set table"
+    assert entry.outcomes == ()  # its words do not say where anything is to end
+
+
+def test_a_task_without_a_word_is_skipped():
+    said, silent = (pick_and_place()[0].episode(i, task) for i, task in enumerate(("wipe it", "...")))
+    mined = mine_key_poses(_Recorded(said, silent), robot())
+    assert [item.episode.index for item in mined.mined] == [0]
+    assert "says nothing" in mined.skipped[1]

@@ -1,15 +1,18 @@
-"""How well instructions are read: known ones, paraphrases, and those that the memory must refuse."""
+"""How well instructions are understood: read, found again, told from others, and refused."""
 
 from __future__ import annotations
 
 import json
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, partial
 from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
+from lerobot_openspm.bench.taught_words import acted_entries, teach_each
 from lerobot_openspm.errors import InstructionError, OpenSPMError
 from lerobot_openspm.memory.compound import plan_parts
 from lerobot_openspm.memory.entry import MemoryEntry, Reference, RetrievalKey, SubTask
@@ -19,6 +22,8 @@ from lerobot_openspm.memory.names import TABLE_NAMES, Model2VecNames, NameSimila
 
 # The instructions and their elements, which were checked by reading every line.
 KNOWN, PARAPHRASES, OUT_OF_DOMAIN = "known.json", "paraphrases.json", "out_of_domain.json"
+# Everyday instructions, each with a light rewording; half of them the grammar cannot read.
+EVERYDAY = "everyday.json"
 HELD_OUT = "held_out"
 # A line of paraphrases.json ("paraphrase", "of", "split") or of out_of_domain.json ("instruction", ...).
 Row = dict[str, str]
@@ -30,7 +35,9 @@ SUITES = ("libero_spatial", "libero_object", "libero_goal", "libero_10", "tablet
 class Options:
     """Measure how instructions are read. Needs no checkpoint and no simulator."""
 
-    folder: str | None = None  # of paraphrases.json and out_of_domain.json; default: those of the package
+    folder: str | None = (
+        None  # of paraphrases.json, out_of_domain.json, everyday.json; default: the package's
+    )
     name_embeddings: str | None = None  # model2vec model, as in --policy.name_embeddings
     failures: bool = False  # whether to list what failed
 
@@ -93,14 +100,16 @@ def bank(suites: Sequence[str] | None = None) -> list[MemoryEntry]:
 
 
 def read_rows(name: str, folder: str | None = None) -> list[Row]:
-    """The paraphrases, or the instructions out of domain; each row with its "split", "dev" or "held_out".
+    """The paraphrases and the instructions out of domain, each with its "split", or the everyday ones.
 
     Raises:
         OpenSPMError: There are none.
     """
     path = Path(folder) / name if folder else files("lerobot_openspm.bench").joinpath("instructions", name)
     if not path.is_file():
-        raise OpenSPMError(f"no {name} at {path}; pass --folder with {PARAPHRASES} and {OUT_OF_DOMAIN}")
+        raise OpenSPMError(
+            f"no {name} at {path}; pass --folder with {PARAPHRASES}, {OUT_OF_DOMAIN} and {EVERYDAY}"
+        )
     return json.loads(path.read_text())
 
 
@@ -140,7 +149,7 @@ def is_first(row: Row, entries: Sequence[MemoryEntry], names: NameSimilarity = T
 
 
 def measure(options: Options) -> dict[str, Any]:
-    """Read everything; the rates named first are those of the held-out half, where there is one."""
+    """Read everything; rates of paraphrases are those of the held-out half, where there is one."""
     names = Model2VecNames(options.name_embeddings) if options.name_embeddings else TABLE_NAMES
     failures: dict[str, list[str]] = {}
     splits = {
@@ -150,13 +159,69 @@ def measure(options: Options) -> dict[str, Any]:
     headline = {**splits[split], "split": split}
     of_libero = [known for known in known_instructions() if known.suites - {"tabletop"}]
     read = [known for known in of_libero if _is_read(known)]
+    of_split = [row for row in read_rows(PARAPHRASES, options.folder) if row["split"] == split]
     result = {
-        "libero_parsed": _wordings(read) / _wordings(of_libero),
+        **_measure_acting(read_rows(EVERYDAY, options.folder), of_split, names, failures),
         **headline,
+        "libero_parsed": _wordings(read) / _wordings(of_libero),
         "n_libero": _wordings(of_libero),
         "splits": splits,
     }
     return {**result, "failures": failures} if options.failures else result
+
+
+def _measure_acting(
+    everyday: Sequence[Row], paraphrases: Sequence[Row], names: NameSimilarity, failures: dict[str, list[str]]
+) -> dict[str, Any]:
+    """What the policy acts by after one drawn demonstration each, with everything but the words against it.
+
+    `acted_entry_right` is over the everyday instructions in both wordings, those of the suites with
+    demonstrations in their own words, and the paraphrases of these that are not refused.
+    """
+    told = [row["instruction"] for row in everyday]
+    shown = [entry.language for entry in bank(SUITES)]
+    to_find = [(row["paraphrase"], row["of"]) for row in paraphrases if row["of"] in shown]
+    asked = [(row[key], row["instruction"]) for row in everyday for key in ("instruction", "reworded")]
+    rights = _rights(asked, told, _is_told_as, names)
+    rights |= _rights([*((one, one) for one in shown), *to_find], shown, _is_about, names)
+    refused = [said for said, _ in to_find if rights[said] is None]
+    acted = {said: is_right for said, is_right in rights.items() if said not in refused}
+    unlearned = [
+        r["instruction"] for r in everyday if not (rights[r["instruction"]] and rights[r["reworded"]])
+    ]
+    failures["acted_entry_right"] = [said for said, is_right in acted.items() if not is_right]
+    failures["any_wording_learned"] = unlearned
+    return {
+        "acted_entry_right": sum(map(bool, acted.values())) / len(acted),
+        "any_wording_learned": 1 - len(unlearned) / len(told) if told else None,
+        "n_acted": len(acted),
+        "n_refused": len(refused),
+        "n_wordings": len(told),
+    }
+
+
+def _rights(
+    asked: Sequence[tuple[str, str]],
+    taught: Sequence[str],
+    is_meant: Callable[[str, MemoryEntry], bool],
+    names: NameSimilarity,
+) -> dict[str, bool | None]:
+    """For every instruction, given with its meaning, whether just the right entry acts; None if none does."""
+    entries = teach_each(taught, np.random.default_rng(0))
+    acted = {said: (acted_entries(said, entries, partial(is_meant, of), names), of) for said, of in asked}
+    return {
+        said: (len(found) == 1 and is_meant(of, found[0])) if found else None
+        for said, (found, of) in acted.items()
+    }
+
+
+def _is_told_as(instruction: str, entry: MemoryEntry) -> bool:
+    return entry.language == instruction
+
+
+def _is_about(instruction: str, entry: MemoryEntry) -> bool:
+    """Whether an entry means what a known instruction means."""
+    return same_meaning(entry.key.sub_tasks, _elements()[instruction])
 
 
 def _wordings(known: Sequence[Known]) -> int:

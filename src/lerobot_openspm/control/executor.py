@@ -48,6 +48,7 @@ class Status(StrEnum):
     INFEASIBLE = "infeasible"  # no entry passes the transfer checks here
     NO_PROGRESS = "no_progress"  # retries are used up
     OBJECT_LOST = "object_lost"  # what is needed now was seen before and is gone; looked for until it is back
+    NOT_UNDERSTOOD = "not_understood"  # nothing in the memory is about the instruction
     CAMERA_FAULT = "camera_fault"  # a camera gave no sound picture for too long
 
 

@@ -17,6 +17,7 @@ from lerobot_openspm.control.executor import Executor, Hand, Status
 from lerobot_openspm.control.knowledge import Knowledge
 from lerobot_openspm.control.referents import Referents, references
 from lerobot_openspm.control.transfer import PushWays, Target, rise
+from lerobot_openspm.errors import InstructionError
 from lerobot_openspm.flow.condition import Query
 from lerobot_openspm.geometry import se3
 from lerobot_openspm.geometry.se3 import Array
@@ -78,6 +79,7 @@ class Row:
         is_paused: Whether the hand holds still until something is seen again.
         succeeded: Whether what was to be done is seen to be done; None before the end, and where it cannot be
             seen.
+        refusal: Why the instruction is not acted on; "" unless the status is NOT_UNDERSTOOD.
     """
 
     def __init__(self, knowledge: Knowledge, instruction: str, fingerprint: int, noise_seed: int):
@@ -91,6 +93,7 @@ class Row:
         self.is_paused = False
         self.succeeded: bool | None = None
         self._looks_left = LOOKS_AT_OUTCOME  # at how the present part ended
+        self.refusal = ""
         # What the instruction is carried out by; made at the first look, because it may be refused.
         self._parts: tuple[tuple[Candidate, ...], ...] = ()
         self._part = 0
@@ -119,7 +122,19 @@ class Row:
         return tuple(self._used)
 
     def observe(self, hand: Hand, look: Look) -> None:
-        """Take in a new observation: plan, advance, look around, go where things are now, try again."""
+        """Take in a new observation: plan, advance, look around, go where things are now, try again.
+
+        What is not understood ends this episode alone: the hand holds still from then on, and
+        :attr:`refusal` says why.
+        """
+        try:
+            self._observe(hand, look)
+        except InstructionError as error:
+            self.refusal = str(error)
+            self.executor.stop(Status.NOT_UNDERSTOOD)
+            logger.warning("not acting: %s", error)
+
+    def _observe(self, hand: Hand, look: Look) -> None:
         self._step += 1
         self.tracker.predict(self._knowledge.step_s)
         if self.status in (Status.WAITING, Status.OBJECT_NOT_FOUND, Status.INFEASIBLE):

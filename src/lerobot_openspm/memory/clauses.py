@@ -241,7 +241,7 @@ def _read(operation: str, words: Words, more: Words) -> Said:
         relation = "in"  # "to the right compartment"
     noun = read_noun(goal.words)
     noun = replace(noun, pronoun="there") if not goal.words else noun
-    if goal.preposition.is_inside and (part := v.PART_BY_PLACE.get(noun.name)):
+    if goal.preposition.is_inside and (part := v.PART_BY_PLACE.get(v.kind(noun.name))):
         noun, relation = replace(noun, part=f"{v.PLACE_OF_RELATION[relation]} {part}"), "in"
     landmark = _which(noun, landmark_where)
     return Said(operation, targets, relation, landmark)
@@ -303,7 +303,7 @@ def _part_and_place(words: Words, preposition: Preposition, following: Words) ->
     if (
         preposition.relation == "in"
         and following
-        and v.singular(following[-1]) in ("cabinet", "cupboard", "caddy")
+        and v.kind(v.singular(following[-1])) in ("cabinet", "caddy")
     ):
         return (*words, "of", *following)
     place = v.PLACE_OF_RELATION.get(preposition.relation, "")

@@ -47,7 +47,10 @@ class Columns:
 
 def key_digest(key: Sequence[SubTask]) -> int:
     """A number below ``2**64`` that tells a key from others, the same on every machine."""
-    fields = json.dumps([asdict(sub_task) for sub_task in key], sort_keys=True)
+    rows = [asdict(sub_task) for sub_task in key]
+    # No words, no field: digests that were kept before there were any stay what they are.
+    kept = [{name: value for name, value in row.items() if value or name != "words"} for row in rows]
+    fields = json.dumps(kept, sort_keys=True)
     return int.from_bytes(hashlib.blake2b(fields.encode(), digest_size=8).digest(), "little")
 
 

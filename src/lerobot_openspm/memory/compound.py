@@ -16,7 +16,7 @@ from lerobot_openspm.memory.entry import MemoryEntry, MemoryKeyPose, Reference, 
 from lerobot_openspm.memory.indexed_entries import near
 from lerobot_openspm.memory.meaning import semantic_score
 from lerobot_openspm.memory.names import TABLE_NAMES, NameSimilarity
-from lerobot_openspm.memory.retrieval import candidates_for, read_instruction
+from lerobot_openspm.memory.retrieval import candidates_for, read_instruction, why_unread
 
 # A sub-task takes hold of something and lets it go again.
 TRANSITIONS_PER_SUB_TASK = 2
@@ -64,8 +64,8 @@ def parts(entry: MemoryEntry) -> tuple[MemoryEntry, ...]:
     relative to other objects is no part, because nothing would look for these.
     """
     sub_tasks = entry.key.sub_tasks
-    if len(sub_tasks) == 1:
-        return (entry,)
+    if len(sub_tasks) == 1 or sub_tasks[0].words:
+        return (entry,)  # no words say what each part of an instruction is that cannot be read
     serves = _sub_tasks_of(entry)
     found: list[MemoryEntry] = []
     for i in range(len(sub_tasks)):
@@ -122,10 +122,11 @@ def plan_parts(
         names: Says which names mean the same thing.
 
     Raises:
-        InstructionError: The instruction cannot be read, or there is no experience of one of its sub-tasks;
-            the error names the sub-task and lists what the memory knows.
+        InstructionError: There is no experience of the instruction or of one of its sub-tasks; the error
+            says why it could not be read or names the sub-task, and lists what the memory knows.
     """
-    asked = read_instruction(instruction, entries)
+    asked = read_instruction(instruction, entries, names)
+    why = why_unread(instruction, entries) if asked[0].words else ""
     entries = near(asked, entries, partial(semantic_score, names=names))
     chain: list[tuple[Candidate, ...]] = []
     left = asked
@@ -134,13 +135,15 @@ def plan_parts(
         try:
             found = _longest_run(left, said, entries, names)
         except InstructionError as error:
+            if why:
+                raise InstructionError(f"{why}; and {error}") from error
             if len(asked) == 1:
                 raise
             raise InstructionError(
                 f"{said!r} is a part of the instruction {instruction!r} that cannot be done: {error}"
             ) from error
         chain.append(found)
-        left = left[len(found[0].asked) :]
+        left = left[1 if left[0].words else len(found[0].asked) :]
     return tuple(chain)
 
 
@@ -167,11 +170,17 @@ def _about(
     """Those of some candidates that are about what is asked, with their score; InstructionError if none."""
     by_entry = {id(one.entry): one for one in candidates}
     found = candidates_for(asked, said, [one.entry for one in candidates], names)
-    return tuple(replace(by_entry[id(e)], semantic=score, asked=tuple(asked)) for e, score in found)
+    return tuple(
+        # By their words things are not told from others of their name, so what is asked is what was shown.
+        replace(by_entry[id(e)], semantic=score, asked=e.key.sub_tasks if asked[0].words else tuple(asked))
+        for e, score in found
+    )
 
 
 def phrase(sub_task: SubTask) -> str:
     """A sub-task in words, as an instruction: "put the bowl in the top drawer of the cabinet"."""
+    if sub_task.words:
+        return sub_task.words
     verb = _VERBS.get(sub_task.operation, sub_task.operation)
     if not sub_task.landmark:
         return f"{verb} {_noun(sub_task.target, sub_task.part, sub_task.target_where)}"

@@ -32,18 +32,25 @@ class Reference:
     landmarks: tuple[str, ...] = ()
 
 
+# The operation of an instruction in which the grammar reads none: what is done is what its words say.
+OWN_WORDS = "do"
+
+
 @dataclass(frozen=True)
 class SubTask:
     """One thing to do, as an instruction says it.
 
     Attributes:
-        operation: What is done: put, open, close, push, turn on, turn off.
+        operation: What is done: put, open, close, push, turn on, turn off; :data:`OWN_WORDS` where it is kept
+            by its words.
         target: The object it is done to.
         part: The part of the target that is meant ("top drawer"), or "".
         relation: Where the target goes relative to the landmark ("on", "in", "front of"), or "".
         landmark: The object it goes to, or "".
         target_where: Which of several objects of the target's name is meant; None where it is not said.
         landmark_where: Likewise for the landmark.
+        words: The instruction in its own words, without articles and courtesies, where the grammar cannot
+            read it; else "".
     """
 
     operation: str
@@ -53,6 +60,7 @@ class SubTask:
     landmark: str = ""
     target_where: Reference | None = None
     landmark_where: Reference | None = None
+    words: str = ""
 
     @property
     def objects(self) -> tuple[str, ...]:

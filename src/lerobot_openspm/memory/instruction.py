@@ -1,26 +1,35 @@
 """From an instruction to its task elements, by a small grammar and a table of words. No download.
 
+:func:`read_task` is how mining, teaching and acting read: any wording is a task, structure a bonus.
+
 ``wording`` makes plain imperatives of other ways to ask, ``sentences`` splits them into clauses, ``clauses``
 reads a verb with its ``nouns`` and ``prepositions``; here clauses become sub-tasks and pronouns get nouns.
 """
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass, replace
 
 from lerobot_openspm.errors import InstructionError
 from lerobot_openspm.memory import vocabulary as v
 from lerobot_openspm.memory.clauses import Said, read_clause
-from lerobot_openspm.memory.entry import SubTask
+from lerobot_openspm.memory.entry import Reference, SubTask
 from lerobot_openspm.memory.loose_reading import read_loosely
 from lerobot_openspm.memory.loose_words import THINGS
 from lerobot_openspm.memory.names import canonical_name
 from lerobot_openspm.memory.nouns import Noun
+from lerobot_openspm.memory.own_words import normal_words, unread
 from lerobot_openspm.memory.sense import makes_sense
 from lerobot_openspm.memory.sentences import MAX_CHARACTERS, Clause, read_clauses
 
 PICK = "pick"
+# Verbs that say all of what is to be done where nothing says where to. Others that mean putting or pushing
+# would be one with them: "move the box", "store the box", "pull the lever".
+_SAY_ALL = (
+    "pick up", "pick", "grab", "grasp", "grab hold of", "take hold of", "get hold of", "take", "lift",
+    "lift up", "get", "fetch", "push", "press",
+)  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -38,7 +47,46 @@ class _Meant:
     is_done: bool = False
 
 
-def parse_instruction(instruction: str, things: Collection[str] = THINGS) -> tuple[SubTask, ...]:
+def read_task(instruction: str, names: Collection[str] = frozenset()) -> tuple[SubTask, ...]:
+    """Read any task: its elements where the grammar has them, else one sub-task kept by its own words.
+
+    Args:
+        instruction: What is asked or was demonstrated, in any words and any language.
+        names: Names of the things that the memory holds.
+
+    Raises:
+        InstructionError: There is not a word in it.
+    """
+    try:
+        found = parse_instruction(instruction, names)
+    except InstructionError:
+        return (unread(instruction),)
+    return found if _says_all(found, instruction) else (unread(instruction),)
+
+
+def read_tasks(
+    instructions: Iterable[str], names: Collection[str] = frozenset()
+) -> dict[str, tuple[SubTask, ...]]:
+    """Read tasks that are to be learned: what one of them names is known in all, as it will be when acting.
+
+    Things keep the names that they are given here, also where the memory has one of their kind: to take two
+    things for one is worse than to learn one twice. An instruction without a word is left out.
+    """
+    told = [one for one in dict.fromkeys(instructions) if normal_words(one)]
+    named = {name for one in told for sub_task in read_task(one) for name in sub_task.objects}
+    return {one: read_task(one, {*names, *named}) for one in told}
+
+
+def _says_all(found: Sequence[SubTask], instruction: str) -> bool:
+    """Whether sub-tasks say as much as their words: a single thing to move needs a place to go to."""
+    if len(found) > 1 or found[0].landmark or found[0].operation not in ("put", "push"):
+        return True
+    words = tuple(normal_words(instruction).split())
+    verb = v.match_verb(words, 0)
+    return verb is not None and " ".join(words[: verb.length]) in _SAY_ALL
+
+
+def parse_instruction(instruction: str, names: Collection[str] | None = None) -> tuple[SubTask, ...]:
     """Read what is to be done, in the order of execution.
 
     "open the top drawer and put the bowl inside" gives two sub-tasks, the second with the cabinet of the
@@ -48,17 +96,42 @@ def parse_instruction(instruction: str, things: Collection[str] = THINGS) -> tup
 
     Args:
         instruction: What is asked.
-        things: Names of things that are known, for the second reading.
+        names: Names of the things that the memory holds. A thing keeps the name that it is given, unless the
+            memory has none of that name and one of its kind: "cupboard", where a cabinet is known. Without a
+            memory, things are called by their kind.
 
     Raises:
         InstructionError: It is no instruction to do something (a question, a statement, a negation, a
             condition), no verb of the grammar is in it, or the verb has no object.
     """
     try:
-        return _read_twice(instruction, things)
+        found = _read_twice(instruction, THINGS | frozenset(names or ()))
+        return tuple(_as_known(sub_task, names) for sub_task in found)
     except InstructionError as error:
         shown = instruction if len(instruction) <= MAX_CHARACTERS else f"{instruction[:60]} ..."
         raise InstructionError(f"the instruction {shown!r} {error}") from None
+
+
+def _as_known(sub_task: SubTask, names: Collection[str] | None) -> SubTask:
+    """A sub-task with the names that the memory has for its things."""
+
+    def known(name: str) -> str:
+        kind = v.kind(name)
+        if names is None or not name:
+            return kind
+        alike = [] if name in names else [other for other in names if v.kind(other) == kind]
+        return alike[0] if len(alike) == 1 else name
+
+    def there(where: Reference | None) -> Reference | None:
+        return None if where is None else replace(where, landmarks=tuple(map(known, where.landmarks)))
+
+    return replace(
+        sub_task,
+        target=known(sub_task.target),
+        landmark=known(sub_task.landmark),
+        target_where=there(sub_task.target_where),
+        landmark_where=there(sub_task.landmark_where),
+    )
 
 
 def _read_twice(instruction: str, things: Collection[str]) -> tuple[SubTask, ...]:

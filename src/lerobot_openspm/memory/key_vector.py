@@ -28,7 +28,7 @@ SCHEME = 1
 # reference tells apart only objects of one name.
 _WEIGHTS = {
     "operation": 1.0, "target": 1.0, "landmark": 1.0, "part": 0.8, "relation": 0.4,
-    "target_where": 0.4, "landmark_where": 0.4,
+    "target_where": 0.4, "landmark_where": 0.4, "words": 2.0,
 }  # fmt: skip
 # Share of a name as a whole beside its words: names of the same words in another order are told apart.
 _WHOLE_NAME = 0.2
@@ -72,6 +72,8 @@ def key_vectors(keys: Sequence[Sequence[SubTask]]) -> Vectors:
 
 
 def _elements(position: int, sub_task: SubTask) -> list[_Element]:
+    if sub_task.words:  # which objects it was about the demonstrations told
+        return [(0, "words", sub_task.words)]
     sub_task = canonical(sub_task)
     # That there is no landmark or part is an element too, as it is in the semantic score.
     elements = [

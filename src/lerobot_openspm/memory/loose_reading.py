@@ -129,8 +129,10 @@ class _Reader:
         if not fits:
             raise InstructionError(f"names nothing to {fragment.operation}")
         target = fits[0]
-        if target.name == "cabinet" and not target.part and things:
-            target = next((n for n in reversed(self._named) if n.part and n.name == "cabinet"), target)
+        if v.kind(target.name) == "cabinet" and not target.part and things:
+            target = next(
+                (n for n in reversed(self._named) if n.part and v.kind(n.name) == "cabinet"), target
+            )
         part = "" if target.part == "door" else target.part
         self._waiting = [n for n in self._waiting if n.name != target.name]
         self._steps.append(SubTask(fragment.operation, target.name, part))
@@ -254,7 +256,7 @@ class _Reader:
             whole = next((n for n in reversed(self._named) if n.part.endswith(f" {noun.part}")), None)
             return whole or noun
         if noun.name == "door":
-            return next((n for n in reversed(self._named) if n.name in OPENED), noun)
+            return next((n for n in reversed(self._named) if v.kind(n.name) in OPENED), noun)
         return noun
 
     def _pick_goal(self, phrases: Sequence[Phrase], fragment: Fragment) -> Phrase | None:
@@ -289,7 +291,7 @@ class _Reader:
         noun = self._resolve(noun)
         if relation == "at" and noun.part:
             relation = "in"
-        if goal.preposition.is_inside and (part := v.PART_BY_PLACE.get(noun.name)):
+        if goal.preposition.is_inside and (part := v.PART_BY_PLACE.get(v.kind(noun.name))):
             noun, relation = replace(noun, part=f"{v.PLACE_OF_RELATION[relation]} {part}"), "in"
         return noun, relation
 

@@ -9,6 +9,7 @@ from itertools import permutations
 from lerobot_openspm.memory import vocabulary as v
 from lerobot_openspm.memory.entry import Reference, SubTask
 from lerobot_openspm.memory.names import TABLE_NAMES, NameSimilarity, canonical_name
+from lerobot_openspm.memory.own_words import words_similarity
 
 # What is lost where the part is not said, or another one; where the thing would end elsewhere.
 PART_UNSAID, OTHER_PART, OTHER_RELATION = 0.9, 0.5, 0.6
@@ -43,6 +44,39 @@ def same_meaning(one: Sequence[SubTask], other: Sequence[SubTask]) -> bool:
     return a == b or (_may_be_reordered(a) and sorted(a, key=repr) == sorted(b, key=repr))
 
 
+def means_the_same(one: Sequence[SubTask], other: Sequence[SubTask]) -> bool:
+    """Whether two keys are about things of the same names, one perhaps not saying which of several is meant.
+
+    Unlike :func:`same_meaning` it knows no other names of a thing: what is held under two names is two.
+    """
+    if not one or not other or len(one) != len(other) or one[0].words or other[0].words:
+        return bool(one and other) and one[0].words == other[0].words != ""
+    a, b = _without_wheres(one), _without_wheres(other)
+    orders = [(a, b)]
+    if _may_be_reordered(one) and _may_be_reordered(other):
+        orders.append((sorted(a, key=repr), sorted(b, key=repr)))
+    return any(
+        [x[0] for x in xs] == [y[0] for y in ys] and all(map(_no_other_where, xs, ys)) for xs, ys in orders
+    )
+
+
+_Wheres = tuple[Reference | None, Reference | None]
+
+
+def _without_wheres(sub_tasks: Sequence[SubTask]) -> list[tuple[SubTask, _Wheres]]:
+    """Sub-tasks in one form but with the names they have, apart from what tells which of several is meant."""
+    found: list[tuple[SubTask, _Wheres]] = []
+    for told, form in zip(sub_tasks, map(canonical, sub_tasks), strict=True):
+        named = replace(form, target=told.target, landmark=told.landmark)
+        wheres = form.target_where, form.landmark_where
+        found.append((replace(named, target_where=None, landmark_where=None), wheres))
+    return found
+
+
+def _no_other_where(one: tuple[SubTask, _Wheres], other: tuple[SubTask, _Wheres]) -> bool:
+    return all(a == b or a is None or b is None for a, b in zip(one[1], other[1], strict=True))
+
+
 def _canonical_relation(relation: str, landmark: str, part: str) -> str:
     """The relation that the landmark allows: "to the basket" and "on the basket" are "in" it."""
     if relation not in ("at", "on", "in") or not landmark:
@@ -69,6 +103,9 @@ def semantic_score(
         known: What an entry is about.
         names: Says which names mean the same thing.
     """
+    if asked and known and asked[0].words and known[0].words:
+        # How many things the hand took shows in the demonstrations, and is not in the words.
+        return words_similarity(asked[0].words, known[0].words, names)
     if len(asked) != len(known) or not asked:
         return 0.0
     best = _in_order(asked, known, names)
@@ -89,6 +126,8 @@ def _may_be_reordered(sub_tasks: Sequence[SubTask]) -> bool:
 
 
 def _sub_task_score(asked: SubTask, known: SubTask, names: NameSimilarity) -> float:
+    if asked.words or known.words:
+        return 0.0  # one is read by the grammar, the other is not
     score = names.similarity(asked.target, known.target) * _landmarks_agree(asked, known, names)
     if score == 0.0:
         return 0.0

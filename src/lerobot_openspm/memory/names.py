@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection
+from functools import lru_cache
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -27,8 +28,10 @@ class NameSimilarity(Protocol):
         ...
 
 
+@lru_cache(maxsize=16384)
 def canonical_name(name: str) -> str:
     """The name that stands for all other names of a thing: "skillet" is the "frying pan"."""
+    name = v.kind(name)
     words = [word for word in v.replace_ending(name, v.ALIASES).split() if word not in v.DESCRIPTIONS]
     kept = " ".join(words) in v.ALIASES.values()
     if len(words) > 1 and words[-1] in v.CONTAINERS and not kept:
@@ -64,6 +67,14 @@ def _shared_words(asked: str, known: str) -> float:
     return MORE_SAID if asked in v.ALIASES.values() else OTHER_KIND  # "wine bottle" for "bottle"
 
 
+def _is_shorter(asked: str, known: str) -> bool:
+    """Whether one name is the other with words left out: "bowl", "black bowl"; "milk", "milk carton"."""
+    a, k = asked.split(), known.split()
+    if a and k and k[-1] in v.CONTAINERS and a == k[:-1]:
+        return True
+    return bool(a and k) and a[-1] == k[-1] and set(a) < set(k)
+
+
 def colours_differ(a: str, b: str) -> bool:
     """Whether both names say a colour, and not the same."""
     colours_a, colours_b = set(a.split()) & v.COLOURS, set(b.split()) & v.COLOURS
@@ -73,13 +84,16 @@ def colours_differ(a: str, b: str) -> bool:
 TABLE_NAMES = TableNames()
 
 
-class TableFirst:
-    """Another similarity, but only for names that the table finds nowhere in the memory.
+class AmongKnown:
+    """A similarity that never merges what the memory holds apart.
 
-    Who asks for the milk, which the memory knows, does not mean the butter, however alike the two are.
+    A name that the memory has means that thing, or one that it is a shorter name of ("bowl" for "black
+    bowl"), and no other: where cups and mugs are known, who asks for the cup does not mean the mug. Of the
+    other names, those that the table finds somewhere in the memory mean nothing else: who asks for the milk
+    does not mean the butter, however alike embeddings find the two.
 
     Args:
-        names: The other similarity.
+        names: The similarity of names that are not known.
         known: All names in the memory.
     """
 
@@ -90,6 +104,8 @@ class TableFirst:
 
     def similarity(self, asked: str, known: str) -> float:
         """See :class:`NameSimilarity`."""
+        if asked in self._known:
+            return 1.0 if asked == known else _is_shorter(asked, known) * LESS_SAID
         if asked not in self._in_table:
             self._in_table[asked] = any(TABLE_NAMES.similarity(asked, name) > 0 for name in self._known)
         names = TABLE_NAMES if self._in_table[asked] else self._names

@@ -68,6 +68,9 @@ def read_noun(words: Words) -> Noun:
         InstructionError: A second noun phrase begins within the words.
     """
     words = tuple(word for word in words if word not in v.FILLERS and word != ",")
+    if len(words) > 1 and words[-1] == "a" and words[-2] not in v.DETERMINERS:  # "block a"
+        noun = read_noun(words[:-1])
+        return replace(noun, name=f"{noun.name} a")
     for before, word in pairwise(words):
         if word in v.DETERMINERS and before not in ("of", "'s", "both", "all", "each", ","):
             raise InstructionError(f"has words I cannot read: {' '.join(words)!r}")
@@ -151,7 +154,8 @@ def _read_whole(words: Words, owner: str = "") -> Noun:
     if head == "one":
         places, rest = _places(rest)
         return Noun(_colours_in_order(rest), "", places, 1, "one")
-    if _is_part(head) or (head in v.PART_SYNONYMS and _sayings(rest)) or (owner and head in v.NAMED_PARTS):
+    is_part = head in v.PART_SYNONYMS and _sayings(rest) and (owner or head not in v.NAMED_WITH_THING)
+    if _is_part(head) or is_part or (owner and head in v.NAMED_PARTS):
         return _read_part(rest, head, count)
     if head in v.NAMED_PARTS and (thing := tuple(word for word in rest if not _is_position(word))):
         return replace(_read_part(rest, head, count), name=_name(thing))
@@ -211,5 +215,4 @@ def _colours_in_order(words: Words) -> str:
 
 
 def _name(words: Words) -> str:
-    name = v.replace_ending(" ".join(words), v.SYNONYMS)
-    return v.replace_ending(name, v.SYNONYMS)  # "wooden cupboard", which is the "wooden cabinet"
+    return " ".join(words)

@@ -1,4 +1,4 @@
-"""Retrieval by the paper's score: semantics, geometry, quality."""
+"""Retrieval: what is meant decides first; of entries that mean the same the paper's score chooses one."""
 
 from __future__ import annotations
 
@@ -9,10 +9,10 @@ from functools import partial
 from lerobot_openspm.errors import InstructionError
 from lerobot_openspm.memory.entry import MemoryEntry, SubTask
 from lerobot_openspm.memory.indexed_entries import known_names, near
-from lerobot_openspm.memory.instruction import parse_instruction
-from lerobot_openspm.memory.loose_words import THINGS
-from lerobot_openspm.memory.meaning import semantic_score
-from lerobot_openspm.memory.names import TABLE_NAMES, NameSimilarity, TableFirst
+from lerobot_openspm.memory.instruction import parse_instruction, read_task
+from lerobot_openspm.memory.meaning import means_the_same, semantic_score
+from lerobot_openspm.memory.names import TABLE_NAMES, AmongKnown, NameSimilarity
+from lerobot_openspm.memory.own_words import normal_words, unread
 
 # Below this semantic score an entry is about something else.
 MIN_SEMANTIC = 0.75
@@ -42,13 +42,48 @@ class Scored:
     total: float
 
 
-def read_instruction(instruction: str, entries: Sequence[MemoryEntry]) -> tuple[SubTask, ...]:
-    """The task elements of an instruction, read by someone who knows the names of the memory's things.
+def read_instruction(
+    instruction: str, entries: Sequence[MemoryEntry], names: NameSimilarity = TABLE_NAMES
+) -> tuple[SubTask, ...]:
+    """What an instruction asks for, read by someone who knows the memory.
+
+    It is read by the grammar, with the names of the memory's things. Where just that is not known, the words
+    of a demonstration mean what it showed, and other words are compared with those of demonstrations that the
+    grammar cannot read either.
+
+    Args:
+        instruction: What is asked.
+        entries: The memory.
+        names: Says which names mean the same thing.
 
     Raises:
-        InstructionError: It cannot be read.
+        InstructionError: There is not a word in it.
     """
-    return parse_instruction(instruction, THINGS | known_names(entries))
+    known = known_names(entries)
+    score = partial(semantic_score, names=AmongKnown(names, known))
+    own = (unread(instruction),)
+    read, best = read_task(instruction, known), MIN_SEMANTIC
+    for asked in dict.fromkeys((read, own)):
+        close = near(asked, entries, score)
+        scores = {key: score(asked, key) for key in {entry.key.sub_tasks for entry in close}}
+        most = max(scores.values(), default=0.0)
+        if most == 1.0:
+            return asked
+        for entry in close:
+            if normal_words(entry.language) == own[0].words:
+                return entry.key.sub_tasks
+        if most > best:
+            read, best = asked, most
+    return read
+
+
+def why_unread(instruction: str, entries: Sequence[MemoryEntry]) -> str:
+    """Why the grammar cannot read an instruction; "" where it can."""
+    try:
+        parse_instruction(instruction, known_names(entries))
+    except InstructionError as error:
+        return str(error)
+    return ""
 
 
 def candidates_for(
@@ -72,12 +107,13 @@ def candidates_for(
     entries = near(sub_tasks, entries, partial(semantic_score, names=names))
     # Demonstrations of one task share their key, so there are far fewer keys than entries.
     keys = {entry.key.sub_tasks for entry in entries}
-    names = TableFirst(names, {name for key in keys for sub_task in key for name in sub_task.objects})
+    names = AmongKnown(names, {name for key in keys for sub_task in key for name in sub_task.objects})
     scores = {key: semantic_score(sub_tasks, key, names) for key in keys}
     best = max(scores, key=lambda key: scores[key], default=())
     if scores.get(best, 0.0) < MIN_SEMANTIC:
         raise InstructionError(_unknown(instruction, entries, scores))
-    _check_rivals(instruction, entries, scores, best, names)
+    if scores[best] < 1.0:  # else just that is known
+        _check_rivals(instruction, entries, scores, best, names)
     alike = {key for key, score in scores.items() if score >= MIN_SEMANTIC and _is_alike(best, key, names)}
     return [(entry, scores[entry.key.sub_tasks]) for entry in entries if entry.key.sub_tasks in alike]
 
@@ -128,7 +164,11 @@ def retrieve(
     geometric: Callable[[MemoryEntry], float],
     weights: ScoreWeights,
 ) -> list[Scored]:
-    """Rank entries by ``lambda_s S_sem + lambda_g S_geo + lambda_r r``, best first.
+    """Rank entries, best first: those that are meant, of these the usable ones, then by the paper's score.
+
+    The score is ``lambda_s S_sem + lambda_g S_geo + lambda_r r``. Meant is what has the highest ``S_sem``,
+    and what means the same: no scene makes the mug's entry act where the cup is asked for and known. Where
+    none of these is usable, one of them still comes first, so that its objects are looked for.
 
     Args:
         candidates: Entries with their semantic score.
@@ -141,5 +181,15 @@ def retrieve(
         geometry = geometric(entry)
         total = weights.semantic * semantic + weights.geometric * geometry + weights.quality * entry.quality
         ranked.append(Scored(entry, semantic, geometry, entry.quality, total))
-    # Usable entries first whatever the weights: an infeasible one cannot be executed.
-    return sorted(ranked, key=lambda scored: (scored.geometric == 0.0, -scored.total))
+    most = max((scored.semantic for scored in ranked), default=0.0)
+    meant = {scored.entry.key.sub_tasks for scored in ranked if scored.semantic == most}
+    is_meant = {
+        key: any(means_the_same(one, key) for one in meant)
+        for key in {scored.entry.key.sub_tasks for scored in ranked}
+    }
+    return sorted(
+        ranked,
+        key=lambda scored: (
+            not is_meant[scored.entry.key.sub_tasks], scored.geometric == 0.0, -scored.total
+        ),
+    )  # fmt: skip

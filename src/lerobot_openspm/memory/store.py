@@ -12,6 +12,7 @@ from lerobot_openspm.errors import MemoryFormatError
 from lerobot_openspm.geometry import se3
 from lerobot_openspm.geometry.se3 import Array
 from lerobot_openspm.memory.entry import (
+    OWN_WORDS,
     PHASES,
     Anchor,
     Axis,
@@ -55,6 +56,7 @@ KEY_POSE = frozenset(
 )  # fmt: skip
 OUTCOME = frozenset(Outcome.__dataclass_fields__)
 SUB_TASK = frozenset(SubTask.__dataclass_fields__)
+OPERATIONS = (*VERBS, OWN_WORDS)
 # "center" is what the grammar has for "in the middle of"; a goal has none where nothing is moved anywhere.
 GOALS = (*RELATIONS, "center", "")
 # What the numbers of a robot are between, wide enough for any units.
@@ -166,9 +168,14 @@ def _instruction(fields: Fields) -> str:
 def _sub_task(fields: Any) -> SubTask:
     fields = known(fields, SUB_TASK, "a sub-task")
     words = {name: text(fields, name) for name in fields if not name.endswith("_where")}
-    for name, choices in (("operation", VERBS), ("relation", GOALS)):
+    for name, choices in (("operation", OPERATIONS), ("relation", GOALS)):
         if name in words:
             choice(fields, name, choices)
+    if (words.get("operation") == OWN_WORDS) != bool(words.get("words")):
+        raise ValueError(
+            f"a sub-task of operation {words.get('operation')!r} has the words {words.get('words', '')!r}, "
+            f"expected words where the operation is {OWN_WORDS!r}, and only there"
+        )
     return SubTask(
         **words,
         target_where=_reference(fields.get("target_where")),

@@ -160,7 +160,10 @@ PART_SYNONYMS = {
 # Parts that stand for the whole: who turns on the knob of the stove turns on the stove.
 SILENT_PARTS = ("knob", "burner", "door")
 
-# Other words for the same thing, replaced as they are read.
+# Names that are told from parts only with their thing: "the left bin" stands by itself.
+NAMED_WITH_THING = ("bin",)
+
+# Other words for the same kind of thing. A memory that has one of them is asked for it by the others too.
 SYNONYMS = {
     "cupboard": "cabinet", "chest of drawers": "cabinet", "drawer unit": "cabinet", "dresser": "cabinet",
     "set of drawers": "cabinet", "drawer chest": "cabinet", "drawer cabinet": "cabinet",
@@ -257,7 +260,11 @@ DESCRIPTIONS = word_set(
 COLOURS = word_set("black white red yellow green blue brown grey gray orange purple pink golden silver beige")
 DETERMINERS = word_set("the a an some this that these those my your our its")
 FILLERS = word_set("stacked also furthest farthest far other same entire whole single little said very")
-NUMBERS = {"both": 2, "two": 2, "pair of": 2, "couple of": 2, "three": 3, "four": 4}
+NUMBERS = {
+    "both": 2, "pair of": 2, "couple of": 2,
+    **{word: i for i, word in enumerate(("two", "three", "four", "five", "six"), start=2)},
+    **{str(i): i for i in range(2, 10)},
+}  # fmt: skip
 PRONOUNS = {
     **dict.fromkeys(("it", "this", "that", "itself"), "it"),
     "there": "there",
@@ -337,6 +344,11 @@ def replace_ending(name: str, table: dict[str, str]) -> str:
         if other := table.get(" ".join(words[start:])):
             return " ".join([*words[:start], other])
     return name
+
+
+def kind(name: str) -> str:
+    """The kind of thing that a name stands for: the "wooden cupboard" is a cabinet."""
+    return replace_ending(replace_ending(name, SYNONYMS), SYNONYMS)
 
 
 def singular(word: str) -> str:

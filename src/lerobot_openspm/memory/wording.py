@@ -28,7 +28,7 @@ _SPELLING = (
     (r"[,:()]+", " , "),
     (r"&", " and "),
     (r"[^a-z0-9,;' ]+", " "),
-    (r"\bstep (?:one|two|three|\d)\b|\b\d\b", " ; "),
+    (r"\bstep (?:one|two|three|\d)\b", " ; "),
     (r"'(?!s\b)", " "),
     (r"\s+", " "),
 )
@@ -72,6 +72,8 @@ _HEADINGS = r"(?:(?:your|next|new|the|first) )?(?:task|goal|job|instruction|comm
 def plain_words(text: str) -> str:
     """Lower-case words with "," and ";" between clauses and sentences, without courtesies."""
     text = text.lower()
+    if re.match(r"\s*\(?1[.):]", text):  # "1. open the drawer 2. put the bowl in it", but not "block 1."
+        text = re.sub(r"(?:^|\s)\(?\d[.):]\s+", " ; ", text)
     for pattern, replacement in _SPELLING:
         text = re.sub(pattern, replacement, text)
     text = _collapse(text)
@@ -87,7 +89,7 @@ def plain_wording(text: str) -> str:
     for pattern, replacement in CONSTRUCTIONS:
         text = _collapse(re.sub(pattern, f" {replacement} ", text))
     for name, other in SYNONYMS.items():
-        if " of " in name:  # before "of" is read as "belonging to"
+        if " of " in name:  # before "of" is read as "belonging to", whatever names the memory has
             text = re.sub(rf"\b{name}\b", other, text)
     return text
 

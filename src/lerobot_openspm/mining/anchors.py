@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import Counter, defaultdict
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -58,11 +58,26 @@ def sub_task_of(pose: KeyPose, sub_tasks: Sequence[SubTask]) -> SubTask:
     return sub_tasks[sub_task_index(pose.contact, pose.phase, len(sub_tasks))]
 
 
+def as_shown(sub_tasks: Sequence[SubTask], key_poses: Sequence[KeyPose]) -> tuple[SubTask, ...]:
+    """Sub-tasks with as many things as the hand took, where the instruction is only kept by its words.
+
+    "Set the table" does not say what is moved; the demonstration shows how many things are. Each gets a name
+    of its own, so that perception learns it from where the hand touched it.
+    """
+    told = sub_tasks[0]
+    if not told.words:
+        return tuple(sub_tasks)
+    count = 1 + max((sub_task_index(p.contact, p.phase, len(key_poses)) for p in key_poses), default=0)
+    names = [told.target, *(f"{told.target} {i}" for i in range(2, count + 1))]
+    return tuple(replace(told, target=name) for name in names)
+
+
 def suggested_anchor(pose: KeyPose, sub_tasks: Sequence[SubTask]) -> str:
     """The object that the instruction suggests for a phase: what is grasped, or where it goes."""
     sub_task = sub_task_of(pose, sub_tasks)
     arriving = pose.phase in ("pre-place", "place", "release", "retreat", "push")
-    return sub_task.landmark if arriving and sub_task.landmark else sub_task.target
+    # A landmark without a relation is only named: "clean the plate with the sponge".
+    return sub_task.landmark if arriving and sub_task.relation else sub_task.target
 
 
 def consensus(demonstrations: Sequence[Demonstration], sub_tasks: Sequence[SubTask]) -> dict[Role, Anchor]:

@@ -4,25 +4,26 @@ from __future__ import annotations
 
 import logging
 from collections import defaultdict
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from tqdm import tqdm
 
-from lerobot_openspm.errors import DatasetError, InstructionError
+from lerobot_openspm.errors import DatasetError
 from lerobot_openspm.geometry import se3
 from lerobot_openspm.geometry.camera import Camera
 from lerobot_openspm.geometry.se3 import Array
 from lerobot_openspm.memory.compound import sub_task_index
 from lerobot_openspm.memory.entry import Anchor, Axis, MemoryEntry, MemoryKeyPose, RetrievalKey, SubTask
-from lerobot_openspm.memory.instruction import parse_instruction
+from lerobot_openspm.memory.instruction import read_tasks
 from lerobot_openspm.memory.robot import RobotModel
 from lerobot_openspm.mining.anchors import (
     CONTACT_PHASES,
     Demonstration,
     Role,
     align_symmetric,
+    as_shown,
     consensus,
     qualities,
     roles,
@@ -68,7 +69,10 @@ class MinedKeyPoses:
 
 
 def mine_key_poses(
-    demonstrations: Demonstrations, robot: RobotModel, indices: Sequence[int] | None = None
+    demonstrations: Demonstrations,
+    robot: RobotModel,
+    indices: Sequence[int] | None = None,
+    names: Collection[str] = frozenset(),
 ) -> MinedKeyPoses:
     """Find the key poses of episodes. Reads no image.
 
@@ -76,20 +80,20 @@ def mine_key_poses(
         demonstrations: The dataset.
         robot: The robot that gave them.
         indices: The episodes; all if not given.
+        names: Names of the things that a memory holds already, by which instructions are read.
 
     Raises:
         DatasetError: No episode has any. The error gives the reasons.
     """
     episodes = demonstrations.episodes(indices)
     mined, skipped = [], {}
+    tasks = read_tasks((episode.task for episode in episodes), names)
     for episode in episodes:
-        try:
-            sub_tasks = parse_instruction(episode.task)
-        except InstructionError as error:
-            skipped[episode.index] = str(error)
-            continue
         key_poses = find_key_poses(episode, robot)
-        if key_poses:
+        if episode.task not in tasks:
+            skipped[episode.index] = f"its task {episode.task!r} says nothing"
+        elif key_poses:
+            sub_tasks = as_shown(tasks[episode.task], key_poses)
             mined.append(MinedEpisode(episode, tuple(key_poses), sub_tasks))
         else:
             skipped[episode.index] = "nothing is grasped or pushed in it"
@@ -242,7 +246,7 @@ def hints(item: MinedEpisode) -> tuple[Hint, ...]:
         sub_task, point = sub_task_of(pose, item.sub_tasks), pose.T_world_ee[:3, 3]
         if pose.phase == "grasp":
             found.append(Hint(sub_task.target, point, "grasp", f"{item.episode.task}: {len(found)}"))
-        elif pose.phase == "release" and sub_task.landmark and not sub_task.part:
+        elif pose.phase == "release" and sub_task.relation and not sub_task.part:
             # What goes into an opened part lies where nothing was to be seen in the first frame.
             found.append(Hint(sub_task.landmark, point, "release", f"{item.episode.task}: {len(found)}"))
     for before, pose in zip(item.key_poses[:-1], item.key_poses[1:], strict=True):

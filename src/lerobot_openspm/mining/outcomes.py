@@ -58,7 +58,8 @@ def outcomes(
     for i, sub_task in enumerate(sub_tasks):
         # A target that a later sub-task moves on ends where that one leaves it.
         moved_on = any(later.target == sub_task.target for later in sub_tasks[i + 1 :])
-        if sub_task.landmark and sub_task.landmark != sub_task.target and not moved_on:
+        is_told = sub_task.relation and not sub_task.words  # else nobody says that it is to end there
+        if is_told and sub_task.landmark != sub_task.target and not moved_on:
             for n, outcome in _outcomes(i, sub_task, demonstrations, ends).items():
                 found[n].append(outcome)
     return [tuple(one) for one in found]

@@ -1,0 +1,110 @@
+"""Instructions that the grammar cannot read: kept, named and compared by their own words."""
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from lerobot_openspm.errors import InstructionError
+from lerobot_openspm.memory.entry import OWN_WORDS
+from lerobot_openspm.memory.instruction import read_task, read_tasks
+from lerobot_openspm.memory.names import TABLE_NAMES
+from lerobot_openspm.memory.own_words import normal_words, unread, words_similarity
+
+
+@pytest.mark.parametrize(
+    ("said", "words"),
+    [
+        ("Could you please wipe the table?", "wipe table"),
+        ("WIPE_THE_TABLE", "wipe table"),
+        ("put block a on block b", "put block a on block b"),
+        ("grab a towel", "grab towel"),
+        ("Räum die Küche auf", "raum die kuche auf"),
+        ("拿起杯子", "拿起杯子"),
+        ("please", "please"),
+        (" ?!", ""),
+    ],
+)
+def test_words_in_normal_form(said: str, words: str):
+    assert normal_words(said) == words
+
+
+@pytest.mark.parametrize(
+    ("said", "objects"),
+    [
+        ("wipe the table with the sponge", ("sponge",)),
+        ("pour the coffee into the cup", ("coffee", "cup")),
+        ("clean the plate with the brush", ("brush", "plate")),
+        ("fold the red towel in half", ("red towel",)),
+        ("turn the knob to the left", ("knob",)),
+        ("wipe the table", ("wipe table object",)),
+    ],
+)
+def test_names_of_things_come_from_the_words_where_they_give_them(said: str, objects: tuple[str, ...]):
+    assert unread(said).objects == objects
+
+
+def test_what_says_nothing_is_no_task():
+    with pytest.raises(InstructionError, match="says nothing"):
+        read_task(" ... ")
+
+
+@pytest.mark.parametrize(
+    ("asked", "known"),
+    [
+        ("could you wipe a table using the sponge", "wipe the table with the sponge"),
+        ("would you mind wiping the table with the sponge", "wipe the table with the sponge"),
+        ("wipe the table", "wipe the table with the sponge"),
+        ("pour coffee in the mug", "pour the coffee into the cup"),
+        ("screw on the lid", "screw the lid on"),
+    ],
+)
+def test_light_rewordings_are_found(asked: str, known: str):
+    assert words_similarity(normal_words(asked), normal_words(known), TABLE_NAMES) > 0.85
+
+
+@pytest.mark.parametrize(
+    ("asked", "known"),
+    [
+        ("wipe the window", "wipe the table"),
+        ("scrub the table", "wipe the table"),
+        ("do not wipe the table", "wipe the table"),
+        ("never wipe the table", "wipe the table"),
+        ("if it rains, wipe the table", "wipe the table"),
+        ("wipe the table with the sponge", "wipe the table"),
+        ("wipe the table with the towel", "wipe the table with the sponge"),
+        ("turn the knob to the right", "turn the knob to the left"),
+        ("screw the lid off", "screw the lid on"),
+        ("put block b on block a", "put block a on block b"),
+        ("pour the cup into the coffee", "pour the coffee into the cup"),
+        ("stir the soup and pour the milk", "pour the milk and stir the soup"),
+    ],
+)
+def test_other_tasks_are_not(asked: str, known: str):
+    assert words_similarity(normal_words(asked), normal_words(known), TABLE_NAMES) < 0.75
+
+
+@given(st.text(max_size=60))
+def test_any_text_with_a_word_is_a_task_that_its_own_words_find(text: str):
+    if not normal_words(text):
+        return
+    (sub_task, *_) = read_task(text)
+    assert sub_task.target
+    if sub_task.operation == OWN_WORDS:
+        assert words_similarity(sub_task.words, normal_words(text), TABLE_NAMES) == 1.0
+
+
+def test_verbs_that_need_a_place_are_kept_by_their_words_without_one():
+    lifted, stored, pulled = (read_task(f"{verb} the box")[0] for verb in ("lift", "store", "pull"))
+    assert lifted.operation == "put"
+    assert stored.words == "store box"
+    assert pulled.words == "pull box"
+
+
+def test_what_is_learned_keeps_its_name_beside_another_of_its_kind():
+    (task,) = read_tasks(["put the pen in the organizer"], {"caddy"}).values()
+    assert task[0].landmark == "organizer"
+
+
+def test_tasks_are_read_together():
+    tasks = read_tasks(["wipe the table", "put the bowl on the plate", "  "])
+    assert list(tasks) == ["wipe the table", "put the bowl on the plate"]
