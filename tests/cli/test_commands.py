@@ -145,10 +145,12 @@ def test_collecting_into_a_foreign_folder_is_one_line(openspm: Openspm, tmp_path
         (("mine", "--policy.execution=telepathy"), "telepathy"),
     ],
 )
-def test_a_bad_option_is_refused_without_a_traceback(arguments: tuple[str, ...], words: str, tmp_path: Path):
+def test_a_bad_option_is_refused_without_a_traceback(
+    openspm: Openspm, arguments: tuple[str, ...], words: str, tmp_path: Path
+):
     target = f"--root={tmp_path / 'data'}" if arguments[0] == "collect" else f"--output={tmp_path / 'out'}"
-    done = run_command("openspm", *arguments, target)
-    assert done.returncode == 2
-    assert "Traceback" not in done.stderr
-    assert words in done.stderr
+    code, _, err = openspm(*arguments, target)
+    assert code == 2
+    assert "Traceback" not in err
+    assert words in err
     assert not list(tmp_path.iterdir())
