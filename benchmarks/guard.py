@@ -26,10 +26,13 @@ from typing import Any
 
 import draccus
 import numpy as np
+from benchmarks.libero import evaluate as harness
+from benchmarks.libero import stages
 from scipy.optimize import brentq
 from scipy.stats import binom
 
 from lerobot_openspm.cli import pipeline
+from lerobot_openspm.cli.collect import CollectConfig, SimulatorConfig, collect
 from lerobot_openspm.envs.seeds import TUNING_SEED_START
 
 FALSE_ALARM, POWER = 0.01, 0.9
@@ -126,12 +129,6 @@ def tabletop(standard: Standard, output: Path) -> list[Run]:
 
 def libero(standard: Standard, output: Path) -> list[Run]:
     """LIBERO-GOAL's episodes, from scenes drawn by the guard's seeds, not the benchmark's initial states."""
-    # They need lerobot[libero].
-    from benchmarks.libero import evaluate as harness
-    from benchmarks.libero import stages
-
-    from lerobot_openspm.cli.collect import CollectConfig, SimulatorConfig, collect
-
     root = output / "dataset"
     collect(CollectConfig(SimulatorConfig("libero"), standard.demos, str(root), repo_id=stages.REPO_ID))
     checkpoint, _ = stages.policy(root, "train")

@@ -2,14 +2,18 @@
 
 import json
 import re
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 import pytest
 from benchmarks.guard import FALSE_ALARM, POWER, STANDARDS, GuardConfig, Run, Standard
+from benchmarks.libero import evaluate as harness
+from benchmarks.libero import stages
 from scipy.stats import binom
 
 from benchmarks import guard
+from lerobot_openspm.cli import pipeline
 from lerobot_openspm.envs.seeds import TUNING_SEEDS
 
 ROOT = Path(__file__).parents[2]
@@ -88,6 +92,48 @@ def test_the_verdict_is_the_exit_code(
     assert f"    seed {STANDARD.seed}: failed after 100 steps, status 'done'" in out
     with pytest.raises(ValueError, match="--suite is 'robosuite', expected one of tabletop, libero"):
         GuardConfig(suite="robosuite")
+
+
+def test_the_tabletops_episodes_are_those_of_the_demos_steps(monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
+    done = []
+    monkeypatch.setattr(pipeline, "collect_dataset", lambda *given: done.append(given))
+    monkeypatch.setattr(pipeline, "train", lambda *given: done.append(given) or (tmp_path / "trained", 1.0))
+    episode = pipeline.Episode("push_plate", STANDARD.seed, 212, False, "time_limit")
+    monkeypatch.setattr(pipeline, "evaluate", lambda *given: done.append(given) or [episode])
+    assert guard.tabletop(STANDARD, tmp_path) == [Run("push_plate", STANDARD.seed, False, 212, "time_limit")]
+    assert done == [
+        (tmp_path / "dataset", STANDARD.demos),
+        (tmp_path / "dataset", tmp_path / "train"),
+        (tmp_path / "trained", tmp_path / "evaluation", STANDARD.episodes, STANDARD.seed),
+    ]
+
+
+def test_liberos_scenes_are_drawn_from_the_guards_own_seeds(monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
+    collected, jobs = [], []
+    checkpoint = tmp_path / "trained"
+    checkpoint.mkdir()
+    for name in ("model.safetensors", "memory.json", "config.json"):
+        (checkpoint / name).write_text(name)
+
+    def run_one(job: harness.Job):
+        config, task, state = job
+        jobs.append((config.tuning, config.tuning_seed + state))
+        told = {"steps": 90, "success": state == 0, "status": "done", "phase": "retreat"}
+        return {"task": task, "state": state, "seed": config.tuning_seed + state, **told}
+
+    monkeypatch.setattr(guard, "collect", collected.append)
+    monkeypatch.setattr(stages, "policy", lambda root, variant: (checkpoint, 1.0))
+    monkeypatch.setattr(harness, "tasks", lambda: {"push_the_plate": "push the plate"})
+    monkeypatch.setattr(harness, "evaluate_one", run_one)
+    monkeypatch.setattr(harness, "EvaluationConfig", partial(harness.EvaluationConfig, processes=1))
+    standard = Standard(expected=0.95, demos=1, episodes=2, seed=STANDARDS["libero"].seed)
+    reason = "every key pose was met, but the goal does not hold"
+    assert guard.libero(standard, tmp_path) == [
+        Run("push_the_plate", standard.seed, True, 90, reason),
+        Run("push_the_plate", standard.seed + 1, False, 90, reason),
+    ]
+    assert jobs == [(True, standard.seed), (True, standard.seed + 1)]
+    assert [(one.env.type, one.episodes) for one in collected] == [("libero", 1)]
 
 
 def test_its_seeds_are_tuning_seeds_that_nobody_else_uses():
