@@ -48,7 +48,7 @@ def test_a_command_lists_its_options(openspm: Openspm, command: str):
     assert options[command] in out
 
 
-def test_mining_then_inspecting(openspm: Openspm, tiny_dataset: Path, tmp_path: Path):
+def test_mining_then_inspecting(openspm: Openspm, tiny_dataset: Path, checkpoint: Path, tmp_path: Path):
     memory = tmp_path / "memory"
     code, out, _ = openspm(
         "mine", f"--root={tiny_dataset}", f"--output={memory}", f"--policy.cameras={CALIBRATION}"
@@ -59,6 +59,10 @@ def test_mining_then_inspecting(openspm: Openspm, tiny_dataset: Path, tmp_path: 
     assert (summary["entries"], summary["episodes"]) == (6, 6)
     assert summary["objects"] == ["bowl", "plate", "stove"]
     assert sorted(path.name for path in memory.iterdir()) == sorted(names(memory))
+    # Mining is deterministic: training mined the same in another process, to the last bit.
+    assert {name: (memory / name).read_bytes() for name in names(memory)} == {
+        name: (checkpoint / name).read_bytes() for name in names(checkpoint)
+    }
 
     code, out, _ = openspm("inspect", f"--path={memory}")
     assert code == 0

@@ -181,7 +181,8 @@ def test_nothing_is_saved_without_a_memory(policy: OpenSPMPolicy, tmp_path: Path
 
 @pytest.fixture
 def oracle(tiny_meta: LeRobotDatasetMetadata) -> OpenSPMPolicy:
-    return OpenSPMPolicy(new_config(tiny_meta, perception="oracle"), dataset_meta=tiny_meta)
+    config = new_config(tiny_meta, perception="oracle", memory_episodes=[0])
+    return OpenSPMPolicy(config, dataset_meta=tiny_meta)
 
 
 def test_the_oracle_needs_the_poses(oracle: OpenSPMPolicy, recorded: list[list[Frame]]):
