@@ -2,7 +2,7 @@
 
 .DEFAULT_GOAL := setup
 .NOTPARALLEL:
-.PHONY: help setup egl demo figures libero libero-setup libero-tables test lint typecheck format clean
+.PHONY: help setup egl demo figures libero libero-setup libero-tables test test-slow guard lint typecheck format clean
 
 # The demo's total time counts the set-up, so the clock starts before anything else does.
 STARTED_AT := $(shell date +%s)
@@ -11,7 +11,10 @@ DEMOS ?= 10
 EPISODES ?= 20
 STATES ?= 50
 TASKS ?= 0-9
+SUITE ?= tabletop
 PYTEST_ARGS ?=
+# The tests of a file share what they make, so a file stays in one process.
+TWO_PROCESSES := -n 2 --dist loadfile
 
 BIN := .venv/bin
 
@@ -49,7 +52,15 @@ libero-tables: setup ## write docs/results.md from what was measured (benchmarks
 	@$(BIN)/python -m benchmarks.tables
 
 test: egl ## run the tests, without those marked slow, libero or gpu (PYTEST_ARGS=... adds arguments)
-	@$(BIN)/python -m pytest -n 2 $(PYTEST_ARGS)
+	@$(BIN)/python -m pytest $(TWO_PROCESSES) $(PYTEST_ARGS)
+
+# Properties run again here, on more examples than in the default tests.
+test-slow: egl ## run the slow tests, and let the properties explore (PYTEST_ARGS=--hypothesis-seed=0 repeats a run)
+	@HYPOTHESIS_PROFILE=explore $(BIN)/python -m pytest $(TWO_PROCESSES) \
+		-m "(slow or hypothesis) and not libero and not gpu" $(PYTEST_ARGS)
+
+guard: egl ## record, train and run episodes of SUITE (tabletop or libero) from pixels; fails below the success floor
+	@$(BIN)/python -m benchmarks.guard --suite=$(SUITE)
 
 lint: setup ## ruff's rules and format, then the types; changes nothing
 	@$(BIN)/ruff check .

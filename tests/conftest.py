@@ -7,13 +7,9 @@ from pathlib import Path
 
 import pytest
 from filelock import FileLock
-from hypothesis import settings
+from tests import properties  # noqa: F401 - loads Hypothesis' profile
 from tests.hub.loopback_hub import LoopbackHub
-from tests.policy.lerobot_commands import lerobot_train, pretrained, training_options
-
-# A busy machine is no failure.
-settings.register_profile("openspm", deadline=None)
-settings.load_profile("openspm")
+from tests.policy.lerobot_commands import pretrained, run_command, train_arguments, training_options
 
 
 @pytest.fixture
@@ -64,7 +60,12 @@ def other_dataset(make_once: Callable[..., Path]) -> Path:
 @pytest.fixture(scope="session")
 def training_run(make_once: Callable[..., Path], tiny_dataset: Path) -> Path:
     """Output folder of lerobot-train on the tiny dataset. Copy it to go on training."""
-    return make_once("training_run", lambda output: lerobot_train(*training_options(tiny_dataset, output)))
+
+    def train(output: Path) -> None:
+        done = run_command("lerobot-train", *train_arguments(*training_options(tiny_dataset, output)))
+        assert done.returncode == 0, done.stderr[-4000:]
+
+    return make_once("training_run", train)
 
 
 @pytest.fixture(scope="session")

@@ -51,6 +51,7 @@ class EvaluationConfig:
         task: A task's name, several with commas, or "all".
         episodes: Initial states a task, from the first on.
         tuning: Draw as many scenes from tuning seeds instead of taking the benchmark's initial states.
+        tuning_seed: The first of those seeds.
         processes: Episodes at a time, each in a process of its own; a single one stays in this process.
         image_size: Pixels; lerobot-eval's default.
         execution: Of the policy; the checkpoint's if not given.
@@ -61,6 +62,7 @@ class EvaluationConfig:
     task: str = "all"
     episodes: int = 50
     tuning: bool = False
+    tuning_seed: int = TUNING_SEED
     processes: int = 2
     image_size: int = 360
     execution: Execution | None = None
@@ -104,7 +106,8 @@ def _set_others_aside(config: EvaluationConfig, output: Path, log: Path) -> None
     """Keep apart what was made of something else, and note what the next episodes are made of."""
     files = [Path(config.checkpoint) / name for name in ("model.safetensors", "memory.json", "config.json")]
     code = [Path(__file__), Path(__file__).with_name("episode.py")]
-    settings = [f"{key}={getattr(config, key)}" for key in ("tuning", "image_size", "execution")]
+    keys = ("tuning", "tuning_seed", "image_size", "execution")
+    settings = [f"{key}={getattr(config, key)}" for key in keys]
     made_of, kept = digest([*code, *files], settings), output / "made_of.sha256"
     if log.exists() and (not kept.exists() or kept.read_text() != made_of):
         aside = next(p for i in count(1) if not (p := output / f"episodes_before_{i}.jsonl").exists())
@@ -163,7 +166,7 @@ def evaluate_one(job: Job) -> dict[str, Any]:
     """Run one episode, with a policy and a simulator kept by the process."""
     config, task, state = job
     policy, simulator = _policy(config), _simulator(task, config.image_size)
-    seed = (TUNING_SEED if config.tuning else SEED) + state
+    seed = (config.tuning_seed if config.tuning else SEED) + state
     if config.tuning:
         simulator.reset(seed)
         _move_hand(simulator, np.random.default_rng(seed))

@@ -1,5 +1,6 @@
 """`openspm calibrate` on rendered demonstrations, typed as a user types it."""
 
+import functools
 import json
 from collections.abc import Callable
 from pathlib import Path
@@ -47,7 +48,8 @@ def turning_dataset(make_once: Callable[..., Path]) -> Path:
     from lerobot_openspm.cli.collect import CollectConfig, SimulatorConfig, collect
 
     env = SimulatorConfig(task="open_middle_drawer,turn_on_stove")
-    return make_once("turning_dataset", lambda root: collect(CollectConfig(env, 2, str(root), workers=0)))
+    config = functools.partial(CollectConfig, env, 2, height=160, width=160, workers=0)
+    return make_once("turning_dataset", lambda root: collect(config(root=str(root))))
 
 
 def test_the_hand_camera_is_found_and_other_cameras_are_kept(

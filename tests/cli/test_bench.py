@@ -49,10 +49,13 @@ def test_a_folder_of_somebody_else_is_left_alone(openspm: Openspm, checkpoint: P
     assert (tmp_path / "mine" / "precious.txt").read_text() == "do not remove"
 
 
-def test_tracking_is_measured_and_goes_on_where_it_was(openspm: Openspm, checkpoint: Path, tmp_path: Path):
+@pytest.mark.parametrize("workers", [1, pytest.param(2, marks=pytest.mark.slow)])
+def test_tracking_is_measured_and_goes_on_where_it_was(
+    openspm: Openspm, checkpoint: Path, tmp_path: Path, workers: int
+):
     arguments = (
         "bench", "tracking", f"--policy.path={checkpoint}", "--env.task=bowl_on_plate", "--episodes=1",
-        "--seed=2000000", f"--output={tmp_path / 'out'}",
+        "--seed=2000000", f"--workers={workers}", f"--output={tmp_path / 'out'}",
     )  # fmt: skip
     code, out, err = openspm(*arguments)
     assert code == 0, err
@@ -73,7 +76,8 @@ def test_tracking_is_measured_and_goes_on_where_it_was(openspm: Openspm, checkpo
 def test_perception_is_measured(openspm: Openspm, checkpoint: Path, tiny_dataset: Path, tmp_path: Path):
     arguments = (
         "bench", "perception", f"--policy.path={checkpoint}", f"--dataset.root={tiny_dataset}",
-        "--env.task=turn_on_stove", "--episodes=1", "--seed=2000000", f"--output={tmp_path / 'out'}",
+        "--env.task=turn_on_stove", "--episodes=1", "--seed=2000000", "--workers=1",
+        f"--output={tmp_path / 'out'}",
     )  # fmt: skip
     code, out, err = openspm(*arguments)
     assert code == 0, err

@@ -35,7 +35,7 @@ def test_teaching_is_measured_and_goes_on_where_it_was(openspm: Openspm, tiny_da
     output = tmp_path / "out"
     arguments = (
         "bench", "teach", f"--dataset.root={tiny_dataset}", "--env.task=turn_on_stove", "--episodes=1",
-        "--seed=2000000", "--steps=20", f"--output={output}",
+        "--seed=2000000", "--steps=20", "--workers=1", f"--output={output}",
     )  # fmt: skip
     code, out, err = openspm(*arguments)
     assert code == 0, err

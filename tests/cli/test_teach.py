@@ -243,7 +243,9 @@ def test_wrong_options_are_one_line_and_change_nothing(
     assert contents(into) == before
 
 
-@pytest.mark.parametrize("moment", ["Reading images", "Finding objects"])
+@pytest.mark.parametrize(
+    "moment", ["Finding objects", pytest.param("Reading images", marks=pytest.mark.slow)]
+)
 def test_a_kill_leaves_the_checkpoint_as_it_was(
     openspm: Openspm, into: Path, other_dataset: Path, moment: str
 ):

@@ -1,8 +1,9 @@
 """Which of several objects is meant: by hand, in LIBERO's scenes, and however a scene is moved or turned."""
 
 import pytest
-from hypothesis import assume, given, settings
+from hypothesis import assume, given
 from hypothesis import strategies as st
+from tests.properties import examples
 
 from lerobot_openspm.control.reference import MARGIN_M, OPPOSITE_THE_ROBOT, choose
 from lerobot_openspm.errors import InstructionError
@@ -121,7 +122,7 @@ def costs_are_clear(reference, candidates, landmarks):
 
 
 @pytest.mark.parametrize("reference", RELATIONS, ids=str)
-@settings(max_examples=30)
+@examples(30)
 @given(places=PLACES, yaw=st.floats(-3, 3), x=st.floats(-1, 1), y=st.floats(-1, 1))
 def test_a_scene_that_is_moved_and_turned_with_its_speaker_means_the_same(reference, places, yaw, x, y):
     candidates, landmarks = scene(places)
@@ -135,7 +136,7 @@ def test_a_scene_that_is_moved_and_turned_with_its_speaker_means_the_same(refere
 
 
 @pytest.mark.parametrize("reference", RELATIONS, ids=str)
-@settings(max_examples=30)
+@examples(30)
 @given(places=PLACES, order=st.randoms())
 def test_the_order_of_the_candidates_does_not_matter(reference, places, order):
     candidates, landmarks = scene(places)
@@ -146,7 +147,7 @@ def test_the_order_of_the_candidates_does_not_matter(reference, places, order):
     assert (None if chosen is None else shuffled[chosen]) == expected
 
 
-@settings(max_examples=30)
+@examples(30)
 @given(places=PLACES)
 def test_left_is_right_for_who_stands_on_the_other_side(places):
     candidates, landmarks = scene(places)

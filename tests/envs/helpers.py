@@ -7,11 +7,11 @@ from lerobot_openspm.envs.tabletop_env import TabletopEnv
 
 
 def run_expert(env: TabletopEnv, seed: int) -> tuple[dict, int]:
-    """Let the expert act from `seed`; returns the last info and the number of steps."""
+    """Let the expert act from `seed`, rendering nothing; returns the last info and the number of steps."""
     _, info = env.reset(seed=seed)
     steps = 0
     for action in expert_actions(env.simulator, env.task, np.random.default_rng(seed)):
-        _, _, terminated, truncated, info = env.step(action)
+        _, terminated, truncated, info = env.advance(action)
         steps += 1
         if terminated or truncated:
             break

@@ -75,15 +75,16 @@ def test_an_interrupted_recording_goes_on_where_it_stopped(tmp_path, monkeypatch
     assert [e["task"] for e in recorded["episodes"]] == ["turn_on_stove", "bowl_on_plate"]
 
 
-def test_two_processes_record_what_one_does(tmp_path):
+def test_two_processes_record_what_one_does(tmp_path, tiny_dataset):
+    def recorded(root):
+        return json.loads((root / "meta/openspm_collect.json").read_text())["episodes"]
+
     env = SimulatorConfig(task="turn_on_stove,bowl_on_plate")
-    recorded = []
-    for workers in (0, 2):
-        root = tmp_path / str(workers)
-        collect(CollectConfig(env, 1, str(root), height=128, width=128, workers=workers))
-        recorded.append(json.loads((root / "meta/openspm_collect.json").read_text())["episodes"])
-    assert recorded[0] == recorded[1]
-    assert [e["task"] for e in recorded[0]] == ["turn_on_stove", "bowl_on_plate"]
+    collect(CollectConfig(env, 1, str(tmp_path / "two"), height=128, width=128, workers=2))
+    stove, bowl = recorded(tmp_path / "two")
+    assert [stove["task"], bowl["task"]] == ["turn_on_stove", "bowl_on_plate"]
+    # One process has recorded three of each, the bowl first.
+    assert [bowl, stove] == recorded(tiny_dataset)[::3]
 
 
 def test_a_foreign_partial_folder_is_not_touched(tmp_path):
@@ -96,12 +97,10 @@ def test_a_foreign_partial_folder_is_not_touched(tmp_path):
 
 
 def test_a_broken_expert_stops_the_recording(tmp_path, monkeypatch):
-    record = TabletopSource.record
-
-    def failing(self, *arguments):
-        return dataclasses.replace(record(self, *arguments), success=False)
-
-    monkeypatch.setattr(TabletopSource, "record", failing)
+    failed = dataclasses.replace(
+        TabletopSource().record("turn_on_stove", DEMO_SEED_START, 64, 64), success=False
+    )
+    monkeypatch.setattr(TabletopSource, "record", lambda *_: failed)
     root = tmp_path / "demos"
     with pytest.raises(RuntimeError, match="failed 4 times on turn_on_stove"):
         collect(

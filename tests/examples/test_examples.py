@@ -25,6 +25,7 @@ def run(tmp_path: Path) -> Callable[..., str]:
     return run
 
 
+@pytest.mark.slow
 def test_a_memory_is_mined_and_looked_into(run: Callable[..., str], tiny_dataset: Path, tmp_path: Path):
     printed = run("01_record_and_mine.py", "--dataset", tiny_dataset, "--output", "one")
     assert "6 demonstrations" in printed
@@ -37,6 +38,7 @@ def test_a_memory_is_mined_and_looked_into(run: Callable[..., str], tiny_dataset
     assert cv2.imread(str(tmp_path / "three/key_poses.png")).shape == (512, 512, 3)
 
 
+@pytest.mark.slow
 def test_training_and_evaluation(run: Callable[..., str], tiny_dataset: Path, tmp_path: Path):
     printed = run(
         "02_train_and_evaluate.py", "--dataset", tiny_dataset, "--steps", 20, "--episodes", 1, "--max-length",

@@ -1,14 +1,9 @@
 """Hypothesis strategies for points, rotations and rigid transforms."""
 
 import numpy as np
-from hypothesis import settings
 from hypothesis import strategies as st
 
 from lerobot_openspm.geometry import se3
-
-# A busy machine makes single examples slow; that is no failure.
-settings.register_profile("openspm", deadline=None)
-settings.load_profile("openspm")
 
 
 @st.composite

@@ -105,6 +105,14 @@ def test_what_is_pulled_acts_as_what_was_pushed(
     pulled = run(ACT + PULL, tiny_dataset, REPO, home="home_b")
     assert answer(pulled) == [actions, 6]
 
+
+@pytest.mark.slow
+def test_what_was_pulled_needs_no_connection_and_a_deleted_memory_is_told(
+    run: Run, loopback_hub: LoopbackHub, checkpoint: Path, tiny_dataset: Path
+):
+    actions = answer(run(ACT + PUSH, checkpoint, tiny_dataset, REPO, home="home_a"))
+    files = loopback_hub.files(REPO)
+    assert answer(run(ACT + PULL, tiny_dataset, REPO, home="home_b")) == [actions, 6]
     # Everything is in the cache now, and nothing is asked for without a connection.
     requests = len(loopback_hub.requests)
     assert answer(run(ACT + PULL, tiny_dataset, REPO, home="home_b", offline=True)) == [actions, 6]
@@ -120,6 +128,7 @@ def test_what_is_pulled_acts_as_what_was_pushed(
     assert "pull the whole checkpoint" in broken.stderr
 
 
+@pytest.mark.slow
 def test_a_changed_memory_is_pushed_again_and_what_it_was_before_is_not_pulled(
     run: Run, loopback_hub: LoopbackHub, checkpoint: Path, tiny_dataset: Path, tmp_path: Path
 ):

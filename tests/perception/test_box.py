@@ -2,9 +2,10 @@
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from tests.perception.drawn_masks import turned_yaw
+from tests.properties import examples
 
 from lerobot_openspm.geometry import se3
 from lerobot_openspm.perception.box import Box, oriented_box
@@ -51,7 +52,7 @@ def test_a_full_box_is_found_at_any_size_place_and_yaw(a, b, height, x, y, z, ya
     assert turned_yaw(found.T_world_obj, T, np.pi) < 1e-3
 
 
-@settings(max_examples=40)
+@examples(40)
 @given(st.integers(0, 2**31), YAW, PLACE, PLACE)
 def test_moving_and_turning_the_points_moves_and_turns_the_box(seed, yaw, x, y):
     rng = np.random.default_rng(seed)

@@ -1,6 +1,6 @@
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 from scipy.stats import chi2
 from tests.geometry.strategies import transforms
@@ -148,6 +148,8 @@ def test_many_objects_are_filtered_as_each_alone(n: int, seed: int):
 
 
 @given(st.integers(0, 2**32 - 1))
+@example(229)  # a variance of 1e6 shrinks to 1e-2 in one step
+@example(287)
 def test_the_covariance_stays_symmetric_and_positive(seed: int):
     rng = np.random.default_rng(seed)
     belief = kalman.begin(np.eye(4)[None], R[None], 1.0, 1.0)
@@ -156,5 +158,5 @@ def test_the_covariance_stays_symmetric_and_positive(seed: int):
         measured = se3.from_position_rotvec(0.1 * rng.standard_normal(3), 0.3 * rng.standard_normal(3))[None]
         belief, _ = kalman.update(kalman.predict(belief, STEP), measured, spread[None], np.inf)
         P = belief.covariance[0]
-        np.testing.assert_allclose(P, P.T, atol=1e-9 * np.abs(P).max())
-        assert np.linalg.eigvalsh(0.5 * (P + P.T)).min() > -1e-9 * np.abs(P).max()
+        np.testing.assert_array_equal(P, P.T)
+        assert np.linalg.eigvalsh(P).min() > -1e-9 * np.abs(P).max()

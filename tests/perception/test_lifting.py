@@ -4,10 +4,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from tests.perception.drawn_masks import body, box_views, depth_of, masked_views, masks_of
 from tests.perception.drawn_world import draw_poses
+from tests.properties import examples
 
 from lerobot_openspm.errors import ObservationError
 from lerobot_openspm.geometry import se3
@@ -30,7 +31,7 @@ def without_depth(views):
     return {name: replace(view, depth=None) for name, view in views.items()}
 
 
-@settings(max_examples=15, deadline=None)
+@examples(15)
 @given(PLACE, PLACE, YAW)
 def test_points_with_depth_lie_on_the_object(x, y, yaw):
     box = Box(se3.from_yaw([x, y, 0.0], yaw), np.array([0.12, 0.06, 0.05]))
@@ -74,7 +75,7 @@ def test_a_mask_that_is_a_pixel_too_wide_brings_no_table_with_it():
     assert np.quantile(outside(lifted.points_world, box), 0.98) < 0.004
 
 
-@settings(max_examples=6, deadline=None)
+@examples(6)
 @given(st.integers(0, 2**31), st.sampled_from(["block", "cup"]))
 def test_the_hull_holds_the_object_and_fills_its_masks(seed, name):
     poses = draw_poses(np.random.default_rng(seed))
@@ -91,7 +92,7 @@ def test_the_hull_holds_the_object_and_fills_its_masks(seed, name):
     assert (high + slack > vertices.max(0)).all()
 
 
-@settings(max_examples=5, deadline=None)
+@examples(5)
 @given(YAW, PLACE, PLACE)
 def test_moving_and_turning_everything_moves_and_turns_the_points(yaw, x, y):
     poses = draw_poses(np.random.default_rng(3))

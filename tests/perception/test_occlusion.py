@@ -4,7 +4,6 @@ from tests.perception.drawn_world import cameras, draw_poses, views_of
 
 from lerobot_openspm.geometry import se3
 from lerobot_openspm.geometry.camera import project
-from lerobot_openspm.perception.learning import learn_objects
 from lerobot_openspm.perception.localise import localise
 from lerobot_openspm.perception.occlusion import hand_mask
 from lerobot_openspm.perception.types import View
@@ -34,12 +33,9 @@ def test_a_larger_hand_hides_more_and_a_hand_camera_sees_past_its_own():
     assert not hand_mask(view("ee"), T_world_ee, 0.08).any()
 
 
-@pytest.fixture(scope="module")
-def models():
-    from tests.perception.drawn_world import demonstration
-
-    rng = np.random.default_rng(3)
-    return learn_objects([demonstration(rng) for _ in range(6)], np.random.default_rng(0))
+@pytest.fixture
+def models(drawn_objects):
+    return drawn_objects
 
 
 def with_bar(views, name, T, share):

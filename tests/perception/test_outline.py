@@ -4,9 +4,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from tests.perception.drawn_masks import box_views, turned_yaw
+from tests.properties import examples
 
 from lerobot_openspm.geometry import se3
 from lerobot_openspm.perception.box import Box
@@ -26,7 +27,7 @@ def nearby(box: Box, turn: float = 0.25) -> Box:
     return Box(T, box.size, box.is_round)
 
 
-@settings(max_examples=25, deadline=None)
+@examples(25)
 @given(PLACE, PLACE, YAW, st.booleans())
 def test_a_body_of_known_size_is_found_within_a_millimetre_or_two(x, y, yaw, is_round):
     size = np.array([0.08, 0.08, 0.06]) if is_round else TRUE_SIZE
@@ -39,7 +40,7 @@ def test_a_body_of_known_size_is_found_within_a_millimetre_or_two(x, y, yaw, is_
         assert turned_yaw(found.body.T_world_obj, box.T_world_obj, np.pi) < np.deg2rad(2.5)
 
 
-@settings(max_examples=12, deadline=None)
+@examples(12)
 @given(YAW, st.floats(0.06, 0.14), st.floats(0.03, 0.05), st.floats(0.02, 0.09))
 def test_two_views_determine_size_and_support_plane_too(yaw, long_side, short_side, height):
     box = Box(se3.from_yaw([0.02, -0.03, 0.03], yaw), np.array([long_side, short_side, height]))
@@ -51,7 +52,7 @@ def test_two_views_determine_size_and_support_plane_too(yaw, long_side, short_si
     assert found.T_world_obj[2, 3] == pytest.approx(0.03, abs=0.009)
 
 
-@settings(max_examples=8, deadline=None)
+@examples(8)
 @given(YAW, PLACE, PLACE)
 def test_moving_and_turning_everything_moves_and_turns_the_fit(yaw, x, y):
     box = Box(se3.from_yaw([0.05, -0.02, 0.0], 0.6), TRUE_SIZE)

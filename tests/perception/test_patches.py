@@ -169,14 +169,6 @@ def test_what_is_not_there_is_not_found(models, unseen):
     assert localise(views_of(empty), models["cup"]).status == "not_found"
 
 
-def test_an_object_that_moves_far_is_known_by_its_shape():
-    from tests.perception.drawn_world import demonstration as free
-
-    rng = np.random.default_rng(1)
-    models = learn_objects([free(rng) for _ in range(5)], np.random.default_rng(0))
-    assert not any(isinstance(model, PatchModel) for model in models.values())
-
-
 def test_store_round_trip(models):
     fields, arrays = store.to_parts(models["cup"])
     again = store.from_parts(json.loads(json.dumps(fields)), arrays, "here")

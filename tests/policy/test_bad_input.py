@@ -12,7 +12,7 @@ import torch
 from lerobot.datasets import LeRobotDataset, LeRobotDatasetMetadata
 from tests.memory.memory_files import edit_header, names
 from tests.policy.conftest import Frame, batch_of
-from tests.policy.lerobot_commands import lerobot_train, training_options
+from tests.policy.lerobot_commands import call_lerobot, train_arguments, training_options
 from tests.policy.test_learning import new_config
 
 from lerobot_openspm.configuration_openspm import OpenSPMConfig
@@ -194,7 +194,8 @@ def test_nothing_is_saved_without_a_memory(policy: OpenSPMPolicy, tmp_path: Path
 
 @pytest.fixture
 def oracle(tiny_meta: LeRobotDatasetMetadata) -> OpenSPMPolicy:
-    return OpenSPMPolicy(new_config(tiny_meta, perception="oracle"), dataset_meta=tiny_meta)
+    config = new_config(tiny_meta, perception="oracle", memory_episodes=[0])
+    return OpenSPMPolicy(config, dataset_meta=tiny_meta)
 
 
 def test_the_oracle_needs_the_poses(oracle: OpenSPMPolicy, recorded: list[list[Frame]]):
@@ -214,12 +215,10 @@ def test_the_oracle_needs_as_many_poses_as_were_recorded(oracle: OpenSPMPolicy, 
 
 def test_training_without_a_calibration_says_how_to_give_one(tiny_dataset: Path, tmp_path: Path):
     output = tmp_path / "run"
-    log = lerobot_train(
-        *training_options(tiny_dataset, output), "--policy.cameras=null", succeeds=False
-    )  # fmt: skip
-    assert (
-        "CalibrationError: mining needs the cameras' calibration, got none; pass --policy.cameras=FILE" in log
-    )
+    message = "mining needs the cameras' calibration, got none; pass --policy.cameras=FILE"
+    options = (*training_options(tiny_dataset, output), "--policy.cameras=null")
+    with pytest.raises(CalibrationError, match=message):
+        call_lerobot("lerobot-train", *train_arguments(*options))
     assert not list(output.rglob("memory.*"))
 
 

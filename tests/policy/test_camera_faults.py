@@ -61,7 +61,7 @@ def test_a_broken_camera_stops_the_hand_after_half_a_second_and_the_episode_afte
     policy: OpenSPMPolicy, name: str, caplog: pytest.LogCaptureFixture
 ):
     with caplog.at_level(logging.WARNING):
-        actions = torch.stack(list(episode(policy, SPOILED[name], range(BROKEN_AT, BROKEN_AT + 70))))
+        actions = torch.stack(list(episode(policy, SPOILED[name], range(BROKEN_AT, BROKEN_AT + 50))))
     assert torch.isfinite(actions).all()
     moving = actions[:, :6].abs().max(dim=1).values > 0
     assert moving[: BROKEN_AT + 5].any()

@@ -6,7 +6,6 @@ import torch
 from lerobot.configs import FeatureType
 from lerobot.datasets import LeRobotDatasetMetadata
 from lerobot.utils.feature_utils import dataset_to_policy_features
-from tests.memory.memory_files import names
 from tests.policy.conftest import Frame, act
 from tests.policy.lerobot_commands import CALIBRATION
 
@@ -120,7 +119,7 @@ def numbers(samples: torch.Tensor) -> set[tuple[float, ...]]:
 
 
 def test_held_out_episodes_are_neither_remembered_nor_drawn(tiny_meta: LeRobotDatasetMetadata):
-    kept = [0, 1, 3, 4]
+    kept = [0, 1]
     policy = OpenSPMPolicy(new_config(tiny_meta, memory_episodes=kept), dataset_meta=tiny_meta)
     assert policy.experience is not None
     assert sorted(e.source for e in policy.experience.entries) == [f"{tiny_meta.repo_id}#{i}" for i in kept]
@@ -130,7 +129,7 @@ def test_held_out_episodes_are_neither_remembered_nor_drawn(tiny_meta: LeRobotDa
     samples = samples_of(tiny_meta, new_config(tiny_meta, memory_episodes=kept, **plain))
     starts, ends = tiny_meta.episodes["dataset_from_index"], tiny_meta.episodes["dataset_to_index"]
     held_out, remembered = (
-        torch.cat([torch.arange(starts[i], ends[i]) for i in indices]) for indices in ((2, 5), kept)
+        torch.cat([torch.arange(starts[i], ends[i]) for i in indices]) for indices in ((2, 3), kept)
     )
     allowed = numbers(samples.draw(remembered, 1, training=False)[0])
     forbidden = numbers(samples.draw(held_out, 1, training=False)[0])
@@ -145,13 +144,6 @@ def test_held_out_episodes_are_neither_remembered_nor_drawn(tiny_meta: LeRobotDa
 def test_an_episode_that_does_not_exist_is_named(tiny_meta: LeRobotDatasetMetadata, held_out: list[int]):
     with pytest.raises(DatasetError, match=r"has episodes 0 to 5, got \["):
         OpenSPMPolicy(new_config(tiny_meta, memory_episodes=held_out), dataset_meta=tiny_meta)
-
-
-def test_mining_is_deterministic(tiny_meta: LeRobotDatasetMetadata, tmp_path: Path, checkpoint: Path):
-    policy = OpenSPMPolicy(new_config(tiny_meta), dataset_meta=tiny_meta)
-    policy.save_pretrained(tmp_path / "again")
-    for name in names(checkpoint):
-        assert (tmp_path / "again" / name).read_bytes() == (checkpoint / name).read_bytes(), name
 
 
 def languages(policy: OpenSPMPolicy) -> list[str]:

@@ -101,7 +101,7 @@ def train(data: Demonstrations, task: str, steps: int, folder: Path) -> None:
 
     if folder.exists():
         return
-    # In a process of its own, as lerobot-train seeds its.
+    # The same weights in any process: seeded as lerobot-train is, on one thread.
     torch.set_num_threads(1)
     torch.manual_seed(TRAINING_SEED)
     others = sorted(i for name, own in data.episodes.items() if name != task for i in own)

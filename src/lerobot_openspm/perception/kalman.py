@@ -157,9 +157,12 @@ def update(belief: Belief, T: Array, R: Array, gate: float = GATE) -> tuple[Beli
     turn = belief.error + change[:, 6:9]
     # What is left of the orientation error is seen from the moved reference.
     reset = EYE_12 + (turn @ HALF_SKEW).reshape(-1, STATE, STATE)
-    # Joseph's form, which stays symmetric and positive for any gain.
+    # Joseph's form stays positive for any gain. In floating point it is symmetric only to the rounding of its
+    # largest terms; where a large variance shrinks to a small one, that is visible, hence the mean with its
+    # transpose.
     kept, gained = reset @ (EYE_12 - K @ H), reset @ K
     P = kept @ P @ kept.mT + gained @ R @ gained.mT
+    P = 0.5 * (P + P.mT)
     updated = Belief(
         belief.position + change[:, :3],
         _turned(turn) @ belief.rotation,

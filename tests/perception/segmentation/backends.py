@@ -1,14 +1,14 @@
 """Every segmentation backend with a scene to look at, each made once a process."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import cache
 
 import numpy as np
-from tests.perception.drawn_world import SHAPES, TABLE, demonstration, draw_poses, render, views_of
+from tests.perception.drawn_world import SHAPES, TABLE, draw_poses, render, views_of
 from tests.perception.segmentation import tiny_models
 
-from lerobot_openspm.perception.learning import learn_objects
+from lerobot_openspm.perception.model import ObjectModel
 from lerobot_openspm.perception.segmentation.given import GivenSegmenter
 from lerobot_openspm.perception.segmentation.grounded_sam2 import GroundedSam2Segmenter
 from lerobot_openspm.perception.segmentation.learned import LearnedSegmenter
@@ -55,11 +55,8 @@ def scene() -> Views:
     return labelled(draw_poses(np.random.default_rng(7)))
 
 
-@cache
-def demonstrations() -> Backend:
+def demonstrations(objects: Mapping[str, ObjectModel]) -> Backend:
     """Objects learned from demonstrations."""
-    rng = np.random.default_rng(1)
-    objects = learn_objects([demonstration(rng) for _ in range(6)], np.random.default_rng(0))
     segmenter = LearnedSegmenter(objects)
     return Backend(segmenter, scene(), segmenter, without_objects())
 
@@ -88,8 +85,8 @@ def given() -> Backend:
     return Backend(segmenter, scene(), segmenter, without_objects())
 
 
+# What needs nothing but itself; the masks of learned objects come with the objects.
 BACKENDS: dict[str, Callable[[], Backend]] = {
-    "demonstrations": demonstrations,
     "sam3": sam3,
     "grounded_sam2": grounded_sam2,
     "given": given,

@@ -5,9 +5,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from tests.perception.segmentation.backends import BACKENDS, PHRASES, Backend
+from tests.perception.segmentation.backends import BACKENDS, PHRASES, Backend, demonstrations
 
 from lerobot_openspm.errors import ObservationError, PerceptionError
+from lerobot_openspm.perception.model import ObjectModel
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -19,9 +20,9 @@ def one_thread():
     torch.set_num_threads(before)
 
 
-@pytest.fixture(params=BACKENDS)
-def backend(request: pytest.FixtureRequest) -> Backend:
-    return BACKENDS[request.param]()
+@pytest.fixture(params=["demonstrations", *BACKENDS])
+def backend(request: pytest.FixtureRequest, drawn_objects: dict[str, ObjectModel]) -> Backend:
+    return demonstrations(drawn_objects) if request.param == "demonstrations" else BACKENDS[request.param]()
 
 
 def assert_same(a, b):

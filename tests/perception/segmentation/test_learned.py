@@ -8,12 +8,13 @@ from tests.perception.builders import model, patch_model
 from tests.perception.segmentation.backends import LABELS, PHRASES, Backend, demonstrations
 
 from lerobot_openspm.errors import PerceptionError
+from lerobot_openspm.perception.model import ObjectModel
 from lerobot_openspm.perception.segmentation.learned import LearnedSegmenter
 
 
 @pytest.fixture
-def learned() -> Backend:
-    return demonstrations()
+def learned(drawn_objects: dict[str, ObjectModel]) -> Backend:
+    return demonstrations(drawn_objects)
 
 
 def overlap(a, b):
