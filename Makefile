@@ -40,10 +40,10 @@ figures: egl ## measure the published figures into benchmarks/results; the last 
 
 # LIBERO and its scenes are hundreds of megabytes that only these figures need.
 libero-setup: egl
-	@$(BIN)/python -c 'import importlib.util, sys; sys.exit(importlib.util.find_spec("libero") is None)' \
-		|| $(BIN)/python -m pip install --no-input --disable-pip-version-check --editable '.[libero]'
-	@# LIBERO asks once where its datasets are to go; they are not used here.
-	@echo N | $(BIN)/python -c 'import libero.libero' >/dev/null
+	@$(BIN)/python -c 'import importlib.util, sys; sys.exit(importlib.util.find_spec("libero") is None)' || { \
+		$(BIN)/python -m ensurepip >/dev/null; \
+		$(BIN)/python -m pip install --no-input --disable-pip-version-check --editable '.[libero]'; }
+	@$(BIN)/python scripts/libero_assets.py
 
 libero: libero-setup ## the same on LIBERO-GOAL: DEMOS, STATES initial states of TASKS (0-9); needs LIBERO, see README
 	@$(BIN)/python -m benchmarks.libero.run --demos=$(DEMOS) --states=$(STATES) --tasks=$(TASKS)

@@ -41,7 +41,7 @@ def main(config: EqualityConfig) -> dict[str, Any]:
     plain, lazy = [], []
     for number, task in enumerate(tqdm(tasks(), unit="task")):
         plain += _plain(acting, checkpoint, number, config.states)
-        simulator = LiberoSimulator(task, 360, render_steps=False)
+        simulator = LiberoSimulator(task, 360)
         for state in range(config.states):
             simulator.reset_to(SEED + state, initial_states(task)[state])
             lazy.append(run_episode(acting, simulator).actions)

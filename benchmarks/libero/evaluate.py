@@ -219,7 +219,7 @@ def _simulator(task: str, image_size: int) -> LiberoSimulator:
     if _KEPT.get("task") != task:
         if "simulator" in _KEPT:
             _KEPT["simulator"].close()
-        _KEPT.update(task=task, simulator=LiberoSimulator(task, image_size, render_steps=False))
+        _KEPT.update(task=task, simulator=LiberoSimulator(task, image_size))
     return _KEPT["simulator"]
 
 

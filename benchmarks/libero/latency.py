@@ -29,7 +29,7 @@ def main() -> dict[str, Any]:
     torch.set_num_threads(1)
     checkpoint, _ = policy(dataset(), "train")
     acting = OpenSPMPolicy.from_pretrained(checkpoint)
-    simulator = LiberoSimulator(TASK, 360, render_steps=False)
+    simulator = LiberoSimulator(TASK, 360)
     simulator.reset(TUNING_SEED_START)
     layout, vector = acting.config.layouts()[0], simulator.state().astype(float)
     hand = Hand(layout.poses(vector), float(layout.openings(vector)))

@@ -68,7 +68,7 @@ def world(env_type: str, task: str, seed: int) -> Generator[World]:
         from lerobot_openspm.bench.libero import IMAGE_SIZE, LiberoWorld
         from lerobot_openspm.envs.libero.simulator import LiberoSimulator
 
-        with contextlib.closing(LiberoSimulator(task, IMAGE_SIZE, render_steps=False)) as simulator:
+        with contextlib.closing(LiberoSimulator(task, IMAGE_SIZE)) as simulator:
             simulator.reset(seed)
             yield LiberoWorld(simulator)
 

@@ -14,12 +14,13 @@ import functools
 import os
 from collections.abc import Mapping
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 from lerobot.envs.utils import preprocess_observation
 from lerobot.processor.env_processor import LiberoProcessorStep
+
+from lerobot_openspm.envs.libero.rendering import Renderer
 
 SUITE = "libero_goal"
 HAND_BODY, GRIP_SITE = "robot0_right_hand", "gripper0_grip_site"
@@ -53,11 +54,10 @@ class LiberoSimulator:
 
     Args:
         task: A name in :func:`tasks`.
-        image_size: Height and width of the images in pixels; None renders nothing, which is far faster.
-        render_steps: Whether every step renders, as in LIBERO; else images are made when asked for.
+        image_size: Height and width of the images in pixels, which are drawn when asked for; None draws none.
     """
 
-    def __init__(self, task: str, image_size: int | None = None, render_steps: bool = True) -> None:
+    def __init__(self, task: str, image_size: int | None = None) -> None:
         if task not in tasks():
             raise ValueError(f"{SUITE} has no task {task!r}, expected one of {', '.join(tasks())}")
         from libero.libero import get_libero_path  # pyright: ignore[reportMissingImports]
@@ -65,13 +65,11 @@ class LiberoSimulator:
 
         self.task, self.instruction = task, tasks()[task]
         self._image_size = image_size
-        self._render_steps = image_size is not None and render_steps
+        self._renderer: Renderer | None = None
         self._env: Any = ControlEnv(
             bddl_file_name=os.fspath(Path(get_libero_path("bddl_files")) / SUITE / f"{task}.bddl"),
-            use_camera_obs=self._render_steps,
-            has_offscreen_renderer=image_size is not None,
-            camera_heights=image_size or 1,
-            camera_widths=image_size or 1,
+            use_camera_obs=False,
+            has_offscreen_renderer=False,
         )
         self._observation: dict[str, Any] = {}
         # The scene as it was when the last observation was sampled, MuJoCo's data.
@@ -97,7 +95,7 @@ class LiberoSimulator:
         # LIBERO draws its scenes from NumPy's global generator; there is no other way to seed them.
         self._env.seed(seed)
         self._observation = self._env.reset()
-        if self._image_size is not None and not self._render_steps:
+        if self._image_size is not None:
             self._keep_what_is_sampled()
 
     def _keep_what_is_sampled(self) -> None:
@@ -125,8 +123,6 @@ class LiberoSimulator:
 
     def step(self, action: np.ndarray) -> bool:
         """Apply a 7-D action for one step of 20 Hz. Returns whether LIBERO's goal holds now."""
-        if self._render_steps:
-            self._draw_here()
         self._observation, _, _, _ = self._env.step(action)
         return bool(self._env.check_success())
 
@@ -162,26 +158,24 @@ class LiberoSimulator:
         return {name: self.image(name) for name in CAMERAS}
 
     def image(self, name: str) -> np.ndarray:
-        """One camera's image (H, W, 3) uint8, turned as LeRobot turns it."""
+        """One camera's image (H, W, 3) uint8, turned as LeRobot turns it.
+
+        Raises:
+            ValueError: The simulator was made without images.
+        """
         if self._image_size is None:
             raise ValueError("this simulator was made without images; pass image_size")
-        if self._render_steps:
-            return _turned(self._observation[f"{CAMERAS[name]}_image"])
-        context = self.sim._render_context_offscreen
-        present, context.data = context.data, SimpleNamespace(_data=self._sampled)
-        try:
-            return self.render(name, self._image_size)
-        finally:
-            context.data = present
+        return self._drawn(self._sampled, name, self._image_size)
 
     def render(self, name: str, size: int) -> np.ndarray:
         """One camera's image of the present scene (size, size, 3) uint8, turned as LeRobot turns it."""
-        self._draw_here()
-        return _turned(self.sim.render(camera_name=CAMERAS[name], width=size, height=size))
+        return self._drawn(self.sim.data._data, name, size)
 
-    def _draw_here(self) -> None:
-        # OpenGL draws into the context made last, which is another simulator's where there are several.
-        self.sim._render_context_offscreen.gl_ctx.make_current()
+    def _drawn(self, data: Any, name: str, size: int) -> np.ndarray:
+        if self._renderer is None:
+            self._renderer = Renderer()
+        image = self._renderer.image(self.sim.model._model, data, CAMERAS[name], size)
+        return np.ascontiguousarray(image[::-1, ::-1])
 
     def object_poses(self) -> dict[str, np.ndarray]:
         """True ``T_world_obj`` (4, 4) of all `OBJECTS`."""
@@ -206,15 +200,14 @@ class LiberoSimulator:
 
     def close(self) -> None:
         """Free the simulator."""
+        if self._renderer is not None:
+            self._renderer.close()
+            self._renderer = None
         self._env.close()
 
 
 def _batched(state: Mapping[str, Any]) -> dict[str, Any]:
     return {k: _batched(v) if isinstance(v, Mapping) else np.asarray(v)[None] for k, v in state.items()}
-
-
-def _turned(image: np.ndarray) -> np.ndarray:
-    return np.ascontiguousarray(image[::-1, ::-1])
 
 
 def _short(name: str) -> str:
