@@ -10,6 +10,7 @@ from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
+from lerobot_openspm.bench.results import ResultOption
 from lerobot_openspm.errors import InstructionError, OpenSPMError
 from lerobot_openspm.memory.compound import plan_parts
 from lerobot_openspm.memory.entry import MemoryEntry, Reference, RetrievalKey, SubTask
@@ -27,7 +28,7 @@ SUITES = ("libero_spatial", "libero_object", "libero_goal", "libero_10", "tablet
 
 
 @dataclass
-class Options:
+class Options(ResultOption):
     """Measure how instructions are read. Needs no checkpoint and no simulator."""
 
     folder: str | None = None  # of paraphrases.json and out_of_domain.json; default: those of the package
