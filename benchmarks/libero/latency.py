@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 import json
 import os
 import time
@@ -43,7 +44,8 @@ def main() -> dict[str, Any]:
     return write(
         "libero_latency",
         {
-            "threads": 1,
+            "seed": TUNING_SEED_START,
+            "n": CHUNKS,
             "chunk_size": horizon,
             "parameters": sum(p.numel() for p in acting.parameters()),
             "chunk_ms": chunk,
@@ -71,4 +73,5 @@ def _times(run: Any, n: int) -> dict[str, float]:
 
 if __name__ == "__main__":
     os.environ.setdefault("MUJOCO_GL", "egl")
+    argparse.ArgumentParser(description=__doc__).parse_args()
     print(json.dumps(main()))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 import json
 import logging
 import os
@@ -47,7 +48,8 @@ def main() -> dict[str, Any]:
             losses[name].append(_loss(acting, samples, index))
     epochs = [round(step * config.samples_per_frame / len(frames["training"]), 2) for step in steps]
     _plot(epochs, losses)
-    return write("libero_losses", {"epochs": epochs, **losses, "plot": PLOT.name})
+    n = sum(len(index) for index in frames.values())
+    return write("libero_losses", {"seed": 0, "n": n, "epochs": epochs, **losses, "plot": PLOT.name})
 
 
 def _meta(root: Path) -> LeRobotDatasetMetadata:
@@ -93,4 +95,5 @@ def _plot(epochs: list[float], losses: dict[str, list[float]]) -> None:
 if __name__ == "__main__":
     logging.basicConfig(level=logging.INFO, format="%(levelname)s %(message)s")
     os.environ.setdefault("MUJOCO_GL", "egl")
+    argparse.ArgumentParser(description=__doc__).parse_args()
     print(json.dumps(main()))
