@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Sequence
+from collections.abc import Generator, Sequence
+from contextlib import contextmanager
+from copy import deepcopy
 from dataclasses import replace
 from functools import cached_property, partial
 from pathlib import Path
@@ -158,19 +160,36 @@ class OpenSPMPolicy(PreTrainedPolicy):
 
     @torch.no_grad()
     def predict_action_chunk(self, batch: dict[str, Tensor], **kwargs: Any) -> Tensor:
-        """Generate a chunk ``(b, chunk_size, action_dim)`` for every environment; the caller executes it."""
-        self.eval()
-        chunks = []
-        for row, observation in self._observe(split_batch(batch, self.config.layouts()[0])):
-            chunk = []
-            while len(chunk) < self.config.chunk_size:
-                action = row.next_action(observation.hand)  # counts it as done
-                if action is None:
-                    row.executor.push_chunk(self._chunk(row, row.query(observation.hand)))
-                else:
-                    chunk.append(action)
-            chunks.append(chunk)
-        return self._encode(np.stack(chunks))
+        """What the next actions ``(b, chunk_size, action_dim)`` would be if no new observation came.
+
+        The policy stays as it is: episodes go on, with :meth:`select_action`, as if nobody had asked.
+        """
+        with self._looking_ahead():
+            chunks = []
+            for row, observation in self._observe(split_batch(batch, self.config.layouts()[0])):
+                chunk = []
+                while len(chunk) < self.config.chunk_size:
+                    action = row.next_action(observation.hand)
+                    if action is None:
+                        row.executor.push_chunk(self._chunk(row, row.query(observation.hand)))
+                    else:
+                        chunk.append(action)
+                chunks.append(chunk)
+            return self._encode(np.stack(chunks))
+
+    @contextmanager
+    def _looking_ahead(self) -> Generator[None]:
+        """Act on copies of the running episodes; at the end those that were running are back."""
+        rows, eyes, is_training = self.rows, self._eyes, self.training
+        # Entries, models and a segmenter's weights are large and never change: the copies share them.
+        shared = (self.experience, self.segmenter, *(row.candidates for row in rows))
+        try:
+            self.rows, self._eyes = deepcopy((rows, eyes), {id(one): one for one in shared})
+            self.eval()
+            yield
+        finally:
+            self.rows, self._eyes = rows, eyes
+            self.train(is_training)
 
     def _observe(self, observations: Sequence[Observation]) -> list[tuple[Row, Observation]]:
         """Each environment's state, brought up to its observation."""

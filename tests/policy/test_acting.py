@@ -7,6 +7,7 @@ import torch
 from lerobot.envs.utils import preprocess_observation
 from tests.policy.conftest import Frame, act, batch_of
 
+from lerobot_openspm.errors import ObservationError
 from lerobot_openspm.modeling_openspm import OpenSPMPolicy
 
 
@@ -77,6 +78,39 @@ def test_every_execution_acts(
     chunk = policy.predict_action_chunk(batch_of([recorded[0][0], recorded[3][0]]))
     assert chunk.shape == (2, policy.config.chunk_size, 7)
     assert torch.isfinite(chunk).all()
+
+
+def test_a_chunk_is_predicted_without_changing_anything(
+    policy: OpenSPMPolicy, recorded: list[list[Frame]]
+):
+    unasked = act(policy, recorded[:2])
+    policy.reset()
+    policy.train()
+    for t, expected in enumerate(unasked):
+        batch = batch_of([recorded[0][t], recorded[1][t]])
+        policy.train(t % 2 == 0)
+        first, second = policy.predict_action_chunk(batch), policy.predict_action_chunk(batch)
+        assert policy.training == (t % 2 == 0)
+        assert torch.equal(first, second)
+        assert torch.equal(first[:, 0], expected), "its first action is the one that comes next"
+        assert torch.equal(policy.select_action(batch), expected)
+    # Neither is another instruction taken up, nor are other environments.
+    other = batch_of([recorded[3][0], recorded[1][len(unasked) - 1], recorded[4][0]])
+    rows = list(policy.rows)
+    assert policy.predict_action_chunk(other).shape == (3, policy.config.chunk_size, 7)
+    assert policy.rows == rows
+
+
+def test_a_chunk_that_cannot_be_predicted_changes_nothing(
+    policy: OpenSPMPolicy, recorded: list[list[Frame]]
+):
+    unasked = act(policy, recorded[:1])
+    policy.reset()
+    first = recorded[0][0]
+    blind = {key: value for key, value in first.items() if "image" not in key}
+    with pytest.raises(ObservationError):
+        policy.predict_action_chunk(batch_of([blind]))
+    assert torch.equal(policy.select_action(batch_of([first])), unasked[0])
 
 
 def test_an_object_that_is_out_of_sight_stops_the_hand(

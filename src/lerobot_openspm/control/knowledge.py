@@ -54,6 +54,10 @@ class Knowledge:
     step_s: float = 0.05
     names: NameSimilarity = TABLE_NAMES
 
+    def __deepcopy__(self, memo: dict[int, object]) -> Knowledge:
+        """Itself: nothing here ever changes, and the memory may be large."""
+        return self
+
     def object_meant(self, name: str) -> str:
         """The object that is known by what a name in an instruction means; the name itself where none is."""
         alike = {known: self.names.similarity(name, known) for known in self.yaw_periods}
