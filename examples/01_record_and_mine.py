@@ -16,7 +16,7 @@ from lerobot.datasets import LeRobotDatasetMetadata
 from lerobot_openspm.cli.collect import CollectConfig, SimulatorConfig, collect
 from lerobot_openspm.configuration_openspm import OpenSPMConfig
 from lerobot_openspm.experience import save_experience
-from lerobot_openspm.training import mine_experience
+from lerobot_openspm.training import dataset_processor, experience_of
 
 NAME = "local/openspm_tabletop"
 CALIBRATION = Path(__file__).parents[1] / "configs/cameras/openspm_tabletop.json"
@@ -43,7 +43,8 @@ def main() -> None:
     #    learned from the demonstrations themselves.
     meta = LeRobotDatasetMetadata(NAME, root=root)
     config = OpenSPMConfig(cameras=str(CALIBRATION), device="cpu", push_to_hub=False)
-    experience = mine_experience(meta, config)
+    mined = dataset_processor(meta, config).mine()
+    experience = experience_of(mined, config)
 
     # 3. Look. Demonstrations of one task should agree: a small spread means that the anchor is the right one.
     by_task = defaultdict(list)

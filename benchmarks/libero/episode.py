@@ -12,9 +12,9 @@ from lerobot_openspm.bench.libero import LiberoWorld
 from lerobot_openspm.control.row import Row
 from lerobot_openspm.envs.libero.simulator import SUITE, LiberoSimulator
 from lerobot_openspm.memory.instruction import parse_instruction
-from lerobot_openspm.mining.mine import name_simulator_poses
 from lerobot_openspm.modeling_openspm import OpenSPMPolicy
 from lerobot_openspm.observation import Observation
+from lerobot_openspm.perception.oracle import name_simulator_poses
 
 
 @dataclass(frozen=True)

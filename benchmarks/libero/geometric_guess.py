@@ -40,8 +40,8 @@ from lerobot_openspm.judgement.zero_shot import (
 )
 from lerobot_openspm.memory.entry import WORLD, Anchor, MemoryEntry, MemoryKeyPose, RetrievalKey, SubTask
 from lerobot_openspm.memory.instruction import parse_instruction
-from lerobot_openspm.mining.mine import name_simulator_poses
 from lerobot_openspm.modeling_openspm import OpenSPMPolicy
+from lerobot_openspm.perception.oracle import name_simulator_poses
 
 ABOVE_M = 0.12
 PULL_M = 0.15

@@ -19,7 +19,7 @@ from tqdm import tqdm
 
 from lerobot_openspm.flow.training_set import TrainingSet
 from lerobot_openspm.modeling_openspm import OpenSPMPolicy
-from lerobot_openspm.training import open_demonstrations, training_set
+from lerobot_openspm.training import dataset_processor, open_demonstrations, training_set
 
 EVERY = 300
 HELD_OUT = 2
@@ -42,8 +42,8 @@ def main() -> dict[str, Any]:
     for step in tqdm(steps, unit="checkpoint"):
         acting = OpenSPMPolicy.from_pretrained(last.parents[1] / f"{step:06d}" / last.name)
         if samples is None:
-            assert acting.experience is not None
-            samples = training_set(_meta(root), config, acting.experience.robot)
+            mined = dataset_processor(_meta(root), config).key_poses(held_out=True)
+            samples = training_set(mined, acting.require_experience().robot, config)
         for name, index in frames.items():
             losses[name].append(_loss(acting, samples, index))
     epochs = [round(step * config.samples_per_frame / len(frames["training"]), 2) for step in steps]

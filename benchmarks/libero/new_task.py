@@ -10,7 +10,7 @@ import logging
 import os
 import sys
 import time
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -29,9 +29,7 @@ from benchmarks.libero.stages import (
 )
 from lerobot.datasets import LeRobotDatasetMetadata
 
-from lerobot_openspm.experience import load_experience
 from lerobot_openspm.modeling_openspm import OpenSPMPolicy
-from lerobot_openspm.training import mine_experience
 
 
 @dataclass
@@ -62,12 +60,9 @@ def teach(nine: Path, root: Path, config: NewTaskConfig, folder: Path) -> float:
     """Append a task's first demonstrations to a checkpoint's memory. Returns the seconds it took."""
     start_s = time.monotonic()
     taught = OpenSPMPolicy.from_pretrained(nine)
-    known = load_experience(nine)
     others = set(first_episodes(root, config.demos, without=config.task))
     chosen = [number for number in first_episodes(root, config.demos) if number not in others]
-    settings = replace(taught.config, memory_episodes=chosen)
-    meta = LeRobotDatasetMetadata(REPO_ID, root=root)
-    taught.experience = mine_experience(meta, settings, known, known.cameras)
+    taught.teach(LeRobotDatasetMetadata(REPO_ID, root=root), chosen)
     taught.save_pretrained(folder)
     return round(time.monotonic() - start_s, 1)
 

@@ -47,7 +47,7 @@ from lerobot_openspm.perceive import Eyes
 from lerobot_openspm.perception.tracker import TrackerSettings
 from lerobot_openspm.perception.types import Segmenter
 from lerobot_openspm.teaching import Lesson, teach
-from lerobot_openspm.training import mine_experience, segmenter_of, training_set
+from lerobot_openspm.training import dataset_processor, experience_of, segmenter_of, training_set
 
 logger = logging.getLogger(__name__)
 
@@ -92,8 +92,9 @@ class OpenSPMPolicy(PreTrainedPolicy):
         if dataset_meta is not None:
             _ = self.names  # what cannot be used is an error now, not at the first observation
             config.control_hz = config.control_hz or float(dataset_meta.fps)
-            self.experience = mine_experience(dataset_meta, config, segmenter=self.segmenter)
-            self._training_set = training_set(dataset_meta, config, self.experience.robot)
+            mined = dataset_processor(dataset_meta, config, segmenter=self.segmenter).mine(held_out=True)
+            self.experience = experience_of(mined, config)
+            self._training_set = training_set(mined, mined.robot, config)
             self.flow.action_scale.copy_(self._training_set.action_scale)
         self.reset()
 
@@ -376,15 +377,23 @@ class OpenSPMPolicy(PreTrainedPolicy):
         where = self.config.cameras or str(directory / CAMERAS_JSON)
         check_sizes(self.experience.cameras, self.config.image_sizes, where)
         if dataset_meta is not None:
-            if self.config.memory_update != "keep":
-                known = self.experience if self.config.memory_update == "append" else None
-                self.experience = mine_experience(
-                    dataset_meta, self.config, known, self.experience.cameras, self.segmenter
-                )
+            self.experience = self._learn_on(self.experience, dataset_meta)
             logger.info(
                 "memory_update=%s: %d entries", self.config.memory_update, len(self.experience.entries)
             )
-            self._training_set = training_set(dataset_meta, self.config, self.experience.robot)
+
+    def _learn_on(self, experience: Experience, dataset_meta: Any) -> Experience:
+        """Take up a dataset to train on, and update what is known by it as ``config.memory_update`` says."""
+        known = None if self.config.memory_update == "rebuild" else experience
+        processor = dataset_processor(dataset_meta, self.config, known, experience.cameras, self.segmenter)
+        if self.config.memory_update == "keep":
+            mined = processor.key_poses(held_out=True)
+        else:
+            mined = processor.mine(held_out=True)
+            newer = experience_of(mined, self.config)
+            experience = newer if known is None else known.appended(newer)
+        self._training_set = training_set(mined, experience.robot, self.config)
+        return experience
 
     def require_experience(self) -> Experience:
         """What was mined. Raises MemoryFormatError when nothing was."""

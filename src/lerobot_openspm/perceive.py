@@ -10,11 +10,11 @@ import numpy as np
 from lerobot_openspm.control.row import Seen
 from lerobot_openspm.experience import Experience
 from lerobot_openspm.geometry.se3 import Array
-from lerobot_openspm.mining.mine import name_simulator_poses
 from lerobot_openspm.observation import Observation
 from lerobot_openspm.perception.camera_watch import CameraWatch
 from lerobot_openspm.perception.localise import localise_all
 from lerobot_openspm.perception.occlusion import hand_mask
+from lerobot_openspm.perception.oracle import name_simulator_poses
 from lerobot_openspm.perception.types import PoseEstimate, Segmenter, View
 
 # How exact the simulator's poses are taken to be (oracle ablation only): metres and radians.

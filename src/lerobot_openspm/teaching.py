@@ -16,7 +16,7 @@ from lerobot_openspm.memory.entry import MemoryEntry
 from lerobot_openspm.memory.instruction import read_tasks
 from lerobot_openspm.memory.own_words import normal_words
 from lerobot_openspm.perception.types import Segmenter
-from lerobot_openspm.training import mine
+from lerobot_openspm.training import dataset_processor, experience_of
 
 # Beside a dataset's own metadata, where `openspm collect` writes the cameras that recorded it.
 DATASET_CAMERAS = "openspm_cameras.json"
@@ -85,7 +85,8 @@ def teach(
     settings = replace(config, memory_episodes=wanted)
     own = Path(dataset_meta.root) / "meta" / DATASET_CAMERAS
     cameras = load_cameras(own) if own.is_file() else experience.cameras
-    mined = mine(dataset_meta, settings, experience, cameras, segmenter)
+    processor = dataset_processor(dataset_meta, settings, experience, cameras, segmenter)
+    mined = experience_of(processor.mine(), settings)
     # An object that was not found cannot be an anchor, and with few demonstrations nothing shows that the one
     # taken instead is wrong.
     added = tuple(entry for entry in mined.entries if not _unseen(entry))

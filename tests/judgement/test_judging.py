@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 from lerobot.annotations.steerable_pipeline.executor import Executor
 from lerobot.annotations.steerable_pipeline.reader import iter_episodes
 from lerobot.annotations.steerable_pipeline.staging import EpisodeStaging
@@ -28,9 +29,8 @@ from lerobot_openspm.judgement.structure import check_sequence
 from lerobot_openspm.memory.entry import PHASES
 from lerobot_openspm.mining.dataset import Demonstrations
 from lerobot_openspm.mining.key_poses import KeyPose
-from lerobot_openspm.mining.mine import MinedEpisode, mine_key_poses
-from lerobot_openspm.mining.signals import observe_robot
-from lerobot_openspm.training import judged, mine_experience, open_demonstrations
+from lerobot_openspm.mining.mined import MinedEpisode
+from lerobot_openspm.training import dataset_processor, experience_of, judged, training_set
 
 NAME = "local/openspm_tabletop"
 
@@ -51,13 +51,15 @@ class Mined:
 
     def __init__(self, root: Path) -> None:
         self.meta = LeRobotDatasetMetadata(NAME, root=root)
-        self.demonstrations: Demonstrations = open_demonstrations(self.meta, config())
-        self.robot = observe_robot(self.demonstrations.episodes())
+        processor = dataset_processor(self.meta, config(memory_episodes=list(range(4))))
+        found = processor.key_poses()
+        self.demonstrations: Demonstrations = processor.demonstrations
+        self.robot = found.robot
         self.episodes = tuple(
             replace(
                 item, key_poses=tuple(replace(p, confidence=min(p.confidence, 0.7)) for p in item.key_poses)
             )
-            for item in mine_key_poses(self.demonstrations, self.robot, range(4)).mined
+            for item in found.episodes
         )
         decode, decoded = self.demonstrations.pictures, {}
 
@@ -181,6 +183,25 @@ def test_a_server_that_is_gone_costs_seconds(mined: Mined, asked, caplog: pytest
     assert "is asked no more" in caplog.text
 
 
+def test_the_flow_model_learns_the_phases_that_were_judged(mined: Mined, tmp_path: Path):
+    def answer(request) -> Reply:
+        return Reply(say(["pre-place"] * len(question_of(request)["candidates"]), 0.99))
+
+    def phases_learned(**options) -> set[str]:
+        chosen = config(memory_episodes=[0, 1], **options)
+        found = dataset_processor(mined.meta, chosen).key_poses(held_out=True)
+        episodes = [item.episode for item in found.episodes]
+        frames = torch.cat([torch.arange(e.from_index, e.from_index + len(e)) for e in episodes])
+        conditions, _ = training_set(found, found.robot, chosen).draw(frames, 1, training=False)
+        return {PHASES[i] for i in conditions[:, -len(PHASES) :].argmax(dim=1).tolist()}
+
+    with LoopbackChat(answer).running() as chat:
+        judge = {"phase_judge": "openai", "phase_judge_api_base": chat.api_base}
+        told = phases_learned(**judge, phase_judge_model_id="tiny-vl", phase_judge_cache=str(tmp_path))
+    assert len(chat.requests) == 2, "held-out episodes are not asked about"
+    assert phases_learned() - told == {"lift"}
+
+
 def test_a_server_that_fails_now_and_then_is_asked_on(mined: Mined, asked, caplog: pytest.LogCaptureFixture):
     agree, seen = knowing(mined), []
 
@@ -278,7 +299,7 @@ def test_a_checkpoint_holds_what_was_judged_and_not_where_it_was_asked(mined: Mi
     saved = json.loads((tmp_path / "checkpoint/config.json").read_text())
     assert (saved["phase_judge"], saved["phase_judge_model_id"]) == ("openai", "tiny-vl")
     assert (saved["phase_judge_api_base"], saved["phase_judge_cache"]) == (None, None)
-    plain = mine_experience(mined.meta, config(**chosen))
+    plain = experience_of(dataset_processor(mined.meta, config(**chosen)).mine(), config(**chosen))
     sure = load_experience(tmp_path / "checkpoint")
     for before, after in zip(plain.entries, sure.entries, strict=True):
         assert before.key == after.key

@@ -1,5 +1,7 @@
 """Key poses remember which sub-task of the instruction they serve."""
 
+from functools import partial
+
 import numpy as np
 from tests.memory.builders import robot
 from tests.mining.episodes import Drawer, pick_and_place
@@ -7,8 +9,12 @@ from tests.mining.episodes import Drawer, pick_and_place
 from lerobot_openspm.geometry import se3
 from lerobot_openspm.memory.compound import parts
 from lerobot_openspm.memory.instruction import parse_instruction
+from lerobot_openspm.mining.entries import task_entries
 from lerobot_openspm.mining.key_poses import find_key_poses
-from lerobot_openspm.mining.mine import MinedEpisode, build_entries, hints, mine_key_poses
+from lerobot_openspm.mining.mined import MinedEpisode
+from lerobot_openspm.mining.objects import hints
+from lerobot_openspm.mining.processor import mine_episodes
+from lerobot_openspm.mining.tasks import compare
 
 TASK = "open the top drawer and put the bowl inside"
 LAYOUT = {"cabinet": se3.from_yaw([0.3, 0.0, 0.0], 0.0), "bowl": se3.from_yaw([-0.1, 0.2, 0.0], 0.0)}
@@ -36,8 +42,9 @@ def drawn():
 
 def test_every_key_pose_of_a_demonstration_of_two_sub_tasks_knows_its_own():
     episode = drawn()
-    mined = MinedEpisode(episode, tuple(find_key_poses(episode, robot())), parse_instruction(TASK))
-    (entry,) = build_entries([mined], [LAYOUT], [{}], {}, "local/demos")
+    item = MinedEpisode(episode, tuple(find_key_poses(episode, robot())), parse_instruction(TASK))
+    (task,) = compare([item], [LAYOUT], [{}], {})
+    (entry,) = task_entries(task, "local/demos")
     by_sub_task = [[pose.phase for pose in entry.key_poses if pose.sub_task == i] for i in (0, 1)]
     assert by_sub_task[0][-4:] == ["grasp", "open", "release", "retreat"]
     assert "open" not in by_sub_task[1]
@@ -50,21 +57,14 @@ def test_every_key_pose_of_a_demonstration_of_two_sub_tasks_knows_its_own():
         np.testing.assert_array_equal([pose.T_obj_ee for pose in part.key_poses], own)
 
 
-class _Recorded:
-    """Episodes as a dataset gives them."""
-
-    name = "local/any"
-
-    def __init__(self, *episodes):
-        self._episodes = list(episodes)
-
-    def episodes(self, indices=None):
-        return [one for one in self._episodes if indices is None or one.index in indices]
+def mined(*episodes):
+    """What is mined of episodes, and the reasons of those that are skipped."""
+    return mine_episodes(episodes, partial(find_key_poses, robot=robot()))
 
 
 def test_a_task_that_the_grammar_cannot_read_is_mined_with_the_things_that_the_hand_took():
     one = pick_and_place()[0].episode(0, "pour the coffee into the cup")
-    (item,) = mine_key_poses(_Recorded(one), robot()).mined
+    (item,), _ = mined(one)
     assert [(s.operation, s.target, s.landmark) for s in item.sub_tasks] == [("do", "coffee", "cup")]
     touched = [(hint.name, hint.kind) for hint in hints(item)]
     assert touched == [("coffee", "grasp"), ("cup", "release")]
@@ -79,18 +79,18 @@ def test_every_thing_that_such_a_task_takes_has_a_name_of_its_own():
     drawer.move([0.1, 0.1, 0.05])
     drawer.grip(False)
     drawer.move([0.1, 0.1, 0.2])
-    (item,) = mine_key_poses(_Recorded(drawer.episode(0, "set the table")), robot()).mined
+    (item,), _ = mined(drawer.episode(0, "set the table"))
     assert [s.target for s in item.sub_tasks] == ["set table object", "set table object 2"]
     assert [hint.name for hint in hints(item)] == ["set table object", "set table object 2"]
     layout = {"set table object": np.eye(4), "set table object 2": np.eye(4)}
-    (entry,) = build_entries([item], [layout], [layout], {}, "local/any")
+    (task,) = compare([item], [layout], [{}], {})
+    (entry,) = task_entries(task, "local/any")
     assert {pose.anchor.place for pose in entry.key_poses} == set(layout)
     assert entry.key.sub_tasks[0].words == "set table"
-    assert entry.outcomes == ()  # its words do not say where anything is to end
 
 
 def test_a_task_without_a_word_is_skipped():
     said, silent = (pick_and_place()[0].episode(i, task) for i, task in enumerate(("wipe it", "...")))
-    mined = mine_key_poses(_Recorded(said, silent), robot())
-    assert [item.episode.index for item in mined.mined] == [0]
-    assert "says nothing" in mined.skipped[1]
+    found, skipped = mined(said, silent)
+    assert [item.episode.index for item in found] == [0]
+    assert "says nothing" in skipped[1]

@@ -80,9 +80,7 @@ def test_every_execution_acts(
     assert torch.isfinite(chunk).all()
 
 
-def test_a_chunk_is_predicted_without_changing_anything(
-    policy: OpenSPMPolicy, recorded: list[list[Frame]]
-):
+def test_a_chunk_is_predicted_without_changing_anything(policy: OpenSPMPolicy, recorded: list[list[Frame]]):
     unasked = act(policy, recorded[:2])
     policy.reset()
     policy.train()
@@ -101,9 +99,7 @@ def test_a_chunk_is_predicted_without_changing_anything(
     assert policy.rows == rows
 
 
-def test_a_chunk_that_cannot_be_predicted_changes_nothing(
-    policy: OpenSPMPolicy, recorded: list[list[Frame]]
-):
+def test_a_chunk_that_cannot_be_predicted_changes_nothing(policy: OpenSPMPolicy, recorded: list[list[Frame]]):
     unasked = act(policy, recorded[:1])
     policy.reset()
     first = recorded[0][0]

@@ -12,9 +12,8 @@ from tests.policy.lerobot_commands import CALIBRATION
 from lerobot_openspm.configuration_openspm import OpenSPMConfig
 from lerobot_openspm.errors import DatasetError, MemoryFormatError
 from lerobot_openspm.flow.training_set import TrainingSet
-from lerobot_openspm.mining.signals import observe_robot
 from lerobot_openspm.modeling_openspm import OpenSPMPolicy
-from lerobot_openspm.training import open_demonstrations, training_set
+from lerobot_openspm.training import dataset_processor, training_set
 
 BOWL, STOVE = "put the bowl on the plate", "turn on the stove"
 PUSH = "push the plate to the front of the stove"
@@ -49,8 +48,8 @@ def batch(*index: int) -> dict[str, torch.Tensor]:
 
 
 def samples_of(meta: LeRobotDatasetMetadata, config: OpenSPMConfig) -> TrainingSet:
-    episodes = open_demonstrations(meta, config).episodes(config.memory_episodes)
-    return training_set(meta, config, observe_robot(episodes))
+    mined = dataset_processor(meta, config).key_poses(held_out=True)
+    return training_set(mined, mined.robot, config)
 
 
 def test_the_loss_of_every_frame_has_the_mean_loss_as_its_mean(trainable: OpenSPMPolicy):

@@ -18,7 +18,7 @@ from tests.policy.lerobot_commands import CALIBRATION
 
 from lerobot_openspm.configuration_openspm import OpenSPMConfig
 from lerobot_openspm.memory.entry import MemoryEntry
-from lerobot_openspm.training import mine_experience, open_demonstrations, training_set
+from lerobot_openspm.training import dataset_processor, experience_of, open_demonstrations, training_set
 
 PUBLIC = "local/public_layout"
 CAMERAS = {
@@ -92,17 +92,24 @@ def told(entry: MemoryEntry) -> list[tuple[Any, ...]]:
 def test_the_same_key_poses_are_mined_whatever_names_and_rate_the_card_gives(
     public_meta, tiny_meta, calibrations
 ):
-    own = mine_experience(tiny_meta, config(calibrations["own"], memory_episodes=EPISODES))
-    found = mine_experience(public_meta, config(calibrations["public"], **PUBLIC_ROTATION))
+    ours, theirs = (
+        config(calibrations["own"], memory_episodes=EPISODES),
+        config(calibrations["public"], **PUBLIC_ROTATION),
+    )
+    own = experience_of(dataset_processor(tiny_meta, ours).mine(), ours)
+    mined = dataset_processor(public_meta, theirs).mine()
+    found = experience_of(mined, theirs)
     assert len(found.entries) == len(own.entries) == len(EPISODES)
-    for ours, theirs in zip(own.entries, found.entries, strict=True):
-        assert told(ours) == told(theirs)
+    for entry, same in zip(own.entries, found.entries, strict=True):
+        assert told(entry) == told(same)
         np.testing.assert_allclose(
-            [pose.T_obj_ee for pose in ours.key_poses],
-            [pose.T_obj_ee for pose in theirs.key_poses],
+            [pose.T_obj_ee for pose in entry.key_poses],
+            [pose.T_obj_ee for pose in same.key_poses],
             atol=1e-6,
         )
-    assert training_set(public_meta, config(calibrations["public"], **PUBLIC_ROTATION), found.robot)
+    conditions, chunks = training_set(mined, found.robot, theirs).draw(torch.arange(9), 1, training=False)
+    assert torch.isfinite(conditions).all()
+    assert torch.isfinite(chunks).all()
 
 
 def test_its_names_alone_would_be_euler_angles(public_meta, calibrations):
@@ -119,7 +126,7 @@ def test_a_card_with_another_rate_than_the_robots_is_explained(
 ):
     chosen = config(calibrations["public"], control_hz=rate, memory_episodes=[0], **PUBLIC_ROTATION)
     with caplog.at_level(logging.WARNING):
-        mine_experience(public_meta, chosen)
+        dataset_processor(public_meta, chosen).key_poses()
     told_of_it = [r.getMessage() for r in caplog.records if "frames per second" in r.getMessage()]
     assert len(told_of_it) == warned
     assert all("10 frames per second" in text and "counts steps" in text for text in told_of_it)

@@ -66,8 +66,8 @@ def without_stove(experience: Experience, episodes: tuple[int, ...]) -> Experien
 def test_demonstrations_that_do_not_show_an_object_are_not_believed(
     policy: OpenSPMPolicy, push_meta: Any, monkeypatch: pytest.MonkeyPatch, hidden: tuple[int, ...]
 ):
-    mine = teaching.mine
-    monkeypatch.setattr(teaching, "mine", lambda *given: without_stove(mine(*given), hidden))
+    remember = teaching.experience_of
+    monkeypatch.setattr(teaching, "experience_of", lambda *given: without_stove(remember(*given), hidden))
     before = policy.experience
     if len(hidden) == 2:
         with pytest.raises(DatasetError, match=r"not learned from episodes \[0, 1\].*could not find stove"):
@@ -81,13 +81,13 @@ def test_demonstrations_that_do_not_show_an_object_are_not_believed(
 def test_demonstrations_of_another_robot_are_refused(
     policy: OpenSPMPolicy, push_meta: Any, monkeypatch: pytest.MonkeyPatch
 ):
-    mine = teaching.mine
+    remember = teaching.experience_of
 
-    def mine_of_another(*given: Any) -> Experience:
-        mined = mine(*given)
+    def of_another(*given: Any) -> Experience:
+        mined = remember(*given)
         return replace(mined, robot=replace(mined.robot, close_command=-mined.robot.close_command))
 
-    monkeypatch.setattr(teaching, "mine", mine_of_another)
+    monkeypatch.setattr(teaching, "experience_of", of_another)
     before = policy.experience
     with pytest.raises(MemoryFormatError, match="another robot or controller"):
         policy.teach(push_meta)

@@ -11,7 +11,7 @@ import numpy as np
 from lerobot_openspm.experience import Experience
 from lerobot_openspm.geometry import se3
 from lerobot_openspm.mining.dataset import Demonstrations
-from lerobot_openspm.mining.mine import name_simulator_poses
+from lerobot_openspm.perception.oracle import name_simulator_poses
 
 
 def offset(experience: Experience, name: str, demonstrations: Demonstrations) -> np.ndarray:

@@ -73,7 +73,7 @@ def demonstrations(options: Options) -> Demonstrations:
     Raises:
         DatasetError: There is none, or it holds too few.
     """
-    from lerobot_openspm.datasets import dataset_metadata
+    from lerobot_openspm.mining.dataset import dataset_metadata
 
     root = options.dataset.root or f"{DEFAULTS[options.env.type][0]}/dataset"
     repo_id = options.dataset.repo_id or DEFAULTS[options.env.type][1]
@@ -97,7 +97,7 @@ def train(data: Demonstrations, task: str, steps: int, folder: Path) -> None:
     from lerobot.policies.factory import make_policy
 
     from lerobot_openspm.configuration_openspm import OpenSPMConfig
-    from lerobot_openspm.datasets import dataset_metadata
+    from lerobot_openspm.mining.dataset import dataset_metadata
     from lerobot_openspm.teaching import DATASET_CAMERAS
 
     if folder.exists():
@@ -158,8 +158,8 @@ def teach(data: Demonstrations, nine: Path, task: str, demos: int, folder: Path)
         wrong. The folder holds the taught checkpoint, unless there was an error.
     """
     from lerobot_openspm.bench.episode import load
-    from lerobot_openspm.datasets import dataset_metadata
     from lerobot_openspm.experience import save_experience
+    from lerobot_openspm.mining.dataset import dataset_metadata
 
     note = folder.with_name(f"{folder.name}.json")
     if note.is_file():

@@ -14,7 +14,7 @@ import numpy as np
 from lerobot_openspm.bench.object_frames import upright
 from lerobot_openspm.geometry import se3
 from lerobot_openspm.geometry.se3 import Array
-from lerobot_openspm.mining.mine import name_simulator_poses
+from lerobot_openspm.perception.oracle import name_simulator_poses
 
 # What truly turns into itself, by a word of its name; what was learned may differ.
 ROUND, HALF_TURN = ("bowl", "plate", "bottle"), ("box", "cheese")

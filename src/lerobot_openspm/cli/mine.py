@@ -10,9 +10,9 @@ from pathlib import Path
 import draccus
 
 from lerobot_openspm.configuration_openspm import OpenSPMConfig
-from lerobot_openspm.datasets import dataset_metadata
 from lerobot_openspm.experience import save_experience
-from lerobot_openspm.training import mine_experience, segmenter_of
+from lerobot_openspm.mining.dataset import dataset_metadata
+from lerobot_openspm.training import dataset_processor, experience_of
 
 
 @dataclass
@@ -37,7 +37,8 @@ def main(args: list[str]) -> None:
     config = draccus.parse(MineConfig, args=args)
     start_s = time.monotonic()
     meta = dataset_metadata(config.repo_id, config.root)
-    experience = mine_experience(meta, config.policy, segmenter=segmenter_of(config.policy))
+    mined = dataset_processor(meta, config.policy).mine()
+    experience = experience_of(mined, config.policy)
     save_experience(experience, Path(config.output))
     summary = {
         "entries": len(experience.entries),

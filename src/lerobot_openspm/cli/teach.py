@@ -13,11 +13,11 @@ from typing import TYPE_CHECKING, Any
 
 import draccus
 
-from lerobot_openspm.datasets import dataset_metadata
 from lerobot_openspm.errors import OpenSPMError
 from lerobot_openspm.experience import MEMORY_JSON, Experience, load_experience, save_experience
 from lerobot_openspm.experience_exchange import digest
 from lerobot_openspm.experience_files import changing
+from lerobot_openspm.mining.dataset import dataset_metadata
 from lerobot_openspm.teaching import Lesson
 
 if TYPE_CHECKING:

@@ -16,7 +16,7 @@ from lerobot_openspm.judgement.question import ask_about
 from lerobot_openspm.judgement.types import Answers, PhaseAnswer, PhaseJudge, PhaseQuestion
 from lerobot_openspm.memory.robot import RobotModel
 from lerobot_openspm.mining.dataset import Demonstrations
-from lerobot_openspm.mining.mine import MinedEpisode
+from lerobot_openspm.mining.mined import MinedEpisode
 
 # After so many failures in a row a judge is asked no more.
 MAX_FAILURES = 3

@@ -11,7 +11,7 @@ from lerobot_openspm.geometry import se3
 from lerobot_openspm.judgement.types import Moment, PhaseQuestion, Picture
 from lerobot_openspm.memory.robot import RobotModel
 from lerobot_openspm.mining.dataset import Demonstrations
-from lerobot_openspm.mining.mine import MinedEpisode
+from lerobot_openspm.mining.mined import MinedEpisode
 from lerobot_openspm.mining.signals import Episode
 
 # The paper's three views.

@@ -2,27 +2,75 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Generator, Mapping, Sequence
+from contextlib import contextmanager
+from pathlib import Path
 from typing import Any
 
+import httpx
 import numpy as np
-from lerobot.datasets import LeRobotDataset
+from huggingface_hub.errors import HfHubHTTPError, HFValidationError
+from lerobot.datasets import LeRobotDataset, LeRobotDatasetMetadata
 from lerobot.datasets.language import LANGUAGE_PERSISTENT
 from lerobot.datasets.video_utils import decode_video_frames
 from lerobot.utils.constants import ACTION, OBS_STATE
 from numpy.typing import NDArray
 
 from lerobot_openspm.errors import DatasetError
-from lerobot_openspm.geometry import se3
 from lerobot_openspm.geometry.camera import Camera
 from lerobot_openspm.geometry.layout import VectorLayout
 from lerobot_openspm.geometry.se3 import Array
 from lerobot_openspm.mining.signals import Episode
 from lerobot_openspm.perception.layers import DEPTH, MASKS, depth_of, labels_of
+from lerobot_openspm.perception.oracle import decode_object_poses
 from lerobot_openspm.perception.types import View
 
 # True object poses of simulated demonstrations; read for the oracle ablation alone.
 SIMULATOR_POSES = "simulator.object_poses"
+
+
+def dataset_metadata(repo_id: str, root: str | None) -> LeRobotDatasetMetadata:
+    """LeRobot's metadata of a dataset.
+
+    Args:
+        repo_id: Its name on the Hub, or of a local one.
+        root: Its folder; LeRobot's cache, or else the Hub, if not given.
+
+    Raises:
+        DatasetError: There is none, or it cannot be read.
+    """
+    # LeRobot would ask the Hub for a local dataset that is not there.
+    if root is not None and not (Path(root) / "meta/info.json").is_file():
+        raise DatasetError(
+            f"no dataset in {root}: it has no meta/info.json; pass the folder of a LeRobotDataset"
+        )
+    with _one_line(repo_id, root):
+        return LeRobotDatasetMetadata(repo_id, root=root)
+
+
+def open_dataset(dataset_meta: Any) -> LeRobotDataset:
+    """The dataset behind LeRobot's metadata.
+
+    Raises:
+        DatasetError: Files of it are missing, or cannot be read.
+    """
+    with _one_line(dataset_meta.repo_id, dataset_meta.root):
+        return LeRobotDataset(
+            dataset_meta.repo_id, root=dataset_meta.root, revision=dataset_meta.revision, video_backend="pyav"
+        )
+
+
+@contextmanager
+def _one_line(repo_id: str, root: object) -> Generator[None]:
+    """Say in one line that a dataset cannot be read: LeRobot asks the Hub for whatever it misses here."""
+    try:
+        yield
+    except (HfHubHTTPError, HFValidationError, httpx.HTTPError, OSError, ValueError) as error:
+        reason = (str(error).strip().splitlines() or [type(error).__name__])[0]
+        raise DatasetError(
+            f"dataset {repo_id!r} is not whole in {root or 'the cache of LeRobot'}, nor can it be had from "
+            f"the Hub ({reason}); check its name and its folder"
+        ) from error
 
 
 class Demonstrations:
@@ -183,12 +231,3 @@ class Demonstrations:
         row = self._dataset.hf_dataset.select_columns([SIMULATOR_POSES]).with_format("numpy")
         values = np.asarray(row[episode.from_index + frame][SIMULATOR_POSES], float)
         return decode_object_poses(values, feature["names"])
-
-
-def decode_object_poses(values: Array, names: Sequence[str]) -> dict[str, Array]:
-    """Read ``n * 7`` numbers (position, quat_wxyz per object); names are ``<object>.<component>``."""
-    objects = list(dict.fromkeys(name.rsplit(".", 1)[0] for name in names))
-    rows = np.asarray(values, float).reshape(len(objects), 7)
-    quat_xyzw = rows[:, [4, 5, 6, 3]]
-    T = se3.transform(se3.matrix_from_quat_xyzw(quat_xyzw), rows[:, :3])
-    return dict(zip(objects, T, strict=True))

@@ -1,0 +1,89 @@
+"""From what was mined to memory entries: every key pose in the frame of its anchor."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Mapping
+
+from lerobot_openspm.errors import DatasetError
+from lerobot_openspm.geometry import se3
+from lerobot_openspm.memory.compound import sub_task_index
+from lerobot_openspm.memory.entry import Anchor, Axis, MemoryEntry, MemoryKeyPose, RetrievalKey
+from lerobot_openspm.mining.anchors import CONTACT_PHASES, Demonstration, Role, roles
+from lerobot_openspm.mining.mined import MinedDataset, MinedTask
+
+logger = logging.getLogger(__name__)
+
+
+def build_entries(mined: MinedDataset) -> tuple[MemoryEntry, ...]:
+    """Make a memory entry of every demonstration whose anchors were found.
+
+    Raises:
+        DatasetError: There is none.
+    """
+    entries = tuple(entry for task in mined.tasks for entry in task_entries(task, mined.name))
+    if not entries:
+        raise DatasetError(
+            f"dataset {mined.name} has key poses in {len(mined.episodes)} episodes, but the objects "
+            "they belong to were found in none; check --policy.cameras, or record with the hand out of view "
+            "at the start"
+        )
+    return entries
+
+
+def task_entries(task: MinedTask, source: str) -> tuple[MemoryEntry, ...]:
+    """The memory entries of one task's demonstrations; `source` is the name of their dataset."""
+    sub_tasks, entries = task.sub_tasks, list[MemoryEntry]()
+    for item, demonstration, axes, quality, outcomes in zip(
+        task.episodes, task.aligned, task.axes, task.qualities, task.outcomes, strict=True
+    ):
+        key_poses = _remember(demonstration, task.anchors, axes, len(sub_tasks))
+        if key_poses is None:
+            logger.warning(
+                "skipping episode %d of %s: its anchors were not found", item.episode.index, source
+            )
+            continue
+        key = RetrievalKey(sub_tasks, tuple(pose.phase for pose in key_poses))
+        where = f"{source}#{item.episode.index}"
+        layout = {
+            name: T
+            for name, T in demonstration.layout.items()
+            if any(name in sub_task.objects for sub_task in sub_tasks)
+        }
+        known = tuple(one for one in outcomes if all(name in layout for name in one.objects))
+        entries.append(
+            MemoryEntry(key, item.episode.task, key_poses, quality, 1, where, layout, outcomes=known)
+        )
+    return tuple(entries)
+
+
+def _remember(
+    demonstration: Demonstration,
+    anchors: Mapping[Role, Anchor],
+    axes: Mapping[Role, Axis],
+    n_sub_tasks: int,
+) -> tuple[MemoryKeyPose, ...] | None:
+    """Express key poses in their anchors' frames; None if a contact's anchor was not found."""
+    kept = []
+    for role, pose in zip(roles(demonstration.key_poses), demonstration.key_poses, strict=True):
+        anchor = anchors.get(role)
+        if anchor is None or any(name not in demonstration.layout for name in anchor.objects):
+            if pose.phase in CONTACT_PHASES:
+                return None
+            continue
+        T_obj_ee = se3.inverse(anchor.frame(demonstration.layout)) @ pose.T_world_ee
+        kept.append(
+            MemoryKeyPose(
+                anchor,
+                T_obj_ee,
+                pose.phase,
+                pose.confidence,
+                pose.closed,
+                pose.opening,
+                pose.n_steps,
+                pose.dwell,
+                axes.get(role),
+                sub_task_index(pose.contact, pose.phase, n_sub_tasks),
+            )
+        )
+    return tuple(kept)

@@ -1,0 +1,95 @@
+"""What mining finds in a dataset. Memory entries and flow samples are both made of it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+from lerobot_openspm.geometry.camera import Camera
+from lerobot_openspm.geometry.se3 import Array
+from lerobot_openspm.memory.entry import Anchor, Axis, Outcome, SubTask
+from lerobot_openspm.memory.robot import RobotModel
+from lerobot_openspm.mining.anchors import Demonstration, Role
+from lerobot_openspm.mining.key_poses import KeyPose
+from lerobot_openspm.mining.signals import Episode
+from lerobot_openspm.perception.model import KnownObject
+
+
+@dataclass(frozen=True)
+class MinedEpisode:
+    """One demonstration.
+
+    Attributes:
+        episode: Its signals: hand poses, gripper, actions.
+        key_poses: Where its phases end, in order, with the phases' names; a judge has had its say.
+        sub_tasks: What its instruction asks for.
+    """
+
+    episode: Episode
+    key_poses: tuple[KeyPose, ...]
+    sub_tasks: tuple[SubTask, ...]
+
+
+@dataclass(frozen=True)
+class MinedKeyPoses:
+    """What a dataset's low-dimensional columns tell. No image was read.
+
+    Attributes:
+        name: The dataset's repository id.
+        robot: The robot, as `episodes` show it.
+        episodes: Episodes with key poses that may be remembered and learned from.
+        held_out: Episodes with key poses that may not; a validation loss looks them up. Nobody judged their
+            phases.
+        skipped: Reason by episode index for those without key poses.
+    """
+
+    name: str
+    robot: RobotModel
+    episodes: tuple[MinedEpisode, ...]
+    held_out: tuple[MinedEpisode, ...]
+    skipped: Mapping[int, str]
+
+
+@dataclass(frozen=True)
+class MinedTask:
+    """The demonstrations of one instruction, compared with each other.
+
+    Attributes:
+        episodes: The demonstrations.
+        aligned: Key poses and object poses of each, frames of symmetric objects turned so that they agree.
+        anchors: For each role of a key pose, the frame in which the demonstrations agree best.
+        axes: For each demonstration, the axes along which drawers slid and about which knobs turned.
+        qualities: For each demonstration the paper's ``r``, 0 to 1: how closely it agrees with the others.
+        outcomes: For each demonstration, where relative to what it left its targets.
+    """
+
+    episodes: tuple[MinedEpisode, ...]
+    aligned: tuple[Demonstration, ...]
+    anchors: Mapping[Role, Anchor]
+    axes: tuple[Mapping[Role, Axis], ...]
+    qualities: tuple[float, ...]
+    outcomes: tuple[tuple[Outcome, ...], ...]
+
+    @property
+    def sub_tasks(self) -> tuple[SubTask, ...]:
+        """What the instruction asks for."""
+        return self.episodes[0].sub_tasks
+
+
+@dataclass(frozen=True)
+class MinedDataset(MinedKeyPoses):
+    """What columns and images together tell.
+
+    Attributes:
+        cameras: The calibration that the images were looked at through.
+        objects: Models of the objects by name.
+        object_poses: For each of `episodes`, ``T_world_obj`` ``(4, 4)`` of what was found in its first frame.
+        tasks: The episodes by instruction, with their anchors.
+        simulator_objects: Objects in the order of the simulator's pose vector (oracle ablation only).
+    """
+
+    cameras: Mapping[str, Camera]
+    objects: Mapping[str, KnownObject]
+    object_poses: tuple[Mapping[str, Array], ...]
+    tasks: tuple[MinedTask, ...]
+    simulator_objects: tuple[str, ...] = ()

@@ -1,0 +1,166 @@
+"""The objects of demonstrations: learned where the hand touched them, then found in every first frame."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from tqdm import tqdm
+
+from lerobot_openspm.geometry.camera import Camera
+from lerobot_openspm.geometry.se3 import Array
+from lerobot_openspm.mining.anchors import Demonstration, sub_task_of
+from lerobot_openspm.mining.dataset import Demonstrations
+from lerobot_openspm.mining.key_poses import KeyPose
+from lerobot_openspm.mining.mined import MinedEpisode
+from lerobot_openspm.mining.outcomes import carried_to
+from lerobot_openspm.perception.learning import Shape, learn_objects
+from lerobot_openspm.perception.localise import localise_all
+from lerobot_openspm.perception.model import KnownObject
+from lerobot_openspm.perception.object_shape import ShapeBackend
+from lerobot_openspm.perception.oracle import name_simulator_poses
+from lerobot_openspm.perception.types import Hint, PoseEstimate, Scene, Segmenter
+
+logger = logging.getLogger(__name__)
+
+# Least confidence at which a pushed object is believed to be where it is seen in the end.
+SURE = 0.8
+
+
+def learn_scenes(
+    demonstrations: Demonstrations, mined: Sequence[MinedEpisode], cameras: Mapping[str, Camera]
+) -> list[Scene]:
+    """What perception may learn from: two frames of every episode, and where the hand touched what."""
+    scenes = []
+    for item in tqdm(mined, desc="Reading images", unit="episode"):
+        later = _carried_off(item.key_poses)
+        views = demonstrations.views(item.episode, 0, cameras)
+        later_views = None if later is None else demonstrations.views(item.episode, later, cameras)
+        scenes.append(Scene(views, hints(item), later_views))
+    return scenes
+
+
+@dataclass(frozen=True)
+class FoundObjects:
+    """Object models by name, and poses ``T_world_obj`` ``(4, 4)`` of the objects found in each episode.
+
+    Attributes:
+        models: The objects.
+        poses: Per episode, where they stood in its first frame.
+        ends: Per episode, where those that were moved ended.
+    """
+
+    models: dict[str, KnownObject]
+    poses: list[dict[str, Array]]
+    ends: list[dict[str, Array]]
+
+
+def find_objects(
+    scenes: Sequence[Scene],
+    mined: Sequence[MinedEpisode],
+    known: Mapping[str, KnownObject],
+    rng: np.random.Generator,
+    segmenter: Segmenter | None = None,
+    shape: Shape = "demonstrations",
+    shapes: ShapeBackend | None = None,
+) -> FoundObjects:
+    """Learn the objects that are not known yet, and find those that each episode's instruction names.
+
+    Args:
+        scenes: One per episode.
+        mined: The episodes.
+        known: Objects by name that are known already.
+        rng: Chooses among the demonstrations of an object where there are more than needed.
+        segmenter: Finds the objects' masks; None to learn what they look like.
+        shape: What is learned of an object that a segmenter finds.
+        shapes: Tells the sizes of objects, for shape "sam3d".
+    """
+    named = sorted({hint.name for scene in scenes for hint in scene.hints} - set(known))
+    models = dict(known)
+    if named:
+        logger.info("learning what these look like: %s", ", ".join(named))
+        learned = learn_objects(scenes, rng, known.values(), segmenter, shape, shapes)
+        models |= learned
+        if missing := [name for name in named if name not in learned]:
+            logger.warning("could not learn what %s looks like; no key pose will be anchored there", missing)
+    found, ends = [], []
+    for scene, item in tqdm(zip(scenes, mined, strict=True), "Finding objects", len(scenes), unit="episode"):
+        wanted = dict.fromkeys(name for sub_task in item.sub_tasks for name in sub_task.objects)
+        sought = {name: models[name] for name in wanted if name in models}
+        estimates = localise_all(scene.views, sought, segmenter)
+        places = {name: _place(name, estimate, scene.hints) for name, estimate in estimates.items()}
+        found.append({name: T for name, T in places.items() if T is not None})
+        ends.append(_ends(scene, item, found[-1], models, segmenter))
+    return FoundObjects(models, found, ends)
+
+
+def _ends(
+    scene: Scene,
+    item: MinedEpisode,
+    poses: Mapping[str, Array],
+    models: Mapping[str, KnownObject],
+    segmenter: Segmenter | None,
+) -> dict[str, Array]:
+    """Where an episode leaves what it moves: the carried by the hand's path, the pushed by the images."""
+    carried = carried_to(Demonstration(item.key_poses, poses), item.sub_tasks)
+    pushed = {sub_task_of(p, item.sub_tasks).target for p in item.key_poses if p.phase == "push"}
+    sought = {name: models[name] for name in sorted(pushed) if name in models}
+    if not sought or scene.later_views is None:
+        return carried
+    seen = localise_all(scene.later_views, sought, segmenter)
+    sure = {k: e.T_world_obj for k, e in seen.items() if e.status == "found" and e.confidence >= SURE}
+    return {**carried, **sure}
+
+
+def _place(name: str, estimate: PoseEstimate, touched: Sequence[Hint]) -> Array | None:
+    """Where an object is; of several that look alike, the one that the hand went to. None if unknown."""
+    points = [hint.point_world[:2] for hint in touched if hint.name == name]
+    if estimate.status == "not_found" or (estimate.status == "ambiguous" and not points):
+        return None
+    if not estimate.others or not points:
+        return estimate.T_world_obj
+    places = (estimate.T_world_obj, *estimate.others)
+    return min(places, key=lambda T: float(np.linalg.norm(np.asarray(points) - T[:2, 3], axis=1).min()))
+
+
+def simulator_poses(
+    demonstrations: Demonstrations, mined: Sequence[MinedEpisode], models: Mapping[str, KnownObject]
+) -> tuple[list[dict[str, Array]], tuple[str, ...]]:
+    """The simulator's poses of the named objects instead of perception's (oracle ablation only).
+
+    Returns:
+        Poses per episode, and the simulator's object names in the order of its pose vector.
+    """
+    found, names = [], ()
+    for item in mined:
+        poses = demonstrations.simulator_poses(item.episode, 0)
+        names = tuple(poses)
+        nouns = sorted({name for sub_task in item.sub_tasks for name in sub_task.objects})
+        found.append(name_simulator_poses(poses, nouns, models))
+    return found, names
+
+
+def hints(item: MinedEpisode) -> tuple[Hint, ...]:
+    """Where the hand touched the objects of the instruction, for perception to learn their looks from."""
+    found = []
+    for pose in item.key_poses:
+        sub_task, point = sub_task_of(pose, item.sub_tasks), pose.T_world_ee[:3, 3]
+        if pose.phase == "grasp":
+            found.append(Hint(sub_task.target, point, "grasp", f"{item.episode.task}: {len(found)}"))
+        elif pose.phase == "release" and sub_task.relation and not sub_task.part:
+            # What goes into an opened part lies where nothing was to be seen in the first frame.
+            found.append(Hint(sub_task.landmark, point, "release", f"{item.episode.task}: {len(found)}"))
+    for before, pose in zip(item.key_poses[:-1], item.key_poses[1:], strict=True):
+        if pose.phase == "push":
+            target = sub_task_of(pose, item.sub_tasks).target
+            place = f"{item.episode.task}: {len(found)}"
+            found.append(Hint(target, before.T_world_ee[:3, 3], "contact", place))
+    return tuple(found)
+
+
+def _carried_off(key_poses: Sequence[KeyPose]) -> int | None:
+    """A frame in which the first grasped or pushed object is elsewhere and the hand has let go."""
+    moved = [pose.frame for pose in key_poses if pose.phase in ("retreat", "push")]
+    return max(moved) if moved else None

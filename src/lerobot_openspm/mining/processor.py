@@ -1,0 +1,188 @@
+"""The front door of mining: a LeRobotDataset goes in, a MinedDataset comes out.
+
+    mined = DatasetProcessor(dataset, options).mine()
+
+Memory entries (`mining/entries.py`) and flow samples (`flow/samples.py`) are both made of that one result.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import AbstractContextManager, nullcontext
+from dataclasses import dataclass, field
+from functools import cached_property
+
+import numpy as np
+from lerobot.datasets import LeRobotDataset, LeRobotDatasetMetadata
+
+from lerobot_openspm.errors import CalibrationError, DatasetError
+from lerobot_openspm.geometry.camera import Camera, check_sizes
+from lerobot_openspm.geometry.layout import VectorLayout
+from lerobot_openspm.memory.instruction import read_tasks
+from lerobot_openspm.memory.robot import RobotModel
+from lerobot_openspm.mining.anchors import as_shown
+from lerobot_openspm.mining.dataset import Demonstrations, open_dataset
+from lerobot_openspm.mining.key_poses import find_key_poses
+from lerobot_openspm.mining.mined import MinedDataset, MinedEpisode, MinedKeyPoses
+from lerobot_openspm.mining.objects import find_objects, learn_scenes, simulator_poses
+from lerobot_openspm.mining.signals import Episode, observe_robot
+from lerobot_openspm.mining.tasks import compare
+from lerobot_openspm.perception.learning import Shape
+from lerobot_openspm.perception.model import KnownObject
+from lerobot_openspm.perception.object_shape import ShapeBackend
+from lerobot_openspm.perception.types import Segmenter
+
+logger = logging.getLogger(__name__)
+
+# Gives episodes back with their phases judged; see `lerobot_openspm.judgement`.
+PhaseJudgement = Callable[[Demonstrations, tuple[MinedEpisode, ...], RobotModel], tuple[MinedEpisode, ...]]
+
+
+@dataclass(frozen=True)
+class MiningOptions:
+    """How a dataset is mined.
+
+    Attributes:
+        state_layout: What the numbers of ``observation.state`` mean.
+        action_layout: What the numbers of ``action`` mean.
+        cameras: Calibration by camera key. Not needed for key poses alone.
+        calibration: Names the calibration in errors.
+        episodes: Episodes that may be remembered and learned from; all if not given.
+        known_objects: Objects by name that are recognised instead of learned.
+        known_robot: The same robot as seen before; tells which gripper command closes where these episodes
+            do not.
+        judge: Says, beside motion and gripper, which phase ends at a key pose.
+        segmenter: Finds the objects' masks; None where the demonstrations teach what objects look like.
+        shape: What is learned of an object that a segmenter finds.
+        open_shapes: Starts what tells the sizes of objects, for shape "sam3d"; it is closed after use.
+        is_oracle: Whether object poses come from the simulator instead (oracle ablation only).
+    """
+
+    state_layout: VectorLayout
+    action_layout: VectorLayout
+    cameras: Mapping[str, Camera] | None = None
+    calibration: str = "the calibration"
+    episodes: Sequence[int] | None = None
+    known_objects: Mapping[str, KnownObject] = field(default_factory=dict[str, KnownObject])
+    known_robot: RobotModel | None = None
+    judge: PhaseJudgement | None = None
+    segmenter: Segmenter | None = None
+    shape: Shape = "demonstrations"
+    open_shapes: Callable[[], AbstractContextManager[ShapeBackend | None]] = nullcontext
+    is_oracle: bool = False
+
+
+class DatasetProcessor:
+    """Mines key poses from the episodes of a LeRobotDataset.
+
+    Deterministic: every process of a distributed run mines the same.
+
+    Args:
+        dataset: The dataset, or LeRobot's metadata of it.
+        options: How to mine it.
+    """
+
+    def __init__(self, dataset: LeRobotDataset | LeRobotDatasetMetadata, options: MiningOptions):
+        self._dataset = dataset
+        self._meta = dataset.meta if isinstance(dataset, LeRobotDataset) else dataset
+        self._options = options
+
+    @cached_property
+    def demonstrations(self) -> Demonstrations:
+        """The dataset as mining reads it, opened when it is first needed.
+
+        Raises:
+            DatasetError: Files or columns are missing.
+        """
+        dataset = self._dataset if isinstance(self._dataset, LeRobotDataset) else open_dataset(self._dataset)
+        return Demonstrations(dataset, self._options.state_layout, self._options.action_layout)
+
+    def mine(self, held_out: bool = False) -> MinedDataset:
+        """Find key poses, learn the objects, and choose the frame that each key pose belongs to.
+
+        Args:
+            held_out: Whether to find the key poses of held-out episodes too, for a validation loss.
+
+        Raises:
+            CalibrationError: No calibration is given, or it does not fit.
+            DatasetError: The dataset yields no key poses.
+        """
+        cameras = self._cameras()
+        found = self.key_poses(held_out)
+        scenes = learn_scenes(self.demonstrations, found.episodes, cameras)
+        with self._options.open_shapes() as shapes:
+            objects = find_objects(
+                scenes, found.episodes, self._options.known_objects, np.random.default_rng(0),
+                self._options.segmenter, self._options.shape, shapes,
+            )  # fmt: skip
+        poses, simulator_objects = objects.poses, ()
+        if self._options.is_oracle:
+            poses, simulator_objects = simulator_poses(self.demonstrations, found.episodes, objects.models)
+        yaw_periods = {name: model.yaw_period for name, model in objects.models.items()}
+        tasks = compare(found.episodes, poses, objects.ends, yaw_periods)
+        return MinedDataset(
+            **vars(found), cameras=cameras, objects=objects.models, object_poses=tuple(poses), tasks=tasks,
+            simulator_objects=simulator_objects,
+        )  # fmt: skip
+
+    def key_poses(self, held_out: bool = False) -> MinedKeyPoses:
+        """Find key poses and nothing else. Reads no image, unless a judge of phases looks at some.
+
+        Args:
+            held_out: Whether to find those of held-out episodes too.
+
+        Raises:
+            DatasetError: No episode that may be learned from has any. The error gives the reasons.
+        """
+        allowed = self.demonstrations.episodes(self._options.episodes)
+        if not allowed:
+            raise DatasetError(f"no episode of dataset {self._meta.repo_id} may be learned from; name some")
+        robot = observe_robot(allowed, self._options.known_robot)
+        mined, skipped = self._mined(allowed, robot)
+        if not mined:
+            raise DatasetError(
+                f"no key poses in the {len(allowed)} episodes of dataset {self._meta.repo_id}: "
+                f"{'; '.join(sorted(set(skipped.values())))}. OpenSPM needs demonstrations in which the "
+                "gripper grasps, pushes or turns something"
+            )
+        if self._options.judge is not None:
+            mined = self._options.judge(self.demonstrations, mined, robot)
+        others: tuple[MinedEpisode, ...] = ()
+        if held_out:
+            known = {episode.index for episode in allowed}
+            left = [index for index in range(self._meta.total_episodes) if index not in known]
+            others, reasons = self._mined(self.demonstrations.episodes(left), robot)
+            skipped |= reasons
+        return MinedKeyPoses(str(self._meta.repo_id), robot, mined, others, skipped)
+
+    def _mined(
+        self, episodes: Sequence[Episode], robot: RobotModel
+    ) -> tuple[tuple[MinedEpisode, ...], dict[int, str]]:
+        """Episodes with their key poses, and by index the reasons of those that have none."""
+        mined, skipped = list[MinedEpisode](), dict[int, str]()
+        tasks = read_tasks((episode.task for episode in episodes), self._options.known_objects)
+        for episode in episodes:
+            if episode.task not in tasks:
+                skipped[episode.index] = f"its task {episode.task!r} says nothing"
+            elif key_poses := find_key_poses(episode, robot):
+                sub_tasks = as_shown(tasks[episode.task], key_poses)
+                mined.append(MinedEpisode(episode, tuple(key_poses), sub_tasks))
+            else:
+                skipped[episode.index] = "nothing is grasped or pushed in it"
+        for index, reason in skipped.items():
+            logger.warning("skipping episode %d of %s: %s", index, self._meta.repo_id, reason)
+        return tuple(mined), skipped
+
+    def _cameras(self) -> Mapping[str, Camera]:
+        """The calibration, compared with the dataset's images."""
+        if self._options.cameras is None:
+            raise CalibrationError(
+                "mining needs the cameras' calibration, got none; pass --policy.cameras=FILE, e.g. "
+                "configs/cameras/openspm_tabletop.json"
+            )
+        shapes = {key: tuple(self._meta.features[key]["shape"]) for key in self._meta.camera_keys}
+        # Datasets write the channels last, but some write them first.
+        sizes = {key: shape[1:] if shape[0] == 3 else shape[:2] for key, shape in shapes.items()}
+        check_sizes(self._options.cameras, sizes, self._options.calibration)
+        return self._options.cameras

@@ -1,0 +1,38 @@
+"""Object poses that a simulator tells, in the form that perception gives them (oracle ablation only)."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from lerobot_openspm.geometry import se3
+from lerobot_openspm.geometry.se3 import Array
+from lerobot_openspm.perception.model import KnownObject
+
+
+def decode_object_poses(values: Array, names: Sequence[str]) -> dict[str, Array]:
+    """Read ``n * 7`` numbers (position, quat_wxyz per object); names are ``<object>.<component>``."""
+    objects = list(dict.fromkeys(name.rsplit(".", 1)[0] for name in names))
+    rows = np.asarray(values, float).reshape(len(objects), 7)
+    quat_xyzw = rows[:, [4, 5, 6, 3]]
+    T = se3.transform(se3.matrix_from_quat_xyzw(quat_xyzw), rows[:, :3])
+    return dict(zip(objects, T, strict=True))
+
+
+def name_simulator_poses(
+    poses: Mapping[str, Array], nouns: Sequence[str], models: Mapping[str, KnownObject]
+) -> dict[str, Array]:
+    """Simulator poses under the nouns of the instructions: "bottle" is the "wine bottle".
+
+    The yaw of a body of revolution is dropped, as perception, which cannot see it, does.
+    """
+    named = {}
+    for noun in nouns:
+        match = next((name for name in poses if name in noun.split()), None)
+        if match is None:
+            continue
+        T = poses[match]
+        turns = noun not in models or models[noun].yaw_period > 0
+        named[noun] = T if turns else se3.transform(np.eye(3), T[:3, 3])
+    return named
