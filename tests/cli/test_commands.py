@@ -5,6 +5,7 @@ import subprocess
 from pathlib import Path
 
 import pytest
+from lerobot.datasets import LeRobotDataset
 from tests.cli.conftest import Openspm
 from tests.memory.memory_files import names
 from tests.policy.lerobot_commands import CALIBRATION, run_command
@@ -49,10 +50,11 @@ def test_a_command_lists_its_options(openspm: Openspm, command: str):
 
 
 def test_mining_then_inspecting(openspm: Openspm, tiny_dataset: Path, checkpoint: Path, tmp_path: Path):
-    memory = tmp_path / "memory"
+    memory, annotated = tmp_path / "memory", tmp_path / "annotated"
     code, out, _ = openspm(
-        "mine", f"--root={tiny_dataset}", f"--output={memory}", f"--policy.cameras={CALIBRATION}"
-    )
+        "mine", f"--root={tiny_dataset}", f"--output={memory}", f"--policy.cameras={CALIBRATION}",
+        f"--annotated={annotated}",
+    )  # fmt: skip
     assert code == 0
     summary = last_line(out)
     assert set(summary) >= {"entries", "episodes", "key_poses", "objects", "output", "seconds"}
@@ -63,6 +65,10 @@ def test_mining_then_inspecting(openspm: Openspm, tiny_dataset: Path, checkpoint
     assert {name: (memory / name).read_bytes() for name in names(memory)} == {
         name: (checkpoint / name).read_bytes() for name in names(checkpoint)
     }
+    assert summary["annotated"] == str(annotated)
+    written = LeRobotDataset("local/openspm_tabletop", root=annotated, video_backend="pyav")
+    assert sum(written.hf_dataset.with_format("numpy")["openspm.is_key_pose"]) == summary["key_poses"]
+    assert written[0]["openspm.phase"] == "approach"
 
     code, out, _ = openspm("inspect", f"--path={memory}")
     assert code == 0
@@ -102,6 +108,17 @@ def test_mining_with_a_calibration_that_is_not_there_is_one_line(
     )
     assert "no calibration file at nowhere.json" in one_line_error(result, "mine")
     assert not (tmp_path / "memory").exists()
+
+
+def test_annotating_into_a_folder_that_exists_is_one_line(
+    openspm: Openspm, tiny_dataset: Path, tmp_path: Path
+):
+    result = openspm(
+        "mine", f"--root={tiny_dataset}", f"--output={tmp_path / 'memory'}", f"--annotated={tmp_path}",
+        f"--policy.cameras={CALIBRATION}",
+    )  # fmt: skip
+    assert "exists already; choose another --annotated" in one_line_error(result, "mine")
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_inspecting_what_holds_no_memory_is_one_line(openspm: Openspm, tmp_path: Path):

@@ -11,6 +11,7 @@ import draccus
 
 from lerobot_openspm.configuration_openspm import OpenSPMConfig
 from lerobot_openspm.experience import save_experience
+from lerobot_openspm.mining.annotate import check_folder, write_annotated
 from lerobot_openspm.mining.dataset import dataset_metadata
 from lerobot_openspm.training import dataset_processor, experience_of
 
@@ -23,12 +24,15 @@ class MineConfig:
         repo_id: Dataset on the Hub, or the name of a local one.
         root: Folder of the dataset; LeRobot's cache if not given.
         output: Folder to write the memory to.
+        annotated: Folder to write a copy of the dataset to, whose frames say which phase they belong to and
+            which key pose comes next; none if not given.
         policy: Options of the policy that say how to mine, e.g. ``--policy.cameras=FILE``.
     """
 
     repo_id: str = "local/openspm_tabletop"
     root: str | None = None
     output: str = "outputs/memory"
+    annotated: str | None = None
     policy: OpenSPMConfig = field(default_factory=lambda: OpenSPMConfig(device="cpu", push_to_hub=False))
 
 
@@ -37,9 +41,15 @@ def main(args: list[str]) -> None:
     config = draccus.parse(MineConfig, args=args)
     start_s = time.monotonic()
     meta = dataset_metadata(config.repo_id, config.root)
-    mined = dataset_processor(meta, config.policy).mine()
+    processor = dataset_processor(meta, config.policy)
+    annotated = Path(config.annotated) if config.annotated else None
+    if annotated is not None:
+        check_folder(processor.demonstrations, annotated)
+    mined = processor.mine(held_out=annotated is not None)
     experience = experience_of(mined, config.policy)
     save_experience(experience, Path(config.output))
+    if annotated is not None:
+        write_annotated(processor.demonstrations, mined, annotated)
     summary = {
         "entries": len(experience.entries),
         "episodes": int(meta.total_episodes),
@@ -47,6 +57,7 @@ def main(args: list[str]) -> None:
         "skipped": int(meta.total_episodes) - len(experience.entries),
         "objects": sorted(experience.objects),
         "output": config.output,
+        "annotated": config.annotated,
         "seconds": round(time.monotonic() - start_s, 1),
     }
     print(json.dumps(summary))

@@ -20,6 +20,8 @@ from lerobot_openspm.errors import DatasetError
 from lerobot_openspm.geometry.camera import Camera
 from lerobot_openspm.geometry.layout import VectorLayout
 from lerobot_openspm.geometry.se3 import Array
+from lerobot_openspm.mining.columns import TYPES, decode_key_poses
+from lerobot_openspm.mining.key_poses import KeyPose
 from lerobot_openspm.mining.signals import Episode
 from lerobot_openspm.perception.layers import DEPTH, MASKS, depth_of, labels_of
 from lerobot_openspm.perception.oracle import decode_object_poses
@@ -96,6 +98,11 @@ class Demonstrations:
         return str(self._dataset.repo_id)
 
     @property
+    def dataset(self) -> LeRobotDataset:
+        """The dataset itself."""
+        return self._dataset
+
+    @property
     def fps(self) -> float:
         """Frames per second, as the dataset says of itself."""
         return float(self._dataset.meta.fps)
@@ -128,6 +135,22 @@ class Demonstrations:
                 )
             )
         return episodes
+
+    def states(self) -> Array:
+        """The ``observation.state`` ``(n, d)`` of all frames, as it was recorded."""
+        column: Any = self._dataset.hf_dataset.select_columns([OBS_STATE]).with_format("numpy")
+        return np.asarray(column[:][OBS_STATE]).reshape(len(self._dataset.hf_dataset), -1)
+
+    @property
+    def has_key_poses(self) -> bool:
+        """Whether the dataset brings its key poses in columns, see `lerobot_openspm.mining.columns`."""
+        return all(name in self._dataset.features for name in TYPES)
+
+    def key_poses(self, episode: Episode) -> list[KeyPose]:
+        """Read an episode's key poses from the columns. Raises DatasetError if they make no sense."""
+        frames = slice(episode.from_index, episode.from_index + len(episode))
+        table: Any = self._dataset.hf_dataset.select_columns(list(TYPES)).with_format("arrow")[frames]
+        return decode_key_poses(table.to_pydict(), episode, f"dataset {self.name}")
 
     def views(self, episode: Episode, frame: int, cameras: Mapping[str, Camera]) -> dict[str, View]:
         """Decode one frame's images of the calibrated cameras, keyed by camera, with its masks and depths.

@@ -11,7 +11,7 @@ import logging
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, field
-from functools import cached_property
+from functools import cached_property, partial
 
 import numpy as np
 from lerobot.datasets import LeRobotDataset, LeRobotDatasetMetadata
@@ -35,7 +35,7 @@ from lerobot_openspm.perception.types import Segmenter
 
 logger = logging.getLogger(__name__)
 
-# Gives episodes back with their phases judged; see `lerobot_openspm.judgement`.
+# Gives episodes back with their phases judged; see `docs/judgement.md`.
 PhaseJudgement = Callable[[Demonstrations, tuple[MinedEpisode, ...], RobotModel], tuple[MinedEpisode, ...]]
 
 
@@ -129,6 +129,8 @@ class DatasetProcessor:
     def key_poses(self, held_out: bool = False) -> MinedKeyPoses:
         """Find key poses and nothing else. Reads no image, unless a judge of phases looks at some.
 
+        Where the dataset brings its key poses in columns, they are read, and nobody is asked about phases.
+
         Args:
             held_out: Whether to find those of held-out episodes too.
 
@@ -146,7 +148,7 @@ class DatasetProcessor:
                 f"{'; '.join(sorted(set(skipped.values())))}. OpenSPM needs demonstrations in which the "
                 "gripper grasps, pushes or turns something"
             )
-        if self._options.judge is not None:
+        if self._options.judge is not None and not self.demonstrations.has_key_poses:
             mined = self._options.judge(self.demonstrations, mined, robot)
         others: tuple[MinedEpisode, ...] = ()
         if held_out:
@@ -160,12 +162,16 @@ class DatasetProcessor:
         self, episodes: Sequence[Episode], robot: RobotModel
     ) -> tuple[tuple[MinedEpisode, ...], dict[int, str]]:
         """Episodes with their key poses, and by index the reasons of those that have none."""
+        is_annotated = self.demonstrations.has_key_poses
+        if is_annotated:
+            logger.info("dataset %s brings its key poses in columns: they are read", self._meta.repo_id)
         mined, skipped = list[MinedEpisode](), dict[int, str]()
         tasks = read_tasks((episode.task for episode in episodes), self._options.known_objects)
         for episode in episodes:
+            find = self.demonstrations.key_poses if is_annotated else partial(find_key_poses, robot=robot)
             if episode.task not in tasks:
                 skipped[episode.index] = f"its task {episode.task!r} says nothing"
-            elif key_poses := find_key_poses(episode, robot):
+            elif key_poses := find(episode):
                 sub_tasks = as_shown(tasks[episode.task], key_poses)
                 mined.append(MinedEpisode(episode, tuple(key_poses), sub_tasks))
             else:

@@ -1,0 +1,240 @@
+"""A dataset is written again with what was mined of it, for LeRobot's viewers and for other policies."""
+
+import os
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from lerobot.annotations.steerable_pipeline.reader import iter_episodes, reconstruct_subtask_spans
+from lerobot.annotations.steerable_pipeline.staging import EpisodeStaging
+from lerobot.annotations.steerable_pipeline.writer import LanguageColumnsWriter, speech_atom
+from lerobot.datasets import LeRobotDataset, LeRobotDatasetMetadata
+from lerobot.datasets.io_utils import load_info, write_info
+from lerobot.datasets.language import language_feature_info
+from tests.memory.builders import robot
+from tests.mining.test_dataset_layers import dataset as image_dataset
+
+from lerobot_openspm.configuration_openspm import OpenSPMConfig
+from lerobot_openspm.errors import DatasetError
+from lerobot_openspm.judgement.annotations import phases_of
+from lerobot_openspm.memory.entry import PHASES
+from lerobot_openspm.memory.instruction import parse_instruction
+from lerobot_openspm.mining import annotate, processor
+from lerobot_openspm.mining.annotate import sub_task_words, write_annotated
+from lerobot_openspm.mining.columns import IS_KEY_POSE, KEY_POSE, PHASE, TARGET, TYPES
+from lerobot_openspm.mining.key_poses import KeyPose
+from lerobot_openspm.mining.mined import MinedEpisode, MinedKeyPoses
+from lerobot_openspm.mining.processor import DatasetProcessor
+from lerobot_openspm.training import dataset_processor, open_demonstrations
+
+NAME = "local/openspm_tabletop"
+
+
+def processor_of(root: Path, **options) -> DatasetProcessor:
+    config = OpenSPMConfig(device="cpu", push_to_hub=False, **options)
+    return dataset_processor(LeRobotDatasetMetadata(NAME, root=root), config)
+
+
+def annotated_copy(source: Path, folder: Path, **options) -> MinedKeyPoses:
+    mining = processor_of(source, **options)
+    mined = mining.key_poses(held_out=True)
+    write_annotated(mining.demonstrations, mined, folder)
+    return mined
+
+
+@pytest.fixture(scope="module")
+def annotated(make_once: Callable[..., Path], tiny_dataset: Path) -> Path:
+    """The tiny dataset, annotated. Nobody may change what lies in it."""
+    return make_once("mined_and_annotated", lambda root: annotated_copy(tiny_dataset, root))
+
+
+def plain(key_poses) -> list[tuple]:
+    return [tuple(np.asarray(value).tolist() for value in vars(pose).values()) for pose in key_poses]
+
+
+def test_reading_it_gives_what_was_mined_and_mines_nothing(
+    tiny_dataset: Path, annotated: Path, monkeypatch: pytest.MonkeyPatch
+):
+    mined = processor_of(tiny_dataset).key_poses()
+    monkeypatch.delattr(processor, "find_key_poses")
+    read = processor_of(annotated).key_poses()
+    assert [item.episode.index for item in read.episodes] == list(range(6))
+    for before, after in zip(mined.episodes, read.episodes, strict=True):
+        assert plain(before.key_poses) == plain(after.key_poses)
+
+
+def test_nobody_is_asked_about_phases_that_stand_there(annotated: Path):
+    judge = {
+        "phase_judge": "openai",
+        "phase_judge_model_id": "m",
+        "phase_judge_api_base": "http://nowhere.test/v1",
+    }
+    assert len(processor_of(annotated, **judge).key_poses().episodes) == 6
+
+
+def test_lerobot_reads_it_with_everything_that_was_there(tiny_dataset: Path, annotated: Path):
+    before, after = (
+        LeRobotDataset(NAME, root=root, video_backend="pyav") for root in (tiny_dataset, annotated)
+    )
+    added = {*TYPES, TARGET, *language_feature_info()}
+    assert set(after.features) - set(before.features) == added
+    assert {key: after.features[key] for key in before.features} == before.features
+    assert before.meta.stats.keys() == after.meta.stats.keys()
+    assert (len(after), after.meta.fps, after.meta.total_tasks) == (len(before), before.meta.fps, 2)
+    for index in (0, 200, len(before) - 1):
+        one, other = before[index], after[index]
+        assert all(np.array_equal(one[key], other[key]) for key in one)
+        assert set(other) - set(one) == added
+    assert not list(annotated.parent.glob(f".{annotated.name}*"))
+
+
+def test_its_videos_are_the_datasets_own_files(tiny_dataset: Path, annotated: Path):
+    videos = [path.relative_to(tiny_dataset) for path in tiny_dataset.rglob("*.mp4")]
+    assert videos
+    assert all(os.path.samefile(tiny_dataset / video, annotated / video) for video in videos)
+    cameras = "meta/openspm_cameras.json"
+    assert (annotated / cameras).read_bytes() == (tiny_dataset / cameras).read_bytes()
+    assert not os.path.samefile(tiny_dataset / cameras, annotated / cameras), "what may be edited is copied"
+
+
+@pytest.mark.parametrize(("forbidden", "linked"), [(("link",), True), (("link", "symlink"), False)])
+def test_where_there_are_no_hard_links_there_are_others_or_copies(
+    tiny_dataset: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog, forbidden, linked: bool
+):
+    def refuse(*_):
+        raise OSError("no such links here")
+
+    for name in forbidden:
+        monkeypatch.setattr(os, name, refuse)
+    annotated_copy(tiny_dataset, tmp_path / "copy")
+    videos = [path.relative_to(tiny_dataset) for path in tiny_dataset.rglob("*.mp4")]
+    assert all((tmp_path / "copy" / video).is_symlink() == linked for video in videos)
+    assert all((tmp_path / "copy" / v).read_bytes() == (tiny_dataset / v).read_bytes() for v in videos)
+    assert ("could not be linked and were copied" in caplog.text) != linked
+
+
+def test_its_sub_tasks_say_the_phases_to_lerobots_tools(annotated: Path):
+    dataset = LeRobotDataset(NAME, root=annotated, video_backend="pyav")
+    columns = dataset.hf_dataset.select_columns([PHASE, KEY_POSE, IS_KEY_POSE, "timestamp"]).with_format(
+        "arrow"
+    )
+    for record in iter_episodes(annotated):
+        first = int(dataset.meta.episodes["dataset_from_index"][record.episode_index])
+        frames = columns[first : first + record.row_count].to_pydict()
+        rows = dataset.hf_dataset[first]["language_persistent"]
+        spans = reconstruct_subtask_spans(rows, episode_end_t=record.frame_timestamps[-1])
+        assert spans[0]["start"] == 0.0
+        for time_s, phase in zip(frames["timestamp"], frames[PHASE], strict=True):
+            said = [span["text"] for span in spans if span["start"] <= time_s][-1]
+            assert not phase or phase in phases_of(said), f"{phase} is called {said!r}"
+        assert sum(frames[IS_KEY_POSE]) == max(frames[KEY_POSE]) + 1
+
+
+@pytest.mark.parametrize("phase", PHASES)
+@pytest.mark.parametrize(
+    "instruction",
+    ["put the bowl in the top drawer of the cabinet", "open the top drawer", "turn on the stove"],
+)
+def test_a_sub_task_is_worded_so_that_it_is_understood_again(phase: str, instruction: str):
+    pose = KeyPose(3, np.eye(4), phase, 1.0, False, 0.0, 3, False, 0)
+    words = sub_task_words(pose, parse_instruction(instruction))
+    assert phase in phases_of(words), words
+
+
+def test_held_out_episodes_are_annotated_and_stay_held_out(tiny_dataset: Path, tmp_path: Path):
+    mined = annotated_copy(tiny_dataset, tmp_path / "copy", memory_episodes=[1, 4])
+    assert [item.episode.index for item in mined.held_out] == [0, 2, 3, 5]
+    everything = processor_of(tmp_path / "copy").key_poses()
+    assert len(everything.episodes) == 6
+    again = processor_of(tmp_path / "copy", memory_episodes=[1, 4]).key_poses()
+    assert [item.episode.index for item in again.episodes] == [1, 4]
+
+
+def test_episodes_without_key_poses_are_skipped_when_read(tiny_dataset: Path, tmp_path: Path):
+    mining = processor_of(tiny_dataset)
+    mined = mining.key_poses()
+    some = MinedKeyPoses(mined.name, mined.robot, mined.episodes[1:], (), {0: "left out"})
+    write_annotated(mining.demonstrations, some, tmp_path / "copy")
+    read = processor_of(tmp_path / "copy").key_poses()
+    assert (len(read.episodes), list(read.skipped)) == (5, [0])
+
+
+def test_a_dataset_of_pictures_masks_and_depths_is_annotated_too(tmp_path: Path):
+    image_dataset(tmp_path / "data")
+    meta = LeRobotDatasetMetadata("local/layers", root=tmp_path / "data")
+    demonstrations = open_demonstrations(meta, OpenSPMConfig(device="cpu", push_to_hub=False))
+    (episode,) = demonstrations.episodes()
+    pose = KeyPose(1, episode.T_world_ee[1], "push", 1.0, False, float(episode.opening[1]), 1, False, 0)
+    item = MinedEpisode(episode, (pose,), parse_instruction(episode.task))
+    write_annotated(demonstrations, MinedKeyPoses("", robot(), (item,), (), {}), tmp_path / "copy")
+    before, after = (LeRobotDataset("local/layers", root=tmp_path / name) for name in ("data", "copy"))
+    for index in range(2):
+        assert all(np.array_equal(before[index][key], after[index][key]) for key in before[index])
+    assert [after[i][IS_KEY_POSE].item() for i in range(2)] == [False, True]
+
+
+def test_what_was_annotated_before_stays(tiny_dataset: Path, tmp_path: Path):
+    source = tmp_path / "source"
+    shutil.copytree(tiny_dataset, source)
+    records = list(iter_episodes(source))
+    row = {"role": "assistant", "camera": None, "tool_calls": None}
+    theirs = [
+        {**row, "content": "fetch it", "style": "subtask", "timestamp": 0.0},
+        {**row, "content": "first this, then that", "style": "plan", "timestamp": 0.0},
+        speech_atom(records[1].frame_timestamps[7], "on my way"),
+    ]
+    EpisodeStaging(tmp_path / "staging", 1).write("plan", theirs)
+    EpisodeStaging(tmp_path / "staging", 2).write("plan", theirs[1:2])
+    LanguageColumnsWriter().write_all(records, tmp_path / "staging", source)
+    info = load_info(source)
+    info.features = {**info.features, **language_feature_info()}
+    write_info(info, source)
+
+    annotated_copy(source, tmp_path / "copy")
+    demonstrations = processor_of(tmp_path / "copy").demonstrations
+    assert demonstrations.subtask_rows(1) == [(0.0, "fetch it")]
+    assert demonstrations.subtask_rows(2)[0] == (0.0, "approach the bowl")
+    frames = demonstrations.dataset.hf_dataset
+    first = demonstrations.episodes([1])[0].from_index
+    assert [r["content"] for r in frames[first]["language_persistent"] if r["style"] == "plan"] == [
+        "first this, then that"
+    ]
+    said = [bool(frames[first + i]["language_events"]) for i in range(10)]
+    assert said == [i == 7 for i in range(10)]
+    (event,) = frames[first + 7]["language_events"]
+    assert event["tool_calls"][0]["function"]["arguments"] == {"text": "on my way"}
+
+
+def test_a_write_that_fails_leaves_nothing(
+    tiny_dataset: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    mining = processor_of(tiny_dataset)
+    mined = mining.key_poses()
+
+    def fail(*_):
+        raise OSError("no space left")
+
+    with monkeypatch.context() as patched:
+        patched.setattr(annotate, "_describe", fail)
+        with pytest.raises(OSError, match="no space left"):
+            write_annotated(mining.demonstrations, mined, tmp_path / "out/copy")
+    assert list((tmp_path / "out").iterdir()) == []
+    # Nor does a run that was killed stand in the way of the next one.
+    (tmp_path / "out/.copy.partial").mkdir()
+    write_annotated(mining.demonstrations, mined, tmp_path / "out/copy")
+    assert [path.name for path in (tmp_path / "out").iterdir()] == ["copy"]
+
+
+def test_what_cannot_be_written_is_said_before(tiny_dataset: Path, annotated: Path, tmp_path: Path):
+    mining = processor_of(tiny_dataset)
+    mined = mining.key_poses()
+    with pytest.raises(DatasetError, match="exists already; choose another --annotated"):
+        write_annotated(mining.demonstrations, mined, tmp_path)
+    with pytest.raises(DatasetError, match="lies in the folder of dataset"):
+        write_annotated(mining.demonstrations, mined, tiny_dataset / "annotated")
+    again = processor_of(annotated)
+    with pytest.raises(DatasetError, match=r"has the columns openspm\.phase, .* already; mine the dataset"):
+        write_annotated(again.demonstrations, again.key_poses(), tmp_path / "twice")
+    assert list(tmp_path.iterdir()) == []
