@@ -52,6 +52,24 @@ def tiny_dataset(make_once: Callable[..., Path]) -> Path:
 
 
 @pytest.fixture(scope="session")
+def annotated_dataset(make_once: Callable[..., Path], tiny_dataset: Path) -> Path:
+    """The tiny dataset with the columns and sub-tasks that mining gives it."""
+
+    def annotate(root: Path) -> None:
+        from lerobot.datasets import LeRobotDatasetMetadata
+
+        from lerobot_openspm.configuration_openspm import OpenSPMConfig
+        from lerobot_openspm.mining.annotate import write_annotated
+        from lerobot_openspm.training import dataset_processor
+
+        meta = LeRobotDatasetMetadata("local/openspm_tabletop", root=tiny_dataset)
+        processor = dataset_processor(meta, OpenSPMConfig(device="cpu", push_to_hub=False))
+        write_annotated(processor.demonstrations, processor.key_poses(), root)
+
+    return make_once("mined_and_annotated", annotate)
+
+
+@pytest.fixture(scope="session")
 def other_dataset(make_once: Callable[..., Path]) -> Path:
     """Two demonstrations of push_plate, whose object the tiny dataset shows too."""
     return make_once("other_dataset", lambda root: record(root, "push_plate", 2))

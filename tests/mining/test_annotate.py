@@ -2,7 +2,7 @@
 
 import os
 import shutil
-from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -37,17 +37,14 @@ def processor_of(root: Path, **options) -> DatasetProcessor:
     return dataset_processor(LeRobotDatasetMetadata(NAME, root=root), config)
 
 
-def annotated_copy(source: Path, folder: Path, **options) -> MinedKeyPoses:
-    mining = processor_of(source, **options)
-    mined = mining.key_poses(held_out=True)
-    write_annotated(mining.demonstrations, mined, folder)
-    return mined
+@pytest.fixture(scope="module")
+def mining(tiny_dataset: Path) -> DatasetProcessor:
+    return processor_of(tiny_dataset)
 
 
 @pytest.fixture(scope="module")
-def annotated(make_once: Callable[..., Path], tiny_dataset: Path) -> Path:
-    """The tiny dataset, annotated. Nobody may change what lies in it."""
-    return make_once("mined_and_annotated", lambda root: annotated_copy(tiny_dataset, root))
+def mined(mining: DatasetProcessor) -> MinedKeyPoses:
+    return mining.key_poses()
 
 
 def plain(key_poses) -> list[tuple]:
@@ -55,28 +52,27 @@ def plain(key_poses) -> list[tuple]:
 
 
 def test_reading_it_gives_what_was_mined_and_mines_nothing(
-    tiny_dataset: Path, annotated: Path, monkeypatch: pytest.MonkeyPatch
+    mined: MinedKeyPoses, annotated_dataset: Path, monkeypatch: pytest.MonkeyPatch
 ):
-    mined = processor_of(tiny_dataset).key_poses()
     monkeypatch.delattr(processor, "find_key_poses")
-    read = processor_of(annotated).key_poses()
+    read = processor_of(annotated_dataset).key_poses()
     assert [item.episode.index for item in read.episodes] == list(range(6))
     for before, after in zip(mined.episodes, read.episodes, strict=True):
         assert plain(before.key_poses) == plain(after.key_poses)
 
 
-def test_nobody_is_asked_about_phases_that_stand_there(annotated: Path):
+def test_nobody_is_asked_about_phases_that_stand_there(annotated_dataset: Path):
     judge = {
         "phase_judge": "openai",
         "phase_judge_model_id": "m",
         "phase_judge_api_base": "http://nowhere.test/v1",
     }
-    assert len(processor_of(annotated, **judge).key_poses().episodes) == 6
+    assert len(processor_of(annotated_dataset, **judge).key_poses().episodes) == 6
 
 
-def test_lerobot_reads_it_with_everything_that_was_there(tiny_dataset: Path, annotated: Path):
+def test_lerobot_reads_it_with_everything_that_was_there(tiny_dataset: Path, annotated_dataset: Path):
     before, after = (
-        LeRobotDataset(NAME, root=root, video_backend="pyav") for root in (tiny_dataset, annotated)
+        LeRobotDataset(NAME, root=root, video_backend="pyav") for root in (tiny_dataset, annotated_dataset)
     )
     added = {*TYPES, TARGET, *language_feature_info()}
     assert set(after.features) - set(before.features) == added
@@ -87,40 +83,45 @@ def test_lerobot_reads_it_with_everything_that_was_there(tiny_dataset: Path, ann
         one, other = before[index], after[index]
         assert all(np.array_equal(one[key], other[key]) for key in one)
         assert set(other) - set(one) == added
-    assert not list(annotated.parent.glob(f".{annotated.name}*"))
+    assert not list(annotated_dataset.parent.glob(f".{annotated_dataset.name}*"))
 
 
-def test_its_videos_are_the_datasets_own_files(tiny_dataset: Path, annotated: Path):
+def test_its_videos_are_the_datasets_own_files(tiny_dataset: Path, annotated_dataset: Path):
     videos = [path.relative_to(tiny_dataset) for path in tiny_dataset.rglob("*.mp4")]
     assert videos
-    assert all(os.path.samefile(tiny_dataset / video, annotated / video) for video in videos)
+    assert all(os.path.samefile(tiny_dataset / video, annotated_dataset / video) for video in videos)
     cameras = "meta/openspm_cameras.json"
-    assert (annotated / cameras).read_bytes() == (tiny_dataset / cameras).read_bytes()
-    assert not os.path.samefile(tiny_dataset / cameras, annotated / cameras), "what may be edited is copied"
+    assert (annotated_dataset / cameras).read_bytes() == (tiny_dataset / cameras).read_bytes()
+    assert not os.path.samefile(tiny_dataset / cameras, annotated_dataset / cameras), (
+        "what may be edited is copied"
+    )
 
 
-@pytest.mark.parametrize(("forbidden", "linked"), [(("link",), True), (("link", "symlink"), False)])
+@pytest.mark.parametrize(("forbidden", "is_linked"), [(("link",), True), (("link", "symlink"), False)])
 def test_where_there_are_no_hard_links_there_are_others_or_copies(
-    tiny_dataset: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog, forbidden, linked: bool
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog, forbidden: tuple[str, ...], is_linked: bool
 ):
+    video = Path("videos/front/file-000.mp4")
+    (tmp_path / "data" / video).parent.mkdir(parents=True)
+    (tmp_path / "data" / video).write_bytes(b"moving pictures")
+
     def refuse(*_):
         raise OSError("no such links here")
 
     for name in forbidden:
         monkeypatch.setattr(os, name, refuse)
-    annotated_copy(tiny_dataset, tmp_path / "copy")
-    videos = [path.relative_to(tiny_dataset) for path in tiny_dataset.rglob("*.mp4")]
-    assert all((tmp_path / "copy" / video).is_symlink() == linked for video in videos)
-    assert all((tmp_path / "copy" / v).read_bytes() == (tiny_dataset / v).read_bytes() for v in videos)
-    assert ("could not be linked and were copied" in caplog.text) != linked
+    annotate._link_the_rest(tmp_path / "data", tmp_path / "copy")
+    assert (tmp_path / "copy" / video).is_symlink() == is_linked
+    assert (tmp_path / "copy" / video).read_bytes() == b"moving pictures"
+    assert ("could not be linked and were copied" in caplog.text) != is_linked
 
 
-def test_its_sub_tasks_say_the_phases_to_lerobots_tools(annotated: Path):
-    dataset = LeRobotDataset(NAME, root=annotated, video_backend="pyav")
+def test_its_sub_tasks_say_the_phases_to_lerobots_tools(annotated_dataset: Path):
+    dataset = LeRobotDataset(NAME, root=annotated_dataset, video_backend="pyav")
     columns = dataset.hf_dataset.select_columns([PHASE, KEY_POSE, IS_KEY_POSE, "timestamp"]).with_format(
         "arrow"
     )
-    for record in iter_episodes(annotated):
+    for record in iter_episodes(annotated_dataset):
         first = int(dataset.meta.episodes["dataset_from_index"][record.episode_index])
         frames = columns[first : first + record.row_count].to_pydict()
         rows = dataset.hf_dataset[first]["language_persistent"]
@@ -143,22 +144,20 @@ def test_a_sub_task_is_worded_so_that_it_is_understood_again(phase: str, instruc
     assert phase in phases_of(words), words
 
 
-def test_held_out_episodes_are_annotated_and_stay_held_out(tiny_dataset: Path, tmp_path: Path):
-    mined = annotated_copy(tiny_dataset, tmp_path / "copy", memory_episodes=[1, 4])
-    assert [item.episode.index for item in mined.held_out] == [0, 2, 3, 5]
-    everything = processor_of(tmp_path / "copy").key_poses()
-    assert len(everything.episodes) == 6
-    again = processor_of(tmp_path / "copy", memory_episodes=[1, 4]).key_poses()
+def test_held_out_episodes_are_annotated_and_those_without_key_poses_skipped(
+    mining: DatasetProcessor, mined: MinedKeyPoses, tmp_path: Path
+):
+    folder, items = tmp_path / "copy", mined.episodes
+    some = replace(mined, episodes=(items[1], items[4]), held_out=items[2:4], skipped={0: "", 5: ""})
+    (tmp_path / ".copy.partial").mkdir()  # of a run that was killed
+    write_annotated(mining.demonstrations, some, folder)
+    assert [path.name for path in tmp_path.iterdir()] == ["copy"]
+    everything = processor_of(folder).key_poses()
+    assert [item.episode.index for item in everything.episodes] == [1, 2, 3, 4]
+    assert sorted(everything.skipped) == [0, 5]
+    again = processor_of(folder, memory_episodes=[1, 4]).key_poses(held_out=True)
     assert [item.episode.index for item in again.episodes] == [1, 4]
-
-
-def test_episodes_without_key_poses_are_skipped_when_read(tiny_dataset: Path, tmp_path: Path):
-    mining = processor_of(tiny_dataset)
-    mined = mining.key_poses()
-    some = MinedKeyPoses(mined.name, mined.robot, mined.episodes[1:], (), {0: "left out"})
-    write_annotated(mining.demonstrations, some, tmp_path / "copy")
-    read = processor_of(tmp_path / "copy").key_poses()
-    assert (len(read.episodes), list(read.skipped)) == (5, [0])
+    assert [item.episode.index for item in again.held_out] == [2, 3]
 
 
 def test_a_dataset_of_pictures_masks_and_depths_is_annotated_too(tmp_path: Path):
@@ -175,24 +174,25 @@ def test_a_dataset_of_pictures_masks_and_depths_is_annotated_too(tmp_path: Path)
     assert [after[i][IS_KEY_POSE].item() for i in range(2)] == [False, True]
 
 
-def test_what_was_annotated_before_stays(tiny_dataset: Path, tmp_path: Path):
+def test_what_was_annotated_before_stays(tiny_dataset: Path, mined: MinedKeyPoses, tmp_path: Path):
     source = tmp_path / "source"
     shutil.copytree(tiny_dataset, source)
     records = list(iter_episodes(source))
     row = {"role": "assistant", "camera": None, "tool_calls": None}
-    theirs = [
+    rows = [
         {**row, "content": "fetch it", "style": "subtask", "timestamp": 0.0},
         {**row, "content": "first this, then that", "style": "plan", "timestamp": 0.0},
         speech_atom(records[1].frame_timestamps[7], "on my way"),
     ]
-    EpisodeStaging(tmp_path / "staging", 1).write("plan", theirs)
-    EpisodeStaging(tmp_path / "staging", 2).write("plan", theirs[1:2])
+    EpisodeStaging(tmp_path / "staging", 1).write("plan", rows)
+    EpisodeStaging(tmp_path / "staging", 2).write("plan", rows[1:2])
     LanguageColumnsWriter().write_all(records, tmp_path / "staging", source)
     info = load_info(source)
     info.features = {**info.features, **language_feature_info()}
     write_info(info, source)
 
-    annotated_copy(source, tmp_path / "copy")
+    theirs = processor_of(source)
+    write_annotated(theirs.demonstrations, mined, tmp_path / "copy")
     demonstrations = processor_of(tmp_path / "copy").demonstrations
     assert demonstrations.subtask_rows(1) == [(0.0, "fetch it")]
     assert demonstrations.subtask_rows(2)[0] == (0.0, "approach the bowl")
@@ -207,34 +207,32 @@ def test_what_was_annotated_before_stays(tiny_dataset: Path, tmp_path: Path):
     assert event["tool_calls"][0]["function"]["arguments"] == {"text": "on my way"}
 
 
-def test_a_write_that_fails_leaves_nothing(
-    tiny_dataset: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize("fault", [OSError("no space left"), KeyboardInterrupt()])
+def test_a_write_that_is_interrupted_leaves_nothing(
+    mining: DatasetProcessor, mined: MinedKeyPoses, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, fault
 ):
-    mining = processor_of(tiny_dataset)
-    mined = mining.key_poses()
+    def half(_demonstrations, _mined, root: Path):
+        (root / "data").mkdir(parents=True)
+        raise fault
 
-    def fail(*_):
-        raise OSError("no space left")
-
-    with monkeypatch.context() as patched:
-        patched.setattr(annotate, "_describe", fail)
-        with pytest.raises(OSError, match="no space left"):
-            write_annotated(mining.demonstrations, mined, tmp_path / "out/copy")
+    monkeypatch.setattr(annotate, "_write_columns", half)
+    with pytest.raises(type(fault)):
+        write_annotated(mining.demonstrations, mined, tmp_path / "out/copy")
     assert list((tmp_path / "out").iterdir()) == []
-    # Nor does a run that was killed stand in the way of the next one.
-    (tmp_path / "out/.copy.partial").mkdir()
-    write_annotated(mining.demonstrations, mined, tmp_path / "out/copy")
-    assert [path.name for path in (tmp_path / "out").iterdir()] == ["copy"]
 
 
-def test_what_cannot_be_written_is_said_before(tiny_dataset: Path, annotated: Path, tmp_path: Path):
-    mining = processor_of(tiny_dataset)
-    mined = mining.key_poses()
+def test_what_cannot_be_written_is_said_before(
+    mining: DatasetProcessor,
+    mined: MinedKeyPoses,
+    tiny_dataset: Path,
+    annotated_dataset: Path,
+    tmp_path: Path,
+):
     with pytest.raises(DatasetError, match="exists already; choose another --annotated"):
         write_annotated(mining.demonstrations, mined, tmp_path)
     with pytest.raises(DatasetError, match="lies in the folder of dataset"):
         write_annotated(mining.demonstrations, mined, tiny_dataset / "annotated")
-    again = processor_of(annotated)
+    again = processor_of(annotated_dataset)
     with pytest.raises(DatasetError, match=r"has the columns openspm\.phase, .* already; mine the dataset"):
-        write_annotated(again.demonstrations, again.key_poses(), tmp_path / "twice")
+        write_annotated(again.demonstrations, mined, tmp_path / "twice")
     assert list(tmp_path.iterdir()) == []
