@@ -183,7 +183,9 @@ class OpenSPMPolicy(PreTrainedPolicy):
         """Act on copies of the running episodes; at the end those that were running are back."""
         rows, eyes, is_training = self.rows, self._eyes, self.training
         # Entries, models and a segmenter's weights are large and never change: the copies share them.
-        shared = (self.experience, self.segmenter, *(row.candidates for row in rows))
+        shared = [self.experience, self.segmenter]
+        for row in rows:
+            shared += [row.candidates, *row.used_entries, *(one.entry for one in row.ranked)]
         try:
             self.rows, self._eyes = deepcopy((rows, eyes), {id(one): one for one in shared})
             self.eval()

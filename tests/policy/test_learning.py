@@ -1,10 +1,13 @@
+from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import pytest
 import torch
 from lerobot.configs import FeatureType
-from lerobot.datasets import LeRobotDatasetMetadata
+from lerobot.datasets import LeRobotDataset, LeRobotDatasetMetadata
 from lerobot.utils.feature_utils import dataset_to_policy_features
 from tests.policy.conftest import Frame, act
 from tests.policy.lerobot_commands import CALIBRATION
@@ -12,6 +15,8 @@ from tests.policy.lerobot_commands import CALIBRATION
 from lerobot_openspm.configuration_openspm import OpenSPMConfig
 from lerobot_openspm.errors import DatasetError, MemoryFormatError
 from lerobot_openspm.flow.training_set import TrainingSet
+from lerobot_openspm.mining import processor
+from lerobot_openspm.mining.dataset import Demonstrations
 from lerobot_openspm.modeling_openspm import OpenSPMPolicy
 from lerobot_openspm.training import dataset_processor, training_set
 
@@ -112,14 +117,52 @@ def test_evaluation_looks_at_the_same_samples_whatever_the_seed(
     assert all(torch.equal(a, b) for a, b in zip(first, second, strict=True))
 
 
+def count_calls(owner: Any, name: str, argument: int, monkeypatch: pytest.MonkeyPatch) -> Counter[int]:
+    """How often a function is called, by the index of the episode that it is given as an argument."""
+    called, calls = getattr(owner, name), Counter[int]()
+
+    def counted(*given):
+        calls[given[argument].index] += 1
+        return called(*given)
+
+    monkeypatch.setattr(owner, name, counted)
+    return calls
+
+
+def test_a_dataset_is_mined_like_its_metadata(tiny_meta: LeRobotDatasetMetadata, tiny_dataset: Path):
+    config = new_config(tiny_meta)
+    some = LeRobotDataset(tiny_meta.repo_id, root=tiny_dataset, episodes=[1, 4], video_backend="pyav")
+    opened = dataset_processor(some, config).key_poses(held_out=True)
+    named = dataset_processor(tiny_meta, new_config(tiny_meta, memory_episodes=[1, 4])).key_poses(
+        held_out=True
+    )
+    for found in (opened, named):
+        assert [item.episode.index for item in found.episodes] == [1, 4]
+        assert [item.episode.index for item in found.held_out] == [0, 2, 3, 5]
+    for one, other in zip(opened.episodes, named.episodes, strict=True):
+        assert np.array_equal(one.episode.T_world_ee, other.episode.T_world_ee)
+        assert [pose.frame for pose in one.key_poses] == [pose.frame for pose in other.key_poses]
+
+
+def test_no_episodes_to_learn_from_are_an_error(tiny_meta: LeRobotDatasetMetadata):
+    with pytest.raises(DatasetError, match=r"no episode of dataset .* may be learned from"):
+        dataset_processor(tiny_meta, new_config(tiny_meta, memory_episodes=[])).key_poses()
+
+
 def numbers(samples: torch.Tensor) -> set[tuple[float, ...]]:
     """The different rows of a batch of samples."""
     return {tuple(row.tolist()) for row in samples}
 
 
-def test_held_out_episodes_are_neither_remembered_nor_drawn(tiny_meta: LeRobotDatasetMetadata):
+def test_held_out_episodes_are_neither_remembered_nor_drawn(
+    tiny_meta: LeRobotDatasetMetadata, monkeypatch: pytest.MonkeyPatch
+):
     kept = [0, 1]
+    mined = count_calls(processor, "find_key_poses", 0, monkeypatch)
+    seen = count_calls(Demonstrations, "views", 1, monkeypatch)
     policy = OpenSPMPolicy(new_config(tiny_meta, memory_episodes=kept), dataset_meta=tiny_meta)
+    assert mined == Counter(range(6)), "every episode is mined once"
+    assert seen == Counter(kept * 2), "two frames are looked at, and none of what is held out"
     assert policy.experience is not None
     assert sorted(e.source for e in policy.experience.entries) == [f"{tiny_meta.repo_id}#{i}" for i in kept]
 

@@ -1,1 +1,1 @@
-"""From demonstrations to key poses: signals, key poses, anchors. One episode in, key poses out."""
+"""From demonstrations to what is remembered and learned from them; `processor` is the front door."""

@@ -79,14 +79,16 @@ class DatasetProcessor:
     Deterministic: every process of a distributed run mines the same.
 
     Args:
-        dataset: The dataset, or LeRobot's metadata of it.
+        dataset: The dataset, or LeRobot's metadata of it. Of one that was opened for some of its episodes,
+            the others are held out, unless the options name episodes.
         options: How to mine it.
     """
 
     def __init__(self, dataset: LeRobotDataset | LeRobotDatasetMetadata, options: MiningOptions):
-        self._dataset = dataset
-        self._meta = dataset.meta if isinstance(dataset, LeRobotDataset) else dataset
+        is_open = isinstance(dataset, LeRobotDataset)
+        self._meta = dataset.meta if is_open else dataset
         self._options = options
+        self._allowed = dataset.episodes if is_open and options.episodes is None else options.episodes
 
     @cached_property
     def demonstrations(self) -> Demonstrations:
@@ -95,8 +97,10 @@ class DatasetProcessor:
         Raises:
             DatasetError: Files or columns are missing.
         """
-        dataset = self._dataset if isinstance(self._dataset, LeRobotDataset) else open_dataset(self._dataset)
-        return Demonstrations(dataset, self._options.state_layout, self._options.action_layout)
+        # Opened anew: what its owner opened may lack episodes, or turn its images for augmentation.
+        return Demonstrations(
+            open_dataset(self._meta), self._options.state_layout, self._options.action_layout
+        )
 
     def mine(self, held_out: bool = False) -> MinedDataset:
         """Find key poses, learn the objects, and choose the frame that each key pose belongs to.
@@ -137,7 +141,7 @@ class DatasetProcessor:
         Raises:
             DatasetError: No episode that may be learned from has any. The error gives the reasons.
         """
-        allowed = self.demonstrations.episodes(self._options.episodes)
+        allowed = self.demonstrations.episodes(self._allowed)
         if not allowed:
             raise DatasetError(f"no episode of dataset {self._meta.repo_id} may be learned from; name some")
         robot = observe_robot(allowed, self._options.known_robot)
@@ -162,20 +166,22 @@ class DatasetProcessor:
         self, episodes: Sequence[Episode], robot: RobotModel
     ) -> tuple[tuple[MinedEpisode, ...], dict[int, str]]:
         """Episodes with their key poses, and by index the reasons of those that have none."""
-        is_annotated = self.demonstrations.has_key_poses
-        if is_annotated:
+        demonstrations, nothing = self.demonstrations, "nothing is grasped or pushed in it"
+        if demonstrations.has_key_poses:
             logger.info("dataset %s brings its key poses in columns: they are read", self._meta.repo_id)
+            nothing = "its columns name no key pose"
         mined, skipped = list[MinedEpisode](), dict[int, str]()
         tasks = read_tasks((episode.task for episode in episodes), self._options.known_objects)
         for episode in episodes:
-            find = self.demonstrations.key_poses if is_annotated else partial(find_key_poses, robot=robot)
+            read = demonstrations.has_key_poses
+            find = demonstrations.key_poses if read else partial(find_key_poses, robot=robot)
             if episode.task not in tasks:
                 skipped[episode.index] = f"its task {episode.task!r} says nothing"
             elif key_poses := find(episode):
                 sub_tasks = as_shown(tasks[episode.task], key_poses)
                 mined.append(MinedEpisode(episode, tuple(key_poses), sub_tasks))
             else:
-                skipped[episode.index] = "nothing is grasped or pushed in it"
+                skipped[episode.index] = nothing
         for index, reason in skipped.items():
             logger.warning("skipping episode %d of %s: %s", index, self._meta.repo_id, reason)
         return tuple(mined), skipped
