@@ -111,7 +111,14 @@ def _write_columns(demonstrations: Demonstrations, mined: Sequence[MinedEpisode]
     described = features(dataset.features[OBS_STATE])
     added: dict[str, Any] = {name: (values, described[name]) for name, values in columns.items()}
     left_out = [*dataset.meta.video_keys, *(key for key in LANGUAGE_COLUMNS if key in dataset.features)]
-    modify_features(dataset, added, left_out or None, root, dataset.repo_id)
+    # LeRobot opens what it has written, and tells at length of decoders that are not here: none is needed.
+    decoders = logging.getLogger("lerobot.utils.import_utils")
+    level = decoders.level
+    decoders.setLevel(logging.ERROR)
+    try:
+        modify_features(dataset, added, left_out or None, root, dataset.repo_id)
+    finally:
+        decoders.setLevel(level)
 
 
 def _write_sub_tasks(dataset: LeRobotDataset, mined: Sequence[MinedEpisode], root: Path) -> None:
@@ -158,10 +165,13 @@ def _sub_task_rows(item: MinedEpisode, times_s: Sequence[float]) -> list[dict[st
 def sub_task_words(pose: KeyPose, sub_tasks: Sequence[SubTask]) -> str:
     """What is done in the phase that ends at a key pose: "grasp the bowl", "place the bowl on the plate"."""
     verb, whole = VERBS[pose.phase], sub_task_of(pose, sub_tasks)
-    if pose.phase in GOING:
-        return phrase(replace(whole, operation=verb))
-    part = "" if whole.landmark else whole.part
-    return phrase(SubTask(verb, whole.target, part, target_where=whole.target_where))
+    said = SubTask(verb, whole.target, "" if whole.landmark else whole.part, target_where=whole.target_where)
+    if pose.phase in GOING and whole.relation:
+        said = replace(
+            said, part=whole.part, relation=whole.relation, landmark=whole.landmark,
+            landmark_where=whole.landmark_where,
+        )  # fmt: skip
+    return phrase(said)
 
 
 def _link_the_rest(source: Path, root: Path) -> None:

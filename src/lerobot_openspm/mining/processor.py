@@ -8,7 +8,7 @@ Memory entries (`mining/entries.py`) and flow samples (`flow/samples.py`) are bo
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, field
 from functools import cached_property, partial
@@ -23,7 +23,7 @@ from lerobot_openspm.memory.instruction import read_tasks
 from lerobot_openspm.memory.robot import RobotModel
 from lerobot_openspm.mining.anchors import as_shown
 from lerobot_openspm.mining.dataset import Demonstrations, open_dataset
-from lerobot_openspm.mining.key_poses import find_key_poses
+from lerobot_openspm.mining.key_poses import KeyPose, find_key_poses
 from lerobot_openspm.mining.mined import MinedDataset, MinedEpisode, MinedKeyPoses
 from lerobot_openspm.mining.objects import find_objects, learn_scenes, simulator_poses
 from lerobot_openspm.mining.signals import Episode, observe_robot
@@ -141,50 +141,35 @@ class DatasetProcessor:
         Raises:
             DatasetError: No episode that may be learned from has any. The error gives the reasons.
         """
-        allowed = self.demonstrations.episodes(self._allowed)
+        demonstrations, name = self.demonstrations, str(self._meta.repo_id)
+        allowed = demonstrations.episodes(self._allowed)
         if not allowed:
-            raise DatasetError(f"no episode of dataset {self._meta.repo_id} may be learned from; name some")
+            raise DatasetError(f"no episode of dataset {name} may be learned from; name some")
         robot = observe_robot(allowed, self._options.known_robot)
-        mined, skipped = self._mined(allowed, robot)
+        if demonstrations.has_key_poses:
+            logger.info("dataset %s brings its key poses in columns: they are read", name)
+            find = demonstrations.key_poses
+        else:
+            find = partial(find_key_poses, robot=robot)
+        names = set(self._options.known_objects)
+        mined, skipped = mine_episodes(allowed, find, names)
         if not mined:
             raise DatasetError(
-                f"no key poses in the {len(allowed)} episodes of dataset {self._meta.repo_id}: "
+                f"no key poses in the {len(allowed)} episodes of dataset {name}: "
                 f"{'; '.join(sorted(set(skipped.values())))}. OpenSPM needs demonstrations in which the "
                 "gripper grasps, pushes or turns something"
             )
-        if self._options.judge is not None and not self.demonstrations.has_key_poses:
-            mined = self._options.judge(self.demonstrations, mined, robot)
+        if self._options.judge is not None and not demonstrations.has_key_poses:
+            mined = self._options.judge(demonstrations, mined, robot)
         others: tuple[MinedEpisode, ...] = ()
         if held_out:
-            known = {episode.index for episode in allowed}
-            left = [index for index in range(self._meta.total_episodes) if index not in known]
-            others, reasons = self._mined(self.demonstrations.episodes(left), robot)
+            left = sorted(set(range(self._meta.total_episodes)) - {one.index for one in allowed})
+            names |= {name for item in mined for sub_task in item.sub_tasks for name in sub_task.objects}
+            others, reasons = mine_episodes(demonstrations.episodes(left), find, names)
             skipped |= reasons
-        return MinedKeyPoses(str(self._meta.repo_id), robot, mined, others, skipped)
-
-    def _mined(
-        self, episodes: Sequence[Episode], robot: RobotModel
-    ) -> tuple[tuple[MinedEpisode, ...], dict[int, str]]:
-        """Episodes with their key poses, and by index the reasons of those that have none."""
-        demonstrations, nothing = self.demonstrations, "nothing is grasped or pushed in it"
-        if demonstrations.has_key_poses:
-            logger.info("dataset %s brings its key poses in columns: they are read", self._meta.repo_id)
-            nothing = "its columns name no key pose"
-        mined, skipped = list[MinedEpisode](), dict[int, str]()
-        tasks = read_tasks((episode.task for episode in episodes), self._options.known_objects)
-        for episode in episodes:
-            read = demonstrations.has_key_poses
-            find = demonstrations.key_poses if read else partial(find_key_poses, robot=robot)
-            if episode.task not in tasks:
-                skipped[episode.index] = f"its task {episode.task!r} says nothing"
-            elif key_poses := find(episode):
-                sub_tasks = as_shown(tasks[episode.task], key_poses)
-                mined.append(MinedEpisode(episode, tuple(key_poses), sub_tasks))
-            else:
-                skipped[episode.index] = nothing
         for index, reason in skipped.items():
-            logger.warning("skipping episode %d of %s: %s", index, self._meta.repo_id, reason)
-        return tuple(mined), skipped
+            logger.warning("skipping episode %d of %s: %s", index, name, reason)
+        return MinedKeyPoses(name, robot, mined, others, skipped)
 
     def _cameras(self) -> Mapping[str, Camera]:
         """The calibration, compared with the dataset's images."""
@@ -198,3 +183,31 @@ class DatasetProcessor:
         sizes = {key: shape[1:] if shape[0] == 3 else shape[:2] for key, shape in shapes.items()}
         check_sizes(self._options.cameras, sizes, self._options.calibration)
         return self._options.cameras
+
+
+def mine_episodes(
+    episodes: Sequence[Episode],
+    find: Callable[[Episode], Sequence[KeyPose]],
+    names: Collection[str] = frozenset(),
+) -> tuple[tuple[MinedEpisode, ...], dict[int, str]]:
+    """Find the key poses of episodes, and what their instructions ask for.
+
+    Args:
+        episodes: The demonstrations.
+        find: Gives an episode's key poses.
+        names: Names of the things that a memory holds already, by which instructions are read.
+
+    Returns:
+        The episodes with key poses, and the reason by index of the others.
+    """
+    mined, skipped = list[MinedEpisode](), dict[int, str]()
+    tasks = read_tasks((episode.task for episode in episodes), names)
+    for episode in episodes:
+        if episode.task not in tasks:
+            skipped[episode.index] = f"its task {episode.task!r} says nothing"
+        elif key_poses := find(episode):
+            sub_tasks = as_shown(tasks[episode.task], key_poses)
+            mined.append(MinedEpisode(episode, tuple(key_poses), sub_tasks))
+        else:
+            skipped[episode.index] = "nothing is grasped or pushed in it"
+    return tuple(mined), skipped
