@@ -13,32 +13,19 @@ from typing import Any
 
 import numpy as np
 import torch
-from huggingface_hub import snapshot_download
-from huggingface_hub.constants import CONFIG_NAME, SAFETENSORS_SINGLE_FILE
-from huggingface_hub.errors import HFValidationError
 from lerobot.configs import PreTrainedConfig
 from lerobot.policies import PreTrainedPolicy
 from torch import Tensor
 
+from lerobot_openspm.checkpoint import checkpoint_folder, load_memory
 from lerobot_openspm.configuration_openspm import OpenSPMConfig
 from lerobot_openspm.control.knowledge import Knowledge
 from lerobot_openspm.control.row import Row
 from lerobot_openspm.errors import DatasetError, MemoryFormatError, OpenSPMError
-from lerobot_openspm.experience import (
-    CAMERAS_JSON,
-    MEMORY_JSON,
-    Experience,
-    check_anchors,
-    check_labels,
-    load_experience,
-    save_experience,
-)  # fmt: skip
-from lerobot_openspm.experience_files import data_files
-from lerobot_openspm.experience_header import check_layouts
+from lerobot_openspm.experience import Experience, save_experience
 from lerobot_openspm.flow.condition import CONDITION_DIM, Query, encode, to_world_frame
 from lerobot_openspm.flow.network import VelocityField
 from lerobot_openspm.flow.training_set import TrainingSet
-from lerobot_openspm.geometry.camera import check_sizes
 from lerobot_openspm.memory.entry import MemoryEntry
 from lerobot_openspm.memory.indexed_entries import indexed
 from lerobot_openspm.memory.names import NameSimilarity, names_from
@@ -336,53 +323,21 @@ class OpenSPMPolicy(PreTrainedPolicy):
         Raises:
             MemoryFormatError: The checkpoint has no memory, or a damaged or newer one.
         """
-        directory = Path(pretrained_name_or_path)
-        if not directory.is_dir():
-            download = partial(
-                snapshot_download, str(pretrained_name_or_path), force_download=force_download,
-                token=token, cache_dir=cache_dir, local_files_only=local_files_only,
-            )  # fmt: skip
-            files = [CONFIG_NAME, SAFETENSORS_SINGLE_FILE, MEMORY_JSON, CAMERAS_JSON]
-            try:
-                directory = Path(download(allow_patterns=files, revision=revision))
-            except HFValidationError as error:
-                raise FileNotFoundError(
-                    f"no checkpoint folder at {pretrained_name_or_path}, and no name on the Hub (user/name)"
-                ) from error
-            # What else it needs is named there. Pushes before may have left other files of this kind.
-            download(allow_patterns=data_files(directory), revision=directory.name)
+        directory = checkpoint_folder(
+            pretrained_name_or_path, revision, force_download=force_download, token=token,
+            cache_dir=cache_dir, local_files_only=local_files_only,
+        )  # fmt: skip
         policy = super().from_pretrained(directory, config=config, strict=strict, **kwargs)
         policy._attach(directory, dataset_meta)
         return policy
 
     def _attach(self, directory: Path, dataset_meta: Any | None) -> None:
         """Give a freshly loaded policy its memory, and its training set when training goes on."""
-        cameras = None if self.config.cameras is None else Path(self.config.cameras)
-        self.experience = load_experience(directory, cameras)
-        if not self.experience.entries:
-            raise MemoryFormatError(
-                f"the memory in {directory} holds no entries, so nothing can be done with it; train again"
-            )
-        for name in ("perception", "segmentation", "shape"):
-            made, asked = getattr(self.experience, name), getattr(self.config, name)
-            if made != asked:
-                raise MemoryFormatError(
-                    f"the memory in {directory} holds key poses in the frames of {name}={made}, got "
-                    f"--policy.{name}={asked}; the two cannot be mixed, train with the one you evaluate"
-                )
-        if self.config.memory_update == "keep" or dataset_meta is None:
-            where = str(directory / MEMORY_JSON)
-            check_layouts(self.experience.layouts, self.config.layouts(), "the configuration's", where)
-            check_anchors(self.experience, str(directory / MEMORY_JSON))
-            check_labels(self.experience, self.config.mask_labels, str(directory / CONFIG_NAME))
+        is_kept = self.config.memory_update == "keep" or dataset_meta is None
+        self.experience = load_memory(directory, self.config, is_kept)
         _ = self.segmenter, self.names  # what cannot be used is an error now, not at the first observation
-        where = self.config.cameras or str(directory / CAMERAS_JSON)
-        check_sizes(self.experience.cameras, self.config.image_sizes, where)
         if dataset_meta is not None:
             self.experience = self._learn_on(self.experience, dataset_meta)
-            logger.info(
-                "memory_update=%s: %d entries", self.config.memory_update, len(self.experience.entries)
-            )
 
     def _learn_on(self, experience: Experience, dataset_meta: Any) -> Experience:
         """Take up a dataset to train on, and update what is known by it as ``config.memory_update`` says."""
@@ -394,6 +349,7 @@ class OpenSPMPolicy(PreTrainedPolicy):
             mined = processor.mine(held_out=True)
             newer = experience_of(mined, self.config)
             experience = newer if known is None else known.appended(newer)
+        logger.info("memory_update=%s: %d entries", self.config.memory_update, len(experience.entries))
         self._training_set = training_set(mined, experience.robot, self.config)
         return experience
 
