@@ -6,7 +6,7 @@ import pytest
 from lerobot.datasets import LeRobotDatasetMetadata
 from tests.memory.memory_files import names
 from tests.policy.conftest import NAME
-from tests.policy.lerobot_commands import run_command
+from tests.policy.lerobot_commands import lerobot_train, pretrained, run_command, training_options
 from tests.policy.test_learning import new_config
 
 from lerobot_openspm.mining import processor
@@ -22,6 +22,15 @@ def test_training_on_it_reads_the_key_poses_and_remembers_the_same(
     policy.save_pretrained(tmp_path / "again")
     for name in names(checkpoint):
         assert (tmp_path / "again" / name).read_bytes() == (checkpoint / name).read_bytes(), name
+
+
+@pytest.mark.slow
+def test_lerobot_train_on_it_leaves_the_same_memory(
+    annotated_dataset: Path, checkpoint: Path, tmp_path: Path
+):
+    lerobot_train(*training_options(annotated_dataset, tmp_path / "run", 10))
+    for name in names(checkpoint):
+        assert (pretrained(tmp_path / "run") / name).read_bytes() == (checkpoint / name).read_bytes(), name
 
 
 @pytest.mark.slow
