@@ -91,9 +91,8 @@ def write_annotated(demonstrations: Demonstrations, mined: MinedKeyPoses, folder
         _write_sub_tasks(dataset, every, beside)
         _link_the_rest(Path(dataset.root), beside)
         _describe(dataset, beside)
-        LeRobotDataset(
-            dataset.repo_id, root=beside, video_backend="pyav"
-        )  # what cannot be read is never put in its place
+        # What LeRobot cannot read is never put in its place.
+        LeRobotDataset(dataset.repo_id, root=beside, video_backend="pyav")
         rename(beside, folder)
     except BaseException:
         shutil.rmtree(beside, ignore_errors=True)
