@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 
@@ -25,11 +26,14 @@ from lerobot_openspm.memory.instruction import read_tasks
 from lerobot_openspm.memory.names import TABLE_NAMES, NameSimilarity
 from lerobot_openspm.memory.retrieval import ScoreWeights
 from lerobot_openspm.memory.robot import RobotModel
-from lerobot_openspm.mining.anchors import Demonstration, as_shown
+from lerobot_openspm.mining.anchors import Demonstration
+from lerobot_openspm.mining.entries import task_entries
 from lerobot_openspm.mining.key_poses import find_key_poses
-from lerobot_openspm.mining.mine import MinedEpisode, build_entries, hints
+from lerobot_openspm.mining.objects import hints
 from lerobot_openspm.mining.outcomes import carried_to
+from lerobot_openspm.mining.processor import mine_episodes
 from lerobot_openspm.mining.signals import Episode
+from lerobot_openspm.mining.tasks import compare
 
 ROBOT = RobotModel(1.0, -1.0, 0.08, 0.01, 0.1, 0.01, np.array([[-0.5, -0.5, 0.0], [0.5, 0.5, 0.5]]))
 # Opening of the fingers around a thing, metres; metres that the hand and the fingers go in a step.
@@ -61,13 +65,13 @@ def _teach(
     if instruction not in tasks:
         raise OpenSPMError(f"{instruction!r} has no words; give it some in everyday.json")
     episode = _drawn(instruction, number, len(tasks[instruction]), rng)
-    key_poses = tuple(find_key_poses(episode, ROBOT))
-    mined = MinedEpisode(episode, key_poses, as_shown(tasks[instruction], key_poses))
+    (mined,), _ = mine_episodes([episode], partial(find_key_poses, robot=ROBOT), known_names(known))
     layout = {
         hint.name: se3.transform(np.eye(3), [*hint.point_world[:2], 0.0]) for hint in reversed(hints(mined))
     }
-    ends = carried_to(Demonstration(key_poses, layout), mined.sub_tasks)
-    found = build_entries([mined], [layout], [ends], {}, "drawn")
+    ends = carried_to(Demonstration(mined.key_poses, layout), mined.sub_tasks)
+    (task,) = compare([mined], [layout], [ends], {})
+    found = task_entries(task, "drawn")
     if not found:
         raise OpenSPMError(f"a demonstration of {instruction!r} gave no entry; it touched {sorted(layout)}")
     return entry_from_json(entry_to_json(found[0]), instruction)
