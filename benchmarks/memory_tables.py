@@ -30,6 +30,11 @@ def memory_sections() -> list[str]:
 
 def _language(result: Quoted) -> str:
     rows = [["the wordings of LIBERO's 130 tasks", *_share(result["libero_parsed"], result["n_libero"])]]
+    if "acted_entry_right" in result:  # not in results of before it was measured
+        rows += [
+            ["everyday instructions learned", *_share(result["any_wording_learned"], result["n_wordings"])],
+            ["entry that is meant acts", *_share(result["acted_entry_right"], result["n_acted"])],
+        ]
     for split, one in result["splits"].items():
         name = split.replace("_", " ")
         rows += [

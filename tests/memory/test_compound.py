@@ -189,3 +189,24 @@ def test_parts_can_be_carried_over_to_a_scene():
     layout = {"cabinet": se3.from_yaw([0.3, 0.1, 0.0], 0.4)}
     targets = transfer(opening, layout, {}, hand_pose(0, 0, 0.3))
     np.testing.assert_allclose(targets[0].T_world_ee, layout["cabinet"] @ opening.key_poses[0].T_obj_ee)
+
+
+WIPE, SINK = "wipe the table with the sponge", "put the sponge in the sink"
+
+
+def test_what_the_grammar_cannot_read_is_carried_out_sentence_by_sentence():
+    bank = [entry(WIPE, source="wipe"), entry(SINK, source="sink")]
+    for asked in (f"{WIPE}, and then {SINK}", f"Please {WIPE}. Then {SINK}!"):
+        chain = plan_parts(asked, bank)
+        assert [[one.source.source for one in part] for part in chain] == [["wipe"], ["sink"]]
+    for asked in (f"sing, then {SINK}", f"{WIPE} and then sing", f"do not {WIPE}, then {SINK}"):
+        with pytest.raises(InstructionError, match="it knows"):
+            plan_parts(asked, bank)
+
+
+def test_an_instruction_kept_by_its_words_is_one_part_however_much_it_moved():
+    shown = entry("set the table")
+    two = replace(shown, key=replace(shown.key, sub_tasks=shown.key.sub_tasks * 2))
+    ((one,),) = plan_parts("please set the table", [two])
+    assert (one.entry, one.asked, one.semantic) == (two, two.key.sub_tasks, 1.0)
+    assert parts(two) == (two,)

@@ -103,3 +103,15 @@ def test_a_missing_package_is_one_error_with_the_command(monkeypatch: pytest.Mon
     monkeypatch.setattr(builtins, "__import__", without)
     with pytest.raises(InstructionError, match=r"pip install 'lerobot_policy_openspm\[text\]'"):
         Model2VecNames("anything")
+
+
+def test_embeddings_compare_the_words_of_what_the_grammar_cannot_read(tmp_path):
+    model = make_model(
+        tmp_path, {"scrub": (1.0, 0.1), "wipe": (1.0, 0.0), "table": (0.0, 1.0), "burn": (-1.0, 0.0)}
+    )
+    names, bank = Model2VecNames(str(model)), [entry("wipe the table")]
+    (found,) = semantic_candidates("scrub the table", bank, names)
+    assert 0.75 <= found[1] < 1
+    for asked, similarity in (("scrub the table", TABLE_NAMES), ("burn the table", names)):
+        with pytest.raises(InstructionError, match="no experience"):
+            semantic_candidates(asked, bank, similarity)

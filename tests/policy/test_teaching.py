@@ -1,5 +1,6 @@
 """A policy is taught in Python, also while it runs."""
 
+import shutil
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -7,7 +8,8 @@ from typing import Any
 
 import pytest
 import torch
-from lerobot.datasets import LeRobotDatasetMetadata
+from lerobot.datasets import LeRobotDataset, LeRobotDatasetMetadata
+from lerobot.datasets.dataset_tools import modify_tasks
 from tests.policy.conftest import NAME, Frame, batch_of
 
 from lerobot_openspm import teaching
@@ -92,3 +94,42 @@ def test_demonstrations_of_another_robot_are_refused(
     with pytest.raises(MemoryFormatError, match="another robot or controller"):
         policy.teach(push_meta)
     assert policy.experience is before
+
+
+@pytest.mark.parametrize(
+    ("told", "asked", "objects", "learned"),
+    [
+        ("polish the plate with the bowl", "please polish a plate with the bowl", {"bowl"}, ()),
+        (
+            "Serve the soup to the guest",
+            "could you serve soup to the guest?",
+            {"soup", "guest"},
+            ("guest", "soup"),
+        ),
+    ],
+)
+def test_any_wording_is_taught_and_acted_on(
+    policy: OpenSPMPolicy,
+    tiny_dataset: Path,
+    recorded: list[list[Frame]],
+    tmp_path: Path,
+    told: str,
+    asked: str,
+    objects: set[str],
+    learned: tuple[str, ...],
+):
+    """The demonstrations put the bowl on the plate; what is said of it is not what the grammar reads."""
+    root = Path(shutil.copytree(tiny_dataset, tmp_path / "told"))
+    modify_tasks(
+        LeRobotDataset(NAME, root=root, video_backend="pyav"), episode_tasks=dict.fromkeys(range(3), told)
+    )
+    lesson = policy.teach(LeRobotDatasetMetadata(NAME, root=root), [0, 1, 2])
+    assert lesson.instructions == (told,)
+    assert sorted(lesson.objects_learned) == sorted(learned)
+    assert objects <= set(lesson.entries[0].objects)
+    frame = recorded[0][0]
+    for said in (told, asked):
+        policy.reset()
+        policy.select_action(batch_of([{**frame, "task": said}, frame]))
+        assert [row.status.value for row in policy.rows] == ["running", "running"]
+        assert [row.ranked[0].entry.language for row in policy.rows] == [told, frame["task"]]

@@ -6,6 +6,7 @@ demonstration shows as a whole is carried out by entries of its parts, one after
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
@@ -16,6 +17,7 @@ from lerobot_openspm.memory.entry import MemoryEntry, MemoryKeyPose, Reference, 
 from lerobot_openspm.memory.indexed_entries import near
 from lerobot_openspm.memory.meaning import semantic_score
 from lerobot_openspm.memory.names import TABLE_NAMES, NameSimilarity
+from lerobot_openspm.memory.own_words import normal_words
 from lerobot_openspm.memory.retrieval import candidates_for, read_instruction, why_unread
 
 # A sub-task takes hold of something and lets it go again.
@@ -29,6 +31,8 @@ _PREPOSITIONS = {
     "center": "in the center of",
 }  # fmt: skip
 _VERBS = {"pick": "pick up"}
+# What one thing after another is said with: "wipe the table, and then open the drawer".
+_NEXT = re.compile(r"(?:\band )?\bthen\b|[;.!?\n]+", re.IGNORECASE)
 
 
 @dataclass(frozen=True)
@@ -126,7 +130,8 @@ def plan_parts(
             says why it could not be read or names the sub-task, and lists what the memory knows.
     """
     asked = read_instruction(instruction, entries, names)
-    why = why_unread(instruction, entries) if asked[0].words else ""
+    if asked[0].words:
+        return _plan_by_words(instruction, asked, entries, names)
     entries = near(asked, entries, partial(semantic_score, names=names))
     chain: list[tuple[Candidate, ...]] = []
     left = asked
@@ -135,16 +140,30 @@ def plan_parts(
         try:
             found = _longest_run(left, said, entries, names)
         except InstructionError as error:
-            if why:
-                raise InstructionError(f"{why}; and {error}") from error
             if len(asked) == 1:
                 raise
             raise InstructionError(
                 f"{said!r} is a part of the instruction {instruction!r} that cannot be done: {error}"
             ) from error
         chain.append(found)
-        left = left[1 if left[0].words else len(found[0].asked) :]
+        left = left[len(found[0].asked) :]
     return tuple(chain)
+
+
+def _plan_by_words(
+    instruction: str, asked: tuple[SubTask, ...], entries: Sequence[MemoryEntry], names: NameSimilarity
+) -> tuple[tuple[Candidate, ...], ...]:
+    """Likewise of an instruction that the grammar cannot read: as a whole, else sentence by sentence."""
+    close = near(asked, entries, partial(semantic_score, names=names))
+    try:
+        return (_about(asked, instruction, [Candidate(entry, 0.0, entry) for entry in close], names),)
+    except InstructionError as error:
+        sentences = [one for one in _NEXT.split(instruction) if normal_words(one)]
+        with suppress(InstructionError):
+            if len(sentences) > 1:
+                return tuple(part for one in sentences for part in plan_parts(one, entries, names))
+        why = why_unread(instruction, entries)
+        raise InstructionError(f"{why}; and {error}" if why else str(error)) from error
 
 
 def _longest_run(

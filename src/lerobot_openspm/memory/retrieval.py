@@ -71,7 +71,7 @@ def read_instruction(
             return asked
         for entry in close:
             if normal_words(entry.language) == own[0].words:
-                return entry.key.sub_tasks
+                return own if entry.key.sub_tasks[0].words else entry.key.sub_tasks
         if most > best:
             read, best = asked, most
     return read
