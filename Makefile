@@ -2,7 +2,7 @@
 
 .DEFAULT_GOAL := setup
 .NOTPARALLEL:
-.PHONY: help setup egl demo figures libero libero-setup libero-tables test test-slow guard lint typecheck format clean
+.PHONY: help setup egl demo figures tables libero libero-setup test test-slow guard lint typecheck format clean
 
 # The demo's total time counts the set-up, so the clock starts before anything else does.
 STARTED_AT := $(shell date +%s)
@@ -13,6 +13,8 @@ STATES ?= 50
 TASKS ?= 0-9
 SUITE ?= tabletop
 PYTEST_ARGS ?=
+RESULT ?=
+FIGURES ?=
 # The tests of a file share what they make, so a file stays in one process.
 TWO_PROCESSES := -n 2 --dist loadfile
 
@@ -32,11 +34,12 @@ setup: ## make .venv with Python 3.12 or 3.13 (PYTHON=... chooses one) and insta
 egl: setup
 	@$(BIN)/python scripts/check_egl.py
 
-demo: egl ## collect DEMOS demonstrations, train, evaluate EPISODES episodes; the last line is JSON
-	@$(BIN)/openspm demo --demos=$(DEMOS) --episodes=$(EPISODES) --started_at=$(STARTED_AT)
+demo: egl ## collect DEMOS demonstrations, train, evaluate EPISODES episodes; RESULT=FILE keeps the last line
+	@$(BIN)/openspm demo --demos=$(DEMOS) --episodes=$(EPISODES) --started_at=$(STARTED_AT) \
+		$(if $(RESULT),--result=$(RESULT))
 
-figures: egl ## measure the published figures into benchmarks/results; the last line is JSON
-	@$(BIN)/python -m benchmarks.figures
+figures: egl ## take the published figures (FIGURES="NAME ..." some of them) that are missing or stale: hours
+	@$(BIN)/python -m benchmarks.figures $(FIGURES)
 
 # LIBERO and its scenes are hundreds of megabytes that only these figures need.
 libero-setup: egl
@@ -48,7 +51,7 @@ libero-setup: egl
 libero: libero-setup ## the same on LIBERO-GOAL: DEMOS, STATES initial states of TASKS (0-9); needs LIBERO, see README
 	@$(BIN)/python -m benchmarks.libero.run --demos=$(DEMOS) --states=$(STATES) --tasks=$(TASKS)
 
-libero-tables: setup ## write docs/results.md from what was measured (benchmarks/results)
+tables: setup ## write docs/results.md and README's figures from what was measured (benchmarks/results)
 	@$(BIN)/python -m benchmarks.tables
 
 test: egl ## run the tests, without those marked slow, libero or gpu (PYTEST_ARGS=... adds arguments)

@@ -59,7 +59,7 @@ def main() -> dict:
                 "field of view given": summary([run for run in runs if run["fov_given"]]),
                 "field of view estimated": summary([run for run in runs if not run["fov_given"]]),
             }
-    return write("calibration", {"n": CHOICES, "episodes": 10, "cameras": rows})
+    return write("calibration", {"seed": 0, "n": CHOICES, "episodes": 10, "cameras": rows})
 
 
 def read(folder: Path, config: OpenSPMConfig) -> Source:

@@ -1,33 +1,179 @@
-"""All figures of the tabletop, each as a JSON file under ``benchmarks/results``, and a summary of them."""
+"""Every published figure: the command that takes it, and the code that it measures.
 
+    python -m benchmarks.figures                     # take all that need no LIBERO, unless current
+    python -m benchmarks.figures tracking libero_goal   # take these, unless current
+
+A figure `NAME` is kept as ``benchmarks/results/NAME.json``. Each command goes on where it was interrupted.
+"""
+
+from __future__ import annotations
+
+import argparse
 import json
 import logging
+import shlex
+import subprocess
+import sys
+from dataclasses import dataclass
+from pathlib import Path
 
-from benchmarks import conditioning, execution, oracle, perception, selection, tables
+from benchmarks.staleness import Origin, origin
+
+logger = logging.getLogger(__name__)
+
+PACKAGE = "src/lerobot_openspm"
+# What a policy does with its default options. Backends that need a download are not part of any figure.
+POLICY = (
+    *(f"{PACKAGE}/{room}" for room in ("control", "flow", "geometry", "memory", "mining", "perception")),
+    f":(glob){PACKAGE}/*.py",
+    f":(exclude){PACKAGE}/search.py",
+    f":(exclude,glob){PACKAGE}/perception/sam3d*.py",
+    f":(exclude,glob){PACKAGE}/perception/segmentation/*sam*.py",
+)
+RECORDING = (f"{PACKAGE}/cli/collect.py", f":(glob){PACKAGE}/envs/*.py")
+TABLETOP = (*POLICY, *RECORDING, "configs/openspm_tabletop_train.yaml")
+LIBERO = (
+    *POLICY,
+    f"{PACKAGE}/cli/collect.py",
+    f"{PACKAGE}/envs/libero",
+    f"{PACKAGE}/envs/motions.py",
+    f"{PACKAGE}/envs/recording.py",
+    "configs/openspm_libero_train.yaml",
+    "configs/cameras/libero.json",
+    "benchmarks/libero/episode.py",
+    "benchmarks/libero/evaluate.py",
+    "benchmarks/libero/stages.py",
+)
+TRACKING = (f"{PACKAGE}/bench/tracking.py", f"{PACKAGE}/bench/tabletop.py", f"{PACKAGE}/bench/episode.py")
+ALONG = tuple(
+    f"{PACKAGE}/bench/{name}.py" for name in ("perception", "truth", "object_frames", "episode", "tabletop")
+)
+KEY_POSES = (
+    *(f"{PACKAGE}/{room}" for room in ("geometry", "mining")),
+    *(
+        f"{PACKAGE}/bench/{name}.py"
+        for name in ("key_poses", "recording", "contact_events", "contact_sensor")
+    ),
+)
+LANGUAGE = (
+    f"{PACKAGE}/memory",
+    f"{PACKAGE}/bench/language.py",
+    f"{PACKAGE}/bench/instructions",
+)
+NOISE, NOISE_SCRIPT = "benchmarks.measurement_noise", "benchmarks/measurement_noise.py"
+NEW_TASKS = (
+    "open_the_middle_drawer_of_the_cabinet",
+    "put_the_bowl_on_the_plate",
+    "put_the_cream_cheese_in_the_bowl",
+    "turn_on_the_stove",
+)
 
 
-def main() -> None:
-    """Measure what is not measured yet, and print the summary as one JSON object."""
-    logging.basicConfig(level=logging.INFO, format="%(levelname)s %(message)s")
-    followed, errors = execution.main(), perception.main()
-    truth, _ = oracle.main(), conditioning.main()
-    beside = {name: selection.main(name)["runs"][name] for name in selection.SEEDS}
-    tables.write_page()
-    runs = followed["runs"]
-    summary = {
-        "oracle_success": truth["oracle"]["success"],
-        **{
-            f"{name}_success": runs[name]["success"]
-            for name in ("open_loop", "closed_loop", "closed_loop_trc")
-        },
-        "mean_steps": runs["closed_loop_trc"]["mean_steps"],
-        "expert_steps": followed["expert_steps"],
-        **{name: errors[name] for name in ("position_mm_mean", "position_mm_p95", "yaw_deg_mean")},
-        "n": runs["closed_loop_trc"]["n"],
-        **{f"{name}_success": run["success"] for name, run in beside.items()},
-    }
-    print(json.dumps(summary))
+@dataclass(frozen=True)
+class Figure:
+    """How a figure is taken.
+
+    Attributes:
+        command: The command line, from the root of the checkout; what it wrote says with what it was run.
+        paths: Git's names (pathspecs) of the code whose change makes the figure stale.
+    """
+
+    command: str
+    paths: tuple[str, ...]
+
+
+def _bench(what: str, name: str, paths: tuple[str, ...], options: str = "") -> Figure:
+    options = f" {options}" if options else ""
+    return Figure(f"openspm bench {what}{options} --result=benchmarks/results/{name}.json", paths)
+
+
+def _tabletop(comparison: str) -> Figure:
+    return Figure(f"python -m benchmarks.tabletop {comparison}", TABLETOP)
+
+
+def _libero(script: str, *own: str, options: str = "") -> Figure:
+    module = f"benchmarks/libero/{script}.py"
+    return Figure(f"python -m benchmarks.libero.{script} {options}".strip(), (*LIBERO, module, *own))
+
+
+FIGURES: dict[str, Figure] = {
+    "tabletop": Figure("openspm demo --result=benchmarks/results/tabletop.json", TABLETOP),
+    **{name: _tabletop(name) for name in ("execution", "oracle", "conditioning", "compound", "two_bowls")},
+    "perception_tabletop": _bench("perception", "perception_tabletop", (*TABLETOP, *ALONG)),
+    "tracking": _bench("tracking", "tracking", (*TABLETOP, *TRACKING)),
+    "cameras": _bench("cameras", "cameras", (*TABLETOP, *TRACKING)),
+    "teach": _bench("teach", "teach", (*TABLETOP, f"{PACKAGE}/bench/teach.py", *TRACKING)),
+    "keyposes_tabletop": _bench(
+        "keyposes", "keyposes_tabletop", (*KEY_POSES, f":(glob){PACKAGE}/envs/*.py"),
+        "--env.type=openspm_tabletop --seed=30000",
+    ),
+    "language": _bench("language", "language", LANGUAGE),
+    "memory": _bench(
+        "memory", "memory",
+        (f"{PACKAGE}/memory", f":(glob){PACKAGE}/experience*.py", f":(glob){PACKAGE}/bench/synthetic_*.py",
+         f"{PACKAGE}/bench/memory.py"),
+    ),
+    "measurement_noise": Figure(f"python -m {NOISE}", (*TABLETOP, *ALONG, NOISE_SCRIPT)),
+    "measurement_noise_libero": Figure(
+        f"python -m {NOISE} --env.type=libero", (*LIBERO, *ALONG, NOISE_SCRIPT)
+    ),
+    "libero_goal": _libero("run", "benchmarks/libero/accuracy.py"),
+    "libero_accuracy": _libero("run", "benchmarks/libero/accuracy.py"),
+    "libero_few_shot_3": _libero("few_shot", options="--demos=3"),
+    "libero_few_shot_1": _libero("few_shot", options="--demos=1 --states=10"),
+    "libero_ablations": _libero("ablations", "benchmarks/libero/geometric_guess.py"),
+    **{f"libero_new_task_{task}_3": _libero("new_task", options=f"--task={task}") for task in NEW_TASKS},
+    "libero_losses": _libero("losses"),
+    "libero_latency": _libero("latency"),
+    "libero_equality": _libero("equality"),
+    "perception_libero": _bench("perception", "perception_libero", (*LIBERO, *ALONG), "--env.type=libero"),
+    "keyposes_libero": _bench(
+        "keyposes", "keyposes_libero", (*KEY_POSES, f"{PACKAGE}/envs/libero"),
+        "--env.type=libero --seed=30000",
+    ),
+    "calibration": Figure(
+        "python -m benchmarks.calibration --libero=outputs/libero/demos_10/dataset",
+        (f"{PACKAGE}/calibration", f"{PACKAGE}/geometry", *RECORDING, f"{PACKAGE}/envs/libero",
+         "benchmarks/calibration.py"),
+    ),
+}  # fmt: skip
+
+
+def needs_libero(figure: Figure) -> bool:
+    """Whether a figure is taken on LIBERO, which is installed apart."""
+    return "libero" in figure.command
+
+
+def take(name: str) -> None:
+    """Run a figure's command, unless its result is current."""
+    figure = FIGURES[name]
+    problem = origin(name, figure.paths).problem
+    if problem is None:
+        logger.info("%s is current", name)
+        return
+    logger.info("%s (%s): %s", name, problem, figure.command)
+    program, *arguments = shlex.split(figure.command)
+    subprocess.run([str(Path(sys.executable).with_name(program)), *arguments], check=True)
+
+
+def main(names: list[str]) -> dict[str, Origin]:
+    """Take the figures, then write the pages that quote them."""
+    from benchmarks import tables
+
+    for name in names:
+        take(name)
+    tables.write_pages()
+    return {name: origin(name, FIGURES[name].paths) for name in names}
 
 
 if __name__ == "__main__":
-    main()
+    logging.basicConfig(level=logging.INFO, format="%(levelname)s %(message)s")
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("names", nargs="*", metavar="NAME", help=f"of: {', '.join(FIGURES)}")
+    chosen = parser.parse_args().names or [n for n, one in FIGURES.items() if not needs_libero(one)]
+    if unknown := sorted(set(chosen) - set(FIGURES)):
+        parser.error(f"no figures {', '.join(unknown)}; expected some of {', '.join(FIGURES)}")
+    taken = main(chosen)
+    print(json.dumps({name: found.problem or "current" for name, found in taken.items()}))

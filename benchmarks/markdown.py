@@ -1,28 +1,70 @@
-"""What the pages of results are made of: parts read from JSON, and tables."""
+"""What the pages of results are made of: sections read from JSON, each with marks of what it quotes."""
 
 from __future__ import annotations
 
-import json
-from collections.abc import Callable
-from pathlib import Path
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
-RESULTS = Path(__file__).parent / "results"
+from benchmarks.staleness import read_result
+
+from lerobot_openspm.bench.results import PROVENANCE
+
+NO_FIGURES = set(PROVENANCE) - {"n"}
 
 
-def part(title: str, name: str, render: Callable[[dict[str, Any]], str], script: str) -> str:
-    """One section, from one JSON file; says so where it is missing."""
-    path = RESULTS / f"{name}.json"
-    if not path.exists():
-        return f"## {title}\n\nNot measured: `{path.name}` is missing; run `python -m benchmarks.{script}`."
-    result = json.loads(path.read_text())
-    return f"## {title}\n\n{render(result)}\n\n{origin(result)}"
+class Quoted(dict[str, Any]):
+    """A result that notes which of its figures are read."""
+
+    def __init__(self, name: str, content: dict[str, Any]) -> None:
+        super().__init__(content)
+        self.name, self.read = name, dict.fromkeys(())
+
+    def __getitem__(self, key: str) -> Any:
+        if key not in NO_FIGURES:
+            self.read[key] = None
+        return super().__getitem__(key)
+
+    @property
+    def marks(self) -> str:
+        """One comment for every figure that was read; `scripts/stale_figures.py` looks for them."""
+        return " ".join(f"<!-- figure: {self.name}.{key} -->" for key in self.read)
 
 
-def origin(result: dict[str, Any]) -> str:
-    """What a result was measured on."""
+def quoted(name: str) -> Quoted | None:
+    """A result to quote from; None if it was not measured."""
+    content = read_result(name)
+    return None if content is None else Quoted(name, content)
+
+
+def section(title: str, names: str | Sequence[str], render: Callable[..., str]) -> str:
+    """A section made of one result, or of those of several that are there; empty if none is.
+
+    Args:
+        title: Its heading.
+        names: The result that `render` gets, or the results that it gets a list of.
+        render: Makes the text.
+    """
+    single = isinstance(names, str)
+    found = [one for name in ([names] if single else names) if (one := quoted(name)) is not None]
+    if not found:
+        return ""
+    text = render(found[0] if single else found)
+    marks = "\n".join(one.marks for one in found)
+    return f"## {title}\n{marks}\n\n{text}\n\n{'\n'.join(dict.fromkeys(_origin(one) for one in found))}"
+
+
+def chapter(introduction: str, sections: Iterable[str]) -> list[str]:
+    """The sections that there are, below their introduction; nothing if there are none."""
+    there = [one for one in sections if one]
+    return [introduction, *there] if there else []
+
+
+def _origin(result: dict[str, Any]) -> str:
+    machine = result["machine"]
+    changed = ", with changes that are not in it" if result["dirty"] else ""
     return (
-        f"Commit `{result['commit']}`, {result['machine']['cores']} cores ({result['machine']['processor']})."
+        f"`{result['command']}` on {result['date'][:10]}, commit `{result['commit']}`{changed}; "
+        f"{machine['cores']} cores of {machine['cpu']}."
     )
 
 

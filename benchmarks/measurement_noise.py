@@ -1,17 +1,17 @@
 """Fit the mapping from what a pose estimate rests on to its covariance, and check its calibration.
 
-    python -m benchmarks.measurement_noise --env.type=libero
+    python -m benchmarks.measurement_noise [--env.type=libero]
 
 Errors are those of the estimates that the policy gets along episodes from tuning seeds, the hand in the way
-and all. Weights are fitted on all seeds but the last and judged on that; they go by hand into
-`perception/measurement.py`. Takes the options of `openspm bench`; episodes are counted per task.
+and all. Weights are fitted on all seeds but the last and judged on that, beside those in use. Fitted ones go
+by hand into `perception/measurement.py`. Takes the options of `openspm bench`; episodes are counted per task.
 """
 
 from __future__ import annotations
 
 import json
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -34,7 +34,13 @@ from lerobot_openspm.envs.seeds import TUNING_SEED_START
 from lerobot_openspm.geometry import se3
 from lerobot_openspm.modeling_openspm import OpenSPMPolicy
 from lerobot_openspm.observation import Observation
-from lerobot_openspm.perception.measurement import FLOOR_M, FLOOR_RAD, features
+from lerobot_openspm.perception.measurement import (
+    FLOOR_M,
+    FLOOR_RAD,
+    POSITION_WEIGHTS,
+    YAW_WEIGHTS,
+    features,
+)
 from lerobot_openspm.training import open_demonstrations
 
 EPISODES = 3
@@ -117,10 +123,11 @@ def fit(samples: list[Sample]) -> dict[str, Any]:
         S = covariance[which, 3, 3] * np.exp(row[which] @ weights) + FLOOR_RAD**2
         return yaw[which] ** 2 / S, np.log(S)
 
-    result = {"position": _fitted(position, ~held_out, held_out, 2)}
+    kind = samples[0].kind
+    result = {"position": _fitted(position, ~held_out, held_out, 2, POSITION_WEIGHTS[kind])}
     known = np.nan_to_num(np.abs(yaw), nan=np.inf) < MAX_ERROR_RAD
-    if samples[0].kind == "shape":
-        result["yaw"] = _fitted(turn, ~held_out & known, held_out & known, 1)
+    if kind == "shape":
+        result["yaw"] = _fitted(turn, ~held_out & known, held_out & known, 1, YAW_WEIGHTS[kind])
     return result
 
 
@@ -129,6 +136,7 @@ def _fitted(
     used: np.ndarray,
     held_out: np.ndarray,
     dimensions: int,
+    in_use: Sequence[float],
 ) -> dict[str, Any]:
     def loss(weights: np.ndarray) -> float:
         squared, log_det = squares(weights, used)
@@ -136,11 +144,18 @@ def _fitted(
 
     starts = [np.r_[first, np.full(5, other)] for first in (0.0, 2.0, 4.0) for other in (0.0, 0.5, 2.0)]
     best = min((minimize(loss, start, bounds=BOUNDS) for start in starts), key=lambda one: one.fun)
-    squared, _ = squares(best.x, held_out)
     return {
-        "weights": best.x.round(2).tolist(),
-        "n": int(used.sum()),
+        "n": int((used | held_out).sum()),
         "held_out": int(held_out.sum()),
+        "fitted": _judged(squares(best.x, held_out)[0], dimensions) | {"weights": best.x.round(2).tolist()},
+        "in_use": _judged(squares(np.array(in_use), used | held_out)[0], dimensions)
+        | {"weights": list(in_use)},
+    }
+
+
+def _judged(squared: np.ndarray, dimensions: int) -> dict[str, Any]:
+    """Squared errors beside what they are said to be: 1 and 0.95 where the covariance is right."""
+    return {
         "squared_mean_per_dimension": round(float(squared.mean()) / dimensions, 2),
         "inside_95": round(float((squared < chi2.ppf(0.95, dimensions)).mean()), 3),
     }
@@ -153,7 +168,8 @@ def main(options: list[str]) -> dict[str, Any]:
     samples = collect(config)
     kinds = sorted({sample.kind for sample in samples})
     result = {kind: fit([sample for sample in samples if sample.kind == kind]) for kind in kinds}
-    return write(f"measurement_noise_{config.env.type}", {"seed": FIRST_SEED, **result})
+    suffix = "" if config.env.type == "openspm_tabletop" else f"_{config.env.type}"
+    return write(f"measurement_noise{suffix}", {"seed": FIRST_SEED, "n": len(samples), "kinds": result})
 
 
 if __name__ == "__main__":

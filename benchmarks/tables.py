@@ -1,85 +1,150 @@
-"""Writes ``docs/results.md`` from the JSON files under ``benchmarks/results``; measures nothing itself."""
+"""Writes ``docs/results.md`` and README's figures from ``benchmarks/results``; measures nothing itself.
 
+    python -m benchmarks.tables [--current]
+
+What was not measured is left out. With ``--current`` results that are stale or cannot be taken again are
+deleted first.
+"""
+
+import argparse
 from pathlib import Path
 from typing import Any
 
-from benchmarks.libero.tables import libero_parts
-from benchmarks.markdown import part, rates, table
-from benchmarks.memory_tables import memory_parts
-from benchmarks.perception_tables import perception_parts
+from benchmarks.figures import FIGURES
+from benchmarks.libero.tables import libero_sections
+from benchmarks.markdown import Quoted, chapter, interval, percent, quoted, rates, section, table
+from benchmarks.memory_tables import memory_sections
+from benchmarks.perception_tables import perception_sections
+from benchmarks.staleness import ROOT, origin, read_result
 
-INTRODUCTION = """# Results on the tabletop
+INTRODUCTION = """# Results
 
-Made by `python -m benchmarks.tables` from `benchmarks/results`; each file there says on what commit and
-machine it was measured. Ten demonstrations a task; seeds from 1000 on. They were measured once before, at an
-earlier commit; in between the rack's shape was mended, judged on scenes of other seeds. Since then control
-and perception have changed. The ten tasks share their scenes seed by seed. Rates come with 95 % Wilson
-intervals."""
-PARTS = "Instructions of which only the parts were demonstrated, from pixels"
+Made by `python -m benchmarks.tables` from `benchmarks/results`. `python -m benchmarks.figures NAME` takes a
+figure anew, `python scripts/stale_figures.py` says which ones the code has left behind. Rates come with 95 %
+Wilson intervals."""
+TABLETOP = """# On the tabletop
+
+From ten demonstrations a task unless said otherwise, on seeds that no demonstration and no tuning used. The
+ten tasks share their scenes seed by seed."""
 NOTES = {
-    "compound": "The ten tasks were demonstrated, these five never were: each is carried out by memories of "
-    "its parts, one after another, with 300 steps for each part.",
+    "compound": "The ten tasks were demonstrated, these never were: each is carried out by memories of its "
+    "parts, one after another, with 300 steps for each part.",
     "two_bowls": "No demonstration shows two bowls; which one is meant is told from where the objects are.",
 }
-PAGE = Path(__file__).parent.parent / "docs" / "results.md"
+PAGE, README = ROOT / "docs/results.md", ROOT / "README.md"
+# What stands between these lines of README is written here.
+BEGIN, END = "<!-- figures: written by python -m benchmarks.tables -->", "<!-- end of figures -->"
 
 
-def write_page() -> None:
-    """Write the page; a table whose JSON is missing says so."""
+def write_pages() -> None:
+    """Write both pages from the results that are there."""
+    PAGE.write_text(results_page())
+    README.write_text(with_headlines(README.read_text()))
+
+
+def results_page() -> str:
+    """All that was measured, and how to measure the rest."""
     parts = [
         INTRODUCTION,
-        part("How key poses are followed, from pixels", "execution", _execution, "figures"),
-        part("Object poses from the simulator (oracle)", "oracle", _oracle, "figures"),
-        part("What the flow model is told, from pixels", "conditioning", _conditioning, "figures"),
-        part(PARTS, "compound", _selection, "selection compound"),
-        part("Which of two bowls is meant, from pixels", "two_bowls", _selection, "selection two_bowls"),
-        part("Error of the object poses on unseen scenes", "perception", _perception, "figures"),
-        *libero_parts(),
-        *perception_parts(),
-        *memory_parts(),
+        *chapter(TABLETOP, tabletop_sections()),
+        *libero_sections(),
+        *perception_sections(),
+        *memory_sections(),
     ]
-    PAGE.write_text("\n\n".join(parts) + "\n")
+    missing = {name: figure.command for name, figure in FIGURES.items() if read_result(name) is None}
+    if missing:
+        lines = "\n".join(f"- {name}: `{command}`" for name, command in missing.items())
+        parts.append(f"# Not measured on the present code\n\n{lines}")
+    return "\n\n".join(parts) + "\n"
 
 
-def _execution(result: dict[str, Any]) -> str:
-    note = f"The demonstrations take {result['expert_steps']} steps on average; mining and training took "
-    return f"{rates(result['runs'])}\n\n{note}{result['train_s']:.0f} s.\n\n{_per_task(result['runs'])}"
+def tabletop_sections() -> list[str]:
+    """Success rates on the tabletop."""
+    parts = "Instructions of which only the parts were demonstrated, from pixels"
+    return [
+        section("`make demo`, from pixels", "tabletop", _demo),
+        section("How key poses are followed, from pixels", "execution", _execution),
+        section("Object poses from the simulator (oracle)", "oracle", _with_tasks),
+        section("What the flow model is told, from pixels", "conditioning", _with_tasks),
+        section(parts, "compound", _selection),
+        section("Which of two bowls is meant, from pixels", "two_bowls", _selection),
+    ]
 
 
-def _oracle(result: dict[str, Any]) -> str:
-    runs = {"oracle": result["oracle"]}
-    return f"{rates(runs)}\n\n{_per_task(runs)}"
+def with_headlines(text: str) -> str:
+    """README with its table of figures written anew.
+
+    Raises:
+        ValueError: The lines that the table stands between are not there.
+    """
+    before, begin, rest = text.partition(BEGIN)
+    _, end, after = rest.partition(END)
+    if not (begin and end):
+        raise ValueError(
+            f"README.md has no place for its figures; put these lines into it: {BEGIN} and {END}"
+        )
+    return f"{before}{BEGIN}\n{_headlines()}\n{END}{after}"
 
 
-def _conditioning(result: dict[str, Any]) -> str:
-    return rates({name: result[name] for name in ("equivariant", "paper")})
+def _headlines() -> str:
+    """The rows whose results are there."""
+    rows = [
+        _headline("Tabletop", "tabletop", "train_s"),
+        _taught("Tabletop, a task taught to a trained policy"),
+        *(
+            _headline("LIBERO-GOAL", name, "mine_and_train_s")
+            for name in ("libero_goal", "libero_few_shot_3", "libero_few_shot_1")
+        ),
+    ]
+    there = [row for row in rows if row is not None]
+    if not there:
+        return "Nothing is measured on the present code; `make figures` measures it."
+    heads = ["From camera images", "Demonstrations", "Success", "95 % interval", "Episodes", "Learning, s"]
+    return table(heads, there)
 
 
-def _selection(result: dict[str, Any]) -> str:
+def _headline(what: str, name: str, seconds: str) -> list[Any] | None:
+    result = quoted(name)
+    if result is None:
+        return None
+    return [what, result["demonstrations"], *_rate(result), _in_s(result[seconds], result)]
+
+
+def _taught(what: str) -> list[Any] | None:
+    result = quoted("teach")
+    if result is None:
+        return None
+    return [what, 1, *_rate(result["demonstrations"]["1"]), _in_s(result["teach_s"], result)]
+
+
+def _rate(run: dict[str, Any]) -> list[Any]:
+    return [percent(run), interval(run), run["n"]]
+
+
+def _in_s(seconds: float | None, result: Quoted) -> str:
+    """The last cell of a row, which also holds the marks."""
+    return f"{'-' if seconds is None else f'{seconds:.0f}'} {result.marks}"
+
+
+def _demo(result: Quoted) -> str:
+    seconds = {"mining and training": result["train_s"], "with recording and evaluating": result["total_s"]}
+    told = ", ".join(f"{what} {s:.0f} s" for what, s in seconds.items() if s is not None)
+    return f"{rates({'all ten tasks': result})}\n\n{told.capitalize()}.\n\n{_per_task({'success': result})}"
+
+
+def _execution(result: Quoted) -> str:
+    note = f"The demonstrations take {result['expert_steps']} steps on average."
+    return f"{rates(result['runs'])}\n\n{note}\n\n{_per_task(result['runs'])}"
+
+
+def _with_tasks(result: Quoted) -> str:
+    return f"{rates(result['runs'])}\n\n{_per_task(result['runs'])}"
+
+
+def _selection(result: Quoted) -> str:
     ((name, run),) = result["runs"].items()
     rows = [[text, f"{100 * run['per_task'][task]:.0f} %"] for task, text in result["instructions"].items()]
-    note = f"{NOTES[name]} Seeds from {result['seed']} on."
-    return f"{rates(result['runs'])}\n\n{note}\n\n{table(['Instruction', 'Success'], rows)}"
-
-
-def _perception(result: dict[str, Any]) -> str:
-    rows = [
-        [
-            name,
-            row["n"],
-            row["not_found"],
-            row["position_mm_mean"],
-            row["position_mm_p95"],
-            "round" if row["yaw_deg_mean"] is None else row["yaw_deg_mean"],
-        ]
-        for name, row in result["objects"].items()
-    ]
-    note = (
-        "A learned object's frame stands anywhere on it: one rigid offset per object was fitted on the "
-        "demonstrations, and the errors are what remains."
-    )
-    heads = ["Object", "Scenes", "Not found", "Mean, mm", "95th percentile, mm", "Yaw, degrees"]
-    return f"{table(heads, rows)}\n\n{note}"
+    return f"{rates(result['runs'])}\n\n{NOTES[name]}\n\n{table(['Instruction', 'Success'], rows)}"
 
 
 def _per_task(runs: dict[str, Any]) -> str:
@@ -88,5 +153,22 @@ def _per_task(runs: dict[str, Any]) -> str:
     return table(["Task", *(name.replace("_", " ") for name in runs)], rows)
 
 
+def drop_what_is_not_current() -> list[Path]:
+    """Delete results that are stale or cannot be taken again; returns them."""
+    files = sorted((ROOT / "benchmarks/results").glob("*.json"))
+    known = {path: FIGURES.get(path.stem) for path in files}
+    dropped = [path for path, one in known.items() if origin(path.stem, one and one.paths).problem]
+    for path in dropped:
+        path.unlink()
+    return dropped
+
+
 if __name__ == "__main__":
-    write_page()
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--current", action="store_true", help="delete results that are not current")
+    if parser.parse_args().current:
+        for path in drop_what_is_not_current():
+            print(f"deleted {path.name}")
+    write_pages()

@@ -16,7 +16,7 @@ from typing import Any
 
 import draccus
 from benchmarks.common import write
-from benchmarks.libero.evaluate import summary
+from benchmarks.libero.evaluate import SEED, summary
 from benchmarks.libero.geometric_guess import GuessConfig, Source, guessing_policy, source_of
 from benchmarks.libero.stages import dataset, evaluation, policy, run_folder
 
@@ -58,10 +58,9 @@ def main(config: AblationConfig) -> dict[str, Any]:
         asked = GuessConfig(str(oracle), str(place), config.source, config.model_id, config.api_base)
         model = guessing_policy(oracle, place, source_of(asked))
         variants["zero_shot"] = evaluation(folder / "ablation_zero_shot", model, config.states)
-    return write(
-        "libero_ablations",
-        {"states": config.states, "runs": {name: summary(found) for name, found in variants.items()}},
-    )
+    runs = {name: summary(found) for name, found in variants.items()}
+    n = min(run["n"] for run in runs.values())
+    return write("libero_ablations", {"seed": SEED, "n": n, "states": config.states, "runs": runs})
 
 
 if __name__ == "__main__":

@@ -51,7 +51,8 @@ def main(config: EqualityConfig) -> dict[str, Any]:
     return write(
         "libero_equality",
         {
-            "episodes": len(equal),
+            "seed": SEED,
+            "n": len(equal),
             "equal": sum(equal),
             "actions": sum(len(actions) for actions in plain),
             "largest_difference": float(max(together)),

@@ -11,7 +11,7 @@ from typing import Any
 
 import draccus
 from benchmarks.common import write
-from benchmarks.libero.evaluate import summary
+from benchmarks.libero.evaluate import SEED, summary
 from benchmarks.libero.stages import STATES, dataset, evaluation, first_episodes, policy, run_folder
 
 
@@ -29,7 +29,7 @@ def main(config: FewShotConfig) -> dict[str, Any]:
     variant = f"few_{config.demos}"
     checkpoint, seconds = policy(root, variant, episodes=first_episodes(root, config.demos))
     episodes = evaluation(run_folder() / f"{variant}_evaluation", checkpoint, config.states)
-    figures = {"demonstrations": config.demos, "mine_and_train_s": seconds, **summary(episodes)}
+    figures = {"seed": SEED, "demonstrations": config.demos, "mine_and_train_s": seconds, **summary(episodes)}
     return write(f"libero_few_shot_{config.demos}", figures)
 
 

@@ -43,7 +43,8 @@ def main() -> dict[str, Any]:
     return write(
         "libero_latency",
         {
-            "threads": 1,
+            "seed": TUNING_SEED_START,
+            "n": CHUNKS,
             "chunk_size": horizon,
             "parameters": sum(p.numel() for p in acting.parameters()),
             "chunk_ms": chunk,

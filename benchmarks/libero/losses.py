@@ -47,7 +47,8 @@ def main() -> dict[str, Any]:
             losses[name].append(_loss(acting, samples, index))
     epochs = [round(step * config.samples_per_frame / len(frames["training"]), 2) for step in steps]
     _plot(epochs, losses)
-    return write("libero_losses", {"epochs": epochs, **losses, "plot": PLOT.name})
+    n = sum(len(index) for index in frames.values())
+    return write("libero_losses", {"seed": 0, "n": n, "epochs": epochs, **losses, "plot": PLOT.name})
 
 
 def _meta(root: Path) -> LeRobotDatasetMetadata:

@@ -16,7 +16,7 @@ from typing import Any
 
 import draccus
 from benchmarks.common import write
-from benchmarks.libero.evaluate import summary
+from benchmarks.libero.evaluate import SEED, summary
 from benchmarks.libero.stages import (
     DEMOS,
     REPO_ID,
@@ -53,7 +53,8 @@ def main(config: NewTaskConfig) -> dict[str, Any]:
     folder = run_folder() / f"taught_{name}"
     taught_s = teach(nine, root, config, folder)
     episodes = evaluation(folder / "evaluation", folder, config.states, [config.task])
-    figures = {"task": config.task, "demonstrations": config.demos, "teach_s": taught_s, **summary(episodes)}
+    taught = {"task": config.task, "demonstrations": config.demos, "teach_s": taught_s}
+    figures = {"seed": SEED, **taught, **summary(episodes)}
     return write(f"libero_new_task_{name}", figures)
 
 

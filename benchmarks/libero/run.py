@@ -15,7 +15,7 @@ from typing import Any
 import draccus
 from benchmarks.common import write
 from benchmarks.libero.accuracy import accuracy
-from benchmarks.libero.evaluate import summary
+from benchmarks.libero.evaluate import SEED, summary
 from benchmarks.libero.stages import DEMOS, STATES, dataset, evaluation, policy, run_folder, select_tasks
 
 from lerobot_openspm.envs.libero.simulator import tasks
@@ -31,13 +31,11 @@ class RunConfig:
         demos: Demonstrations a task.
         states: Initial states a task to evaluate, from the first on.
         tasks: Numbers of the tasks, such as 0-9 or 0,3,5.
-        note: What a reader of the published result has to know.
     """
 
     demos: int = DEMOS
     states: int = STATES
     tasks: str = "0-9"
-    note: str = ""
 
 
 def main(config: RunConfig) -> dict[str, Any]:
@@ -60,8 +58,9 @@ def main(config: RunConfig) -> dict[str, Any]:
         failed["off_mm"] = worst[failed["task"], failed["state"]]
     timing = {"mine_and_train_s": seconds}
     if config.demos == DEMOS and config.states == STATES and selected == list(tasks()):
-        write("libero_goal", {"demonstrations": DEMOS, **timing, **figures, "note": config.note})
-        write("libero_accuracy", {"demonstrations": DEMOS, **errors, "note": config.note})
+        about = {"seed": SEED, "demonstrations": DEMOS}
+        write("libero_goal", {**about, **timing, **figures})
+        write("libero_accuracy", {**about, "n": figures["n"], **errors})
     told = {key: figures[key] for key in ("success", "n", "mean_steps")}
     per_task = {task: row["success"] for task, row in figures["per_task"].items()}
     places = {key: errors[key] for key in ("position_mm_mean", "position_mm_p95")}

@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-import json
-from collections.abc import Callable
-from typing import Any
+from benchmarks.figures import FIGURES
+from benchmarks.markdown import Quoted, chapter, interval, percent, section, table
 
-from benchmarks.markdown import RESULTS, interval, origin, part, percent, rates, table
-
-INTRODUCTION = """# Results on LIBERO-GOAL
+INTRODUCTION = """# On LIBERO-GOAL
 
 From scripted demonstrations of seeded scenes, with LIBERO's two RGB cameras, the robot's state and the
 instruction alone. Evaluation: the benchmark's own initial states, which no demonstration starts from, at most
@@ -25,81 +22,75 @@ PUBLISHED = (
 )
 PAPER_EXECUTION = {"closed_loop_trc": 85.6, "closed_loop": 29.8, "open_loop": 3.0}
 PAPER_GUESS = 23.8
-# Position in millimetres and orientation in degrees, of the paper's filter against its own visual reference.
-PAPER_POSES = (
-    (4.3, 2.0), (4.1, 0.9), (5.0, 1.2), (14.7, 6.4), (5.5, 2.5), (5.7, 1.6), (4.6, 1.1), (5.1, 1.3),
-    (4.0, 1.0), (5.0, 1.8),
-)  # fmt: skip
+# Millimetres by task, of the paper's filter against its own visual reference.
+PAPER_MM = (4.3, 4.1, 5.0, 14.7, 5.5, 5.7, 4.6, 5.1, 4.0, 5.0)
 FAR_OFF_MM = 10.0
 CONSTRAINED = ("push", "open", "turn", "drawer")
 
 
-def libero_parts() -> list[str]:
-    """All sections; one whose JSON is missing says so."""
-    return [
+def libero_sections() -> list[str]:
+    """The chapter, of what was measured."""
+    few = sorted(
+        (n for n in FIGURES if n.startswith("libero_few_shot_")), key=lambda n: int(n.rsplit("_", 1)[1])
+    )
+    new = [name for name in FIGURES if name.startswith("libero_new_task_")]
+    return chapter(
         INTRODUCTION,
-        part("Success from pixels", "libero_goal", _main, "libero.run"),
-        part("Failures", "libero_goal", _failures, "libero.run"),
-        part("How key poses are followed", "libero_ablations", _execution, "libero.ablations"),
-        part("Where key poses come from", "libero_ablations", _memory, "libero.ablations"),
-        part("Object poses from the simulator (oracle)", "libero_ablations", _oracle, "libero.ablations"),
-        part("Error of the object poses", "libero_accuracy", _accuracy, "libero.run"),
-        _several("Few demonstrations", "libero_few_shot_*.json", _few_shot, "libero.few_shot"),
-        _several("A new task by memory alone", "libero_new_task_*.json", _new_tasks, "libero.new_task"),
-        part("Loss over epochs", "libero_losses", _losses, "libero.losses"),
-        part("The harness against lerobot-eval", "libero_equality", _equality, "libero.equality"),
-    ]
+        [
+            section("Success from pixels", "libero_goal", _main),
+            section("Time of a decision", "libero_latency", _latency),
+            section("Failures", "libero_goal", _failures),
+            section("How key poses are followed", "libero_ablations", _execution),
+            section("Where key poses come from", "libero_ablations", _memory),
+            section("Error of the object poses", "libero_accuracy", _accuracy),
+            section("Few demonstrations", [*few, "libero_goal"], _few_shot),
+            section("A new task by memory alone", new, _new_tasks),
+            section("Loss over epochs", "libero_losses", _losses),
+            section("The harness against lerobot-eval", "libero_equality", _equality),
+        ],
+    )
 
 
-def _several(title: str, pattern: str, render: Callable[[list[dict[str, Any]]], str], script: str) -> str:
-    """A section from several files."""
-    found = [json.loads(path.read_text()) for path in sorted(RESULTS.glob(pattern))]
-    if not found:
-        return f"## {title}\n\nNot measured: no `{pattern}`; run `python -m benchmarks.{script}`."
-    return f"## {title}\n\n{render(found)}\n\n{origin(found[0])}"
-
-
-def _main(result: dict[str, Any]) -> str:
-    latency = RESULTS / "libero_latency.json"
-    timing = json.loads(latency.read_text()) if latency.exists() else None
-    ours: list[Any] = [f"**OpenSPM, {result['demonstrations']} demonstrations a task**"]
-    if timing:
-        ours += [f"{timing['parameters'] / 1e6:.2f} M", timing["chunk_size"]]
-    else:
-        ours += [None, None]
-    ours += [f"**{percent(result)}**", timing and timing["equivalent_hz"], timing and timing["decisions_hz"]]
-    rows = [[name, size, length, f"{rate} %", hz, None] for name, size, length, rate, hz in PUBLISHED]
-    heads = [
-        "",
-        "Parameters",
-        "Chunk",
-        "Success",
-        "Actions per second, 1000 H / t",
-        "Decisions per second, 1000 / t",
-    ]
+def _main(result: Quoted) -> str:
     tasks = [
         [task.replace("_", " "), percent(row), interval(row), row["n"], row["mean_steps"]]
         for task, row in result["per_task"].items()
     ]
     tasks.append(["**all**", percent(result), interval(result), result["n"], result["mean_steps"]])
-    text = f"{table(heads, [*rows, ours])}\n\nThe rows above ours are quoted from the paper."
-    if timing:
-        chunk, first = timing["chunk_ms"], timing["first_action_ms"]
-        text += (
-            f" A chunk takes t = {chunk['median']} ms (99th percentile {chunk['p99']}, n = {chunk['n']}), an "
-            f"episode's first action with finding the objects in the images {first['median']} ms "
-            f"({first['p99']}, n = {first['n']}), on one thread."
-        )
-    else:
-        text += " A chunk's time: not measured; run `python -m benchmarks.libero.latency`."
+    ours = [
+        f"**OpenSPM, {result['demonstrations']} demonstrations a task**",
+        None,
+        None,
+        f"**{percent(result)}**",
+    ]
+    rows = [[name, size, length, f"{rate} %"] for name, size, length, rate, _ in PUBLISHED]
+    compared = table(["", "Parameters", "Chunk", "Success"], [*rows, ours])
     seconds = result["mine_and_train_s"]
-    taken = "was interrupted" if seconds is None else f"took {seconds} s"
-    told = f"Mining and training {taken}. {result['note']}"
+    taken = "was interrupted" if seconds is None else f"took {seconds:.0f} s"
     per_task = table(["Task", "Success", "95 % interval", "Episodes", "Mean steps of successes"], tasks)
-    return f"{text}\n\n{per_task}\n\n{told}"
+    return (
+        f"{compared}\n\nThe rows above ours are quoted from the paper.\n\n{per_task}\n\n"
+        f"Mining and training {taken}."
+    )
 
 
-def _failures(result: dict[str, Any]) -> str:
+def _latency(result: Quoted) -> str:
+    rows = [[name, size, length, None, hz] for name, size, length, _, hz in PUBLISHED]
+    chunk, first = result["chunk_ms"], result["first_action_ms"]
+    ours = [
+        "**OpenSPM**", f"{result['parameters'] / 1e6:.2f} M", result["chunk_size"], chunk["median"],
+        result["equivalent_hz"],
+    ]  # fmt: skip
+    heads = ["", "Parameters", "Chunk H", "Chunk t, ms", "Actions per second, 1000 H / t"]
+    note = (
+        f"The rows above ours are quoted from the paper. A chunk's 99th percentile is {chunk['p99']} ms (n = "
+        f"{chunk['n']}). An episode's first action, for which the objects are found in the images, takes "
+        f"{first['median']} ms ({first['p99']}, n = {first['n']}). One thread."
+    )
+    return f"{table(heads, [*rows, ours])}\n\n{note}"
+
+
+def _failures(result: Quoted) -> str:
     """The paper's three categories, told apart by rule."""
     counts = {"perception": 0, "small tolerances": 0, "geometric constraints": 0}
     physical = 0
@@ -129,7 +120,7 @@ def _failures(result: dict[str, Any]) -> str:
     return f"{table(['Category', 'Episodes'], rows)}\n\n{rule} {share}" + (f"\n\n{listed}." if n else "")
 
 
-def _execution(result: dict[str, Any]) -> str:
+def _execution(result: Quoted) -> str:
     runs = result["runs"]
     rows = [
         [
@@ -141,7 +132,7 @@ def _execution(result: dict[str, Any]) -> str:
     return table(["", "Success", "95 % interval", "Episodes", "Mean steps of successes", "Paper"], rows)
 
 
-def _memory(result: dict[str, Any]) -> str:
+def _memory(result: Quoted) -> str:
     runs = result["runs"]
     sources = {
         "memory, poses from pixels": ("closed_loop_trc", "85.6 %"),
@@ -154,59 +145,37 @@ def _memory(result: dict[str, Any]) -> str:
     ]
     note = (
         "The guess, which knows no demonstration: grasp the centroid from above, release above the landmark. "
-        "It gets the simulator's poses and sizes of the objects. The paper asks a multimodal model instead; "
-        "that is not built yet."
+        "It gets the simulator's poses and sizes of the objects. The paper asks a multimodal model instead: "
+        "see [judgement.md](judgement.md)."
     )
     return f"{table(['Key poses from', 'Success', '95 % interval', 'Episodes', 'Paper'], rows)}\n\n{note}"
 
 
-def _oracle(result: dict[str, Any]) -> str:
-    runs = result["runs"]
-    return rates({"from pixels": runs["closed_loop_trc"], "oracle": runs["oracle"]})
-
-
-def _accuracy(result: dict[str, Any]) -> str:
+def _accuracy(result: Quoted) -> str:
     objects = [
         [name, row["n"], row["position_mm_mean"], row["position_mm_p95"], row["yaw_deg_mean"]]
         for name, row in result["objects"].items()
     ]
     tasks = [
-        [
-            task.replace("_", " "),
-            row["n"],
-            row["position_mm_mean"],
-            row["position_mm_p95"],
-            row["yaw_deg_mean"],
-            *paper,
-        ]
-        for (task, row), paper in zip(result["tasks"].items(), PAPER_POSES, strict=True)
+        [task.replace("_", " "), row["n"], row["position_mm_mean"], row["position_mm_p95"], paper]
+        for (task, row), paper in zip(result["tasks"].items(), PAPER_MM, strict=True)
     ]
-    heads = ["n", "Mean, mm", "95th percentile, mm", "Yaw, degrees"]
+    heads = ["n", "Mean, mm", "95th percentile, mm"]
     note = (
         "Against the simulator, at the start of evaluated episodes, of the objects that a task touches. A "
         "learned object's frame stands anywhere on it: one rigid offset per object was fitted on the "
-        "demonstrations. Objects known by patches are taken to stand as demonstrated: their yaw is not "
-        "measured, and the error in it is how far they turned. The paper's columns compare its filter with "
-        "another estimator, not with the truth."
+        "demonstrations. A dash: the yaw is not measured; the object is round, or known by patches and taken "
+        "to stand as demonstrated. The paper's column compares its filter with another estimator, not with "
+        "the truth."
     )
-    per_task = table(["Task", *heads, "Paper, mm", "Paper, degrees"], tasks)
-    return f"{table(['Object', *heads], objects)}\n\n{per_task}\n\n{note}"
+    per_object = table(["Object", *heads, "Yaw, degrees"], objects)
+    return f"{per_object}\n\n{table(['Task', *heads, 'Paper, mm'], tasks)}\n\n{note}"
 
 
-def _few_shot(results: list[dict[str, Any]]) -> str:
-    full = RESULTS / "libero_goal.json"
-    found = [*results, json.loads(full.read_text())] if full.exists() else results
+def _few_shot(results: list[Quoted]) -> str:
     rows = [
-        [
-            r["demonstrations"],
-            percent(r),
-            interval(r),
-            r["n"],
-            r["mean_steps"],
-            r["mine_and_train_s"],
-            r["commit"],
-        ]
-        for r in sorted(found, key=lambda r: r["demonstrations"])
+        [r["demonstrations"], percent(r), interval(r), r["n"], r["mean_steps"], r["mine_and_train_s"]]
+        for r in results
     ]
     heads = [
         "Demonstrations a task",
@@ -215,22 +184,13 @@ def _few_shot(results: list[dict[str, Any]]) -> str:
         "Episodes",
         "Mean steps",
         "Mining and training, s",
-        "Commit",
     ]
     return table(heads, rows)
 
 
-def _new_tasks(results: list[dict[str, Any]]) -> str:
+def _new_tasks(results: list[Quoted]) -> str:
     rows = [
-        [
-            r["task"].replace("_", " "),
-            r["demonstrations"],
-            percent(r),
-            interval(r),
-            r["n"],
-            r["teach_s"],
-            r["commit"],
-        ]
+        [r["task"].replace("_", " "), r["demonstrations"], percent(r), interval(r), r["n"], r["teach_s"]]
         for r in results
     ]
     mean = sum(r["success"] for r in results) / len(results)
@@ -241,13 +201,12 @@ def _new_tasks(results: list[dict[str, Any]]) -> str:
         "95 % interval",
         "Episodes",
         "Teaching, s",
-        "Commit",
     ]
     note = f"Mean over these {len(results)} tasks: {100 * mean:.1f} %. No gradient step after teaching."
     return f"{table(heads, rows)}\n\n{note}"
 
 
-def _losses(result: dict[str, Any]) -> str:
+def _losses(result: Quoted) -> str:
     last = (
         f"At the end: training {result['training'][-1]}, validation {result['validation'][-1]}. Both over "
         "all frames as they were recorded, with the same noise for every checkpoint; training itself also "
@@ -256,9 +215,9 @@ def _losses(result: dict[str, Any]) -> str:
     return f"![Training and validation loss](images/{result['plot']})\n\n{last}"
 
 
-def _equality(result: dict[str, Any]) -> str:
+def _equality(result: Quoted) -> str:
     return (
-        f"{result['equal']} of {result['episodes']} episodes by LeRobot's own rollout and by the harness, "
+        f"{result['equal']} of {result['n']} episodes by LeRobot's own rollout and by the harness, "
         "which renders only when the policy looks, took the same actions bit by bit "
         f"({result['actions']} actions; largest difference {result['largest_difference']})."
     )

@@ -1,55 +1,94 @@
-"""The page of results says what the committed JSON files say, and what has not been measured."""
+"""The pages say what the committed JSON files say, mark that, and leave out what is not measured."""
 
 import json
+import re
 from pathlib import Path
+from typing import Any
 
 import pytest
-from benchmarks.libero import tables as libero_tables
+from benchmarks.figures import FIGURES
+from benchmarks.staleness import MARK, read_result
 
-from benchmarks import markdown, memory_tables, perception_tables, tables
+from benchmarks import markdown, tables
 
-MACHINE = {"commit": "0123456789ab", "machine": {"cores": 2, "processor": "x86_64"}}
+ORIGIN = {
+    "commit": "0123456789ab", "dirty": False, "command": "python -m benchmarks.x",
+    "date": "2026-11-22T10:00:00",
+    "machine": {"cpu": "Some CPU", "cores": 2, "threads": 1, "python": "3.12.1"},
+    "seed": 0,
+}  # fmt: skip
 RATE = {"success": 0.5, "n": 4, "interval": [0.15, 0.85], "mean_steps": 100.0}
+A_NUMBER = re.compile(r"\d[\d.,]* ?(%|ms\b|s\b|min\b|mm\b|minutes?\b|hours?\b|seconds?\b)")
 
 
 @pytest.fixture
-def results(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """An empty folder of results."""
-    for module in (markdown, libero_tables):
-        monkeypatch.setattr(module, "RESULTS", tmp_path)
-    return tmp_path
+def results(monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
+    """Results by name, instead of those in the folder."""
+    found: dict[str, Any] = {}
+    for module in (markdown, tables):
+        monkeypatch.setattr(module, "read_result", found.get)
+    return found
 
 
-def put(folder: Path, name: str, **content) -> None:
-    (folder / f"{name}.json").write_text(json.dumps({**MACHINE, **content}))
+def put(results: dict[str, Any], name: str, **content: Any) -> None:
+    results[name] = json.loads(json.dumps({**ORIGIN, **content}))
 
 
-def put_main_result(folder: Path, **content) -> None:
-    put(folder, "libero_goal", **RATE, demonstrations=10, mine_and_train_s=200, note="", **content)
+def put_main_result(results: dict[str, Any], **content: Any) -> None:
+    put(results, "libero_goal", **RATE, demonstrations=10, mine_and_train_s=200, **content)
 
 
-def page(monkeypatch: pytest.MonkeyPatch, folder: Path) -> str:
-    monkeypatch.setattr(tables, "PAGE", folder / "page.md")
-    tables.write_page()
-    return (folder / "page.md").read_text()
+def test_the_committed_pages_are_made_of_the_committed_results():
+    assert tables.PAGE.read_text() == tables.results_page(), "run: python -m benchmarks.tables"
+    readme = tables.README.read_text()
+    assert readme == tables.with_headlines(readme), "run: python -m benchmarks.tables"
 
 
-def test_the_committed_page_is_made_of_the_committed_results(tmp_path, monkeypatch):
-    committed = tables.PAGE.read_text()
-    assert page(monkeypatch, tmp_path) == committed, "run: python -m benchmarks.tables"
+def test_readme_quotes_no_figure_outside_its_table():
+    before, _, rest = tables.README.read_text().partition(tables.BEGIN)
+    after = rest.partition(tables.END)[2]
+    found = [line for line in (before + after).splitlines() if A_NUMBER.search(line)]
+    assert found == []
 
 
-def test_what_is_not_measured_says_so_and_how_to_measure_it(results, monkeypatch):
-    text = page(monkeypatch, results)
-    parts = [
-        *libero_tables.libero_parts(), *perception_tables.perception_parts(), *memory_tables.memory_parts()
-    ]  # fmt: skip
-    assert text.count("Not measured") == 6 + len(parts) - 3  # but for the introductions
-    assert "`execution.json` is missing; run `python -m benchmarks.figures`" in text
-    assert "`libero_goal.json` is missing; run `python -m benchmarks.libero.run`" in text
+def test_without_results_there_is_nothing_but_how_to_measure(results):
+    text = tables.results_page()
+    assert text.count("\n# ") == 1
+    assert all(f"- {name}: `{figure.command}`" in text for name, figure in FIGURES.items())
+    assert MARK.findall(text) == []
+    page = tables.with_headlines(f"a\n{tables.BEGIN}\nold\n{tables.END}\nz\n")
+    assert page.startswith("a\n")
+    assert page.endswith("\nz\n")
+    assert "Nothing is measured" in page
 
 
-def test_failures_are_told_apart_by_rule(results, monkeypatch):
+def test_readme_without_a_place_for_figures_is_refused():
+    with pytest.raises(ValueError, match="no place for its figures"):
+        tables.with_headlines("words")
+
+
+def test_a_section_is_marked_with_what_it_quotes_and_where_that_comes_from(results):
+    put(results, "tracking", n=4, conditions={"displaced": RATE})
+    text = tables.results_page()
+    assert "| displaced | 50.0 % | 15.0 to 85.0 % | 4 |" in text
+    assert MARK.findall(text) == [("tracking", "conditions")]
+    assert "`python -m benchmarks.x` on 2026-11-22, commit `0123456789ab`; 2 cores of Some CPU." in text
+    assert "- tracking:" not in text
+
+
+def test_readme_has_a_row_for_what_was_measured_alone(results):
+    put(results, "tabletop", **RATE, demonstrations=7, train_s=30.4)
+    put(results, "libero_few_shot_3", **RATE, demonstrations=3, mine_and_train_s=None)
+    page = tables.with_headlines(f"{tables.BEGIN}\n{tables.END}")
+    rows = [line for line in page.splitlines() if "50.0 %" in line]
+    assert [row.split(" <!--")[0] for row in rows] == [
+        "| Tabletop | 7 | 50.0 % | 15.0 to 85.0 % | 4 | 30",
+        "| LIBERO-GOAL | 3 | 50.0 % | 15.0 to 85.0 % | 4 | -",
+    ]
+    assert ("tabletop", "success") in MARK.findall(rows[0])
+
+
+def test_failures_are_told_apart_by_rule(results):
     failed = [
         {"task": task, "state": state, "reason": "gave up at lift", "attempts": 2, "off_mm": off}
         for task, state, off in (
@@ -60,16 +99,34 @@ def test_failures_are_told_apart_by_rule(results, monkeypatch):
         )
     ]
     put_main_result(results, per_task={"put_the_bowl": RATE}, failed=failed)
-    text = page(monkeypatch, results)
+    text = tables.results_page()
     for category, n in (("perception", 2), ("small tolerances", 1), ("geometric constraints", 1)):
         assert f"| {category} | {n} |" in text
     assert "2 of 4 failed episodes failed in acting" in text
     assert "put the bowl, state 3: gave up at lift" in text
 
 
-def test_the_curve_of_few_demonstrations_ends_with_the_main_result(results, monkeypatch):
+def test_the_curve_of_few_demonstrations_ends_with_the_main_result(results):
     for n in (3, 1):
         put(results, f"libero_few_shot_{n}", **RATE, demonstrations=n, mine_and_train_s=9)
     put_main_result(results, per_task={}, failed=[])
-    rows = [line for line in page(monkeypatch, results).splitlines() if "| 9 |" in line or "| 200 |" in line]
+    rows = [line for line in tables.results_page().splitlines() if line.endswith(("| 9 |", "| 200 |"))]
     assert [row.split("|")[1].strip() for row in rows] == ["1", "3", "10"]
+
+
+def test_results_that_are_not_current_can_be_dropped(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    folder = tmp_path / "benchmarks/results"
+    folder.mkdir(parents=True)
+    for name in ("tracking", "nobody_knows"):
+        (folder / f"{name}.json").write_text(json.dumps(ORIGIN))
+    monkeypatch.setattr(tables, "ROOT", tmp_path)
+    current = {"tracking": None, "nobody_knows": "names no command"}
+    monkeypatch.setattr(
+        tables, "origin", lambda name, paths: type("Origin", (), {"problem": current[name]})
+    )  # fmt: skip
+    assert [path.stem for path in tables.drop_what_is_not_current()] == ["nobody_knows"]
+    assert [path.stem for path in folder.iterdir()] == ["tracking"]
+
+
+def test_a_result_that_is_there_is_read():
+    assert read_result("no_such_figure") is None

@@ -20,6 +20,7 @@ from scipy.optimize import linear_sum_assignment
 
 from lerobot_openspm.bench.contact_events import PHASES, contact_events
 from lerobot_openspm.bench.recording import OPERATORS, Job, Recording, record
+from lerobot_openspm.bench.results import ResultOption
 from lerobot_openspm.envs.recording import Names, source
 from lerobot_openspm.geometry.layout import RotationKind, parse_layout
 from lerobot_openspm.mining.key_poses import find_key_poses
@@ -52,7 +53,7 @@ class SimulatorOption:
 
 
 @dataclass
-class Options:
+class Options(ResultOption):
     """Compare mined key poses with the simulators' contacts."""
 
     env: SimulatorOption = field(default_factory=SimulatorOption)

@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from lerobot_openspm.bench.results import ResultOption
 from lerobot_openspm.bench.taught_words import acted_entries, teach_each
 from lerobot_openspm.errors import InstructionError, OpenSPMError
 from lerobot_openspm.memory.compound import plan_parts
@@ -32,7 +33,7 @@ SUITES = ("libero_spatial", "libero_object", "libero_goal", "libero_10", "tablet
 
 
 @dataclass
-class Options:
+class Options(ResultOption):
     """Measure how instructions are read. Needs no checkpoint and no simulator."""
 
     folder: str | None = (

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from lerobot_openspm.bench.results import ResultOption
 from lerobot_openspm.bench.synthetic_bank import synthetic_experience
 from lerobot_openspm.bench.synthetic_keys import Key, distinct_keys, said_otherwise
 from lerobot_openspm.experience import load_experience, save_experience
@@ -29,7 +30,7 @@ SEMANTIC_ENTRIES, SEMANTIC_QUERIES = 20_000, 200
 
 
 @dataclass
-class Options:
+class Options(ResultOption):
     """Measure the index, and the loading of a large memory."""
 
     entries: int = 1_000_000  # different keys in the index
@@ -58,14 +59,15 @@ def measure(options: Options) -> dict[str, Any]:
     load_s, near_ms = _load(options.loaded, options.queries, rng)
     return {
         "entries": options.entries,
+        "n": options.queries,
         "query_ms_p50": tasks["query_ms_p50"],
         "query_ms_p99": tasks["query_ms_p99"],
         "recall": tasks["recall"],
-        "load_s_100k": round(load_s, 3),
-        "exact_10k_ms_p50": _percentile(exact_ms, 50),
-        "queries": options.queries,
+        "loaded_entries": options.loaded,
+        "load_s": round(load_s, 3),
+        "exact_entries": len(few),
+        "exact_ms_p50": _percentile(exact_ms, 50),
         "threads": options.threads,
-        "loaded": options.loaded,
         "tasks": tasks | _semantic_recall(keys[:SEMANTIC_ENTRIES], INDICES[tasks["index"]], rng),
         "uniform": _search(*_uniform(options.entries, options.queries, rng)),
         "near_ms_p50": _percentile(near_ms, 50),

@@ -20,6 +20,7 @@ from typing import Any
 
 import numpy as np
 
+from lerobot_openspm.bench.results import ResultOption
 from lerobot_openspm.bench.workers import each
 from lerobot_openspm.cli.bench import DEFAULTS, DatasetOption, EnvironmentOption
 from lerobot_openspm.envs.tasks import TASKS, select_tasks
@@ -37,7 +38,7 @@ NOT_TAUGHT = "not_taught"
 
 
 @dataclass
-class Options:
+class Options(ResultOption):
     """Measure teaching on the tabletop."""
 
     env: EnvironmentOption = field(default_factory=EnvironmentOption)

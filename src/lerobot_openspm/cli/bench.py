@@ -11,6 +11,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from lerobot_openspm.bench.results import ResultOption, write_result
 from lerobot_openspm.bench.workers import each
 from lerobot_openspm.envs.gl_backend import set_default_gl_backend
 from lerobot_openspm.envs.tasks import select_tasks
@@ -52,7 +53,7 @@ class DatasetOption:
 
 
 @dataclass
-class BenchConfig:
+class BenchConfig(ResultOption):
     """Measure a checkpoint in a simulator."""
 
     env: EnvironmentOption = field(default_factory=EnvironmentOption)
@@ -166,8 +167,8 @@ MEASURES: dict[str, Callable[[BenchConfig], dict[str, Any]]] = {
     "tracking": tracking,
     "cameras": cameras,
 }
-# Measures with options of their own: a module with a dataclass `Options` and `measure(options)`, which
-# returns what is printed. Imported when it is asked for.
+# Measures with options of their own: a module with a dataclass `Options`, a `ResultOption`, and
+# `measure(options)`, which returns what is printed. Imported when it is asked for.
 ON_THEIR_OWN: dict[str, str] = {
     "keyposes": "lerobot_openspm.bench.key_poses",
     "language": "lerobot_openspm.bench.language",
@@ -192,4 +193,8 @@ def main(args: Sequence[str] | None = None) -> None:
     else:
         module = importlib.import_module(ON_THEIR_OWN[what])
         options_class, measure = module.Options, module.measure
-    print(json.dumps(measure(draccus.parse(config_class=options_class, args=options))))
+    config = draccus.parse(config_class=options_class, args=options)
+    measured = measure(config)
+    if config.result:
+        write_result(Path(config.result), {"seed": getattr(config, "seed", None), **measured})
+    print(json.dumps(measured))

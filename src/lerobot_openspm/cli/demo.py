@@ -15,7 +15,8 @@ from typing import Any
 import draccus
 import numpy as np
 
-from lerobot_openspm.cli.pipeline import collect_dataset, evaluate, mean_steps, rate, train
+from lerobot_openspm.bench.results import ResultOption, write_result
+from lerobot_openspm.cli.pipeline import collect_dataset, evaluate, mean_steps, rate, success, train
 from lerobot_openspm.cli.report import write_report
 
 # lerobot-eval's own default; demonstrations are recorded from seeds far away from it.
@@ -25,7 +26,7 @@ logger = logging.getLogger(__name__)
 
 
 @dataclass
-class DemoConfig:
+class DemoConfig(ResultOption):
     """Collect, train, evaluate, and write one page about it. Finished steps are kept and not done again.
 
     Args:
@@ -33,6 +34,7 @@ class DemoConfig:
         episodes: Evaluation episodes a task.
         output: Folder for everything.
         started_at: When the set-up began, in seconds since the epoch; counts towards ``total_s``.
+        result: JSON file for what is printed, with commit, command and machine.
     """
 
     demos: int = 10
@@ -52,7 +54,7 @@ def main(args: list[str]) -> None:
     output = Path(config.output)
     # What is kept from an earlier run is kept by what it was made of.
     run = output / f"demos_{config.demos}"
-    dataset = run / "dataset"
+    dataset, is_new = run / "dataset", not run.exists()
     collected = collect_dataset(dataset, config.demos)
     checkpoint, train_s = train(dataset, run / "train")
     evaluation = run / f"eval_{config.episodes}"
@@ -78,4 +80,10 @@ def main(args: list[str]) -> None:
         "checkpoint": str(checkpoint),
         "report": str(report),
     }
-    print(json.dumps({k: None if isinstance(v, float) and np.isnan(v) else v for k, v in summary.items()}))
+    summary = {k: None if isinstance(v, float) and np.isnan(v) else v for k, v in summary.items()}
+    if config.result:
+        # A total is only told where nothing was kept from before.
+        timing = {"train_s": summary["train_s"], "total_s": summary["total_s"] if is_new else None}
+        figure = {"seed": EVALUATION_SEED, **success(episodes), **timing, "demonstrations": config.demos}
+        write_result(Path(config.result), figure)
+    print(json.dumps(summary))

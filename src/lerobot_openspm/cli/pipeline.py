@@ -205,6 +205,17 @@ def rate(successes: int, n: int) -> dict[str, Any]:
     }
 
 
+def success(episodes: Sequence[Episode]) -> dict[str, Any]:
+    """Rate, interval, mean steps of the successes (None without one), rate of each task, what failed."""
+    own = {task: [e for e in episodes if e.task == task] for task in dict.fromkeys(e.task for e in episodes)}
+    return {
+        **rate(sum(e.success for e in episodes), len(episodes)),
+        "mean_steps": round(mean_steps(episodes), 1) if any(e.success for e in episodes) else None,
+        "per_task": {task: sum(e.success for e in es) / len(es) for task, es in own.items()},
+        "failed": [[e.task, e.seed, e.status] for e in episodes if not e.success],
+    }
+
+
 def mean_steps(episodes: Sequence[Episode]) -> float:
     """Mean steps of the successful episodes; NaN if there is none."""
     return (

@@ -1,0 +1,151 @@
+"""Whether a result is still what the code does: what it was measured on, and what has changed since."""
+
+from __future__ import annotations
+
+import ast
+import functools
+import importlib.util
+import json
+import re
+import shlex
+import subprocess
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+ROOT = Path(__file__).parents[1]
+# A quoted figure is marked where it stands: the result's name and the key in it.
+MARK = re.compile(r"<!-- figure: (\w+)\.(\w+) -->")
+
+
+@dataclass(frozen=True)
+class Quote:
+    """A figure that a page quotes: where it stands, the result's name, the key in it."""
+
+    page: str
+    line: int
+    name: str
+    key: str
+
+
+@dataclass(frozen=True)
+class Origin:
+    """What is known of where a result comes from.
+
+    Attributes:
+        commit: What it was measured on, if known.
+        missing: Why it cannot be taken again as it is, or None.
+        changes: The commits since that touch what it measures.
+    """
+
+    commit: str | None
+    missing: str | None
+    changes: tuple[str, ...] = ()
+
+    @property
+    def problem(self) -> str | None:
+        """Why it is not current, or None."""
+        return self.missing or (f"stale by {len(self.changes)} commits" if self.changes else None)
+
+
+def quotes(root: Path = ROOT) -> list[Quote]:
+    """Every figure that README and the docs quote."""
+    pages = [path for path in (root / "README.md", *sorted((root / "docs").glob("*.md"))) if path.is_file()]
+    return [
+        Quote(str(page.relative_to(root)), number, *found.groups())
+        for page in pages
+        for number, line in enumerate(page.read_text().splitlines(), 1)
+        for found in MARK.finditer(line)
+    ]
+
+
+def read_result(name: str, root: Path = ROOT) -> dict[str, Any] | None:
+    """A result file's content; None if there is none."""
+    path = root / "benchmarks/results" / f"{name}.json"
+    return json.loads(path.read_text()) if path.is_file() else None
+
+
+def origin(name: str, paths: Sequence[str] | None, root: Path = ROOT) -> Origin:
+    """Where a result comes from, and whether what it measures has changed.
+
+    Args:
+        name: The result's name.
+        paths: Git's names (pathspecs) of the code that it measures; None if nobody knows how to take it.
+        root: The checkout.
+    """
+    result = read_result(name, root)
+    if result is None:
+        return Origin(None, "no result file")
+    commit, command = result.get("commit"), result.get("command")
+    if paths is None:
+        return Origin(commit, "benchmarks/figures.py names no command that takes it")
+    if not command or not _is_there(command, root):
+        return Origin(commit, f"its command is gone: {command}")
+    if not commit or not _git(root, "merge-base", commit, "HEAD").startswith(commit):
+        return Origin(commit, f"its commit {commit} is not in this history")
+    if result.get("dirty") is not False:
+        return Origin(commit, "measured with changes that were not committed")
+    return Origin(commit, None, tuple(changes(commit, paths, root)))
+
+
+def _is_there(command: str, root: Path) -> bool:
+    """Whether the script, module or subcommand of a command line still exists."""
+    match shlex.split(command):
+        case ["python", "-m", module, *_]:
+            return (root / f"{module.replace('.', '/')}.py").is_file()
+        case ["openspm", "bench", what, *_]:
+            from lerobot_openspm.cli.bench import MEASURES, ON_THEIR_OWN
+
+            return what in MEASURES or (
+                what in ON_THEIR_OWN and importlib.util.find_spec(ON_THEIR_OWN[what]) is not None
+            )
+        case ["openspm", what, *_]:
+            from lerobot_openspm.cli.main import COMMANDS
+
+            return what in COMMANDS
+        case _:
+            return False
+
+
+def changes(commit: str, paths: Sequence[str], root: Path = ROOT) -> Iterator[str]:
+    """Commits since that touch files whose code is another now; comments and docstrings are no code."""
+    head = _git(root, "rev-parse", "HEAD").strip()
+    names = _git(root, "diff", "--name-only", "--no-renames", commit, head, "--", *paths).splitlines()
+    changed = [name for name in names if _code(root, commit, name) != _code(root, head, name)]
+    if changed:
+        yield from _git(root, "log", "--format=%h %s", f"{commit}..{head}", "--", *changed).splitlines()
+
+
+@functools.cache
+def _code(root: Path, commit: str, name: str) -> str:
+    """What a file does at a commit, without what only people read; empty if it is not there."""
+    text = _git(root, "show", f"{commit}:{name}")
+    match Path(name).suffix:
+        case ".py":
+            return _without_docstrings(text)
+        case ".yaml" | ".yml":
+            return repr(yaml.safe_load(text))
+        case ".md":
+            return ""
+        case _:
+            return text
+
+
+def _without_docstrings(text: str) -> str:
+    tree = ast.parse(text)
+    for node in ast.walk(tree):
+        if (
+            isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef)
+            and ast.get_docstring(node, clean=False) is not None
+        ):
+            node.body = node.body[1:]
+    return ast.dump(tree)
+
+
+def _git(root: Path, *arguments: str) -> str:
+    """What git prints; empty where it fails."""
+    done = subprocess.run(["git", *arguments], cwd=root, capture_output=True, text=True, check=False)
+    return done.stdout if done.returncode == 0 else ""

@@ -1,0 +1,119 @@
+"""Writes a measured result beside what it was measured on: the one way into ``benchmarks/results``."""
+
+from __future__ import annotations
+
+import datetime
+import os
+import platform
+import shlex
+import subprocess
+import sys
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import lerobot_openspm
+from lerobot_openspm.errors import OpenSPMError
+from lerobot_openspm.files import write_json
+
+# What a result file tells of its own origin. `seed` and `n` come from whoever measured; the seed is None
+# where nothing is drawn.
+PROVENANCE = ("commit", "dirty", "command", "date", "machine", "seed", "n")
+# What can change a figure while it is not committed. Results are left out: they are written in turn.
+MEASURED_CODE = ("src", "configs", "benchmarks", ":(exclude)benchmarks/results")
+
+
+@dataclass
+class ResultOption:
+    """Where to keep what is measured."""
+
+    result: str | None = None  # JSON file for what is printed, with commit, command and machine
+
+
+def write_result(path: Path, measured: Mapping[str, Any]) -> dict[str, Any]:
+    """Write a result with its provenance, and return both.
+
+    Args:
+        path: The JSON file; it is replaced as a whole.
+        measured: The figures, with ``seed`` (None where nothing is drawn) and ``n``, over how many they were
+            taken.
+
+    Raises:
+        OpenSPMError: ``seed`` or ``n`` is missing, or a figure has the name of a piece of provenance.
+    """
+    missing = [name for name in ("seed", "n") if name not in measured]
+    taken = sorted({"commit", "dirty", "command", "date", "machine"} & set(measured))
+    if missing or taken:
+        raise OpenSPMError(
+            f"cannot write {path}: a result needs seed and n, missing {missing}; its provenance is "
+            f"added here, already given {taken}"
+        )
+    commit, dirty = code_version()
+    content = {
+        "commit": commit,
+        "dirty": dirty,
+        "command": command_line(sys.orig_argv, sys.argv),
+        "date": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
+        "machine": machine(),
+        "seed": measured["seed"],
+        "n": measured["n"],
+        **measured,
+    }
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_json(path, content)
+    return content
+
+
+def code_version() -> tuple[str | None, bool | None]:
+    """Commit of the checkout that this code is run from, and whether it was changed; None without one."""
+    here = Path(lerobot_openspm.__file__).parent
+    if not _git(here, "ls-files", "__init__.py"):
+        # An installed package may lie within somebody else's repository.
+        return None, None
+    root = Path(_git(here, "rev-parse", "--show-toplevel"))
+    return _git(root, "rev-parse", "--short=12", "HEAD"), bool(
+        _git(root, "status", "--porcelain", "--", *MEASURED_CODE)
+    )
+
+
+def command_line(started: Sequence[str], arguments: Sequence[str]) -> str:
+    """The command as it was typed, without where its program lies.
+
+    Args:
+        started: ``sys.orig_argv``.
+        arguments: ``sys.argv``, whose first is the program.
+    """
+    if "-m" in started[: len(started) - len(arguments) + 1]:
+        words = ["python", *started[started.index("-m") :]]
+    else:
+        words = [Path(arguments[0]).name, *arguments[1:]]
+    return shlex.join(words)
+
+
+def machine() -> dict[str, Any]:
+    """What times depend on; ``threads`` is how many this process computes with."""
+    torch = sys.modules.get("torch")
+    threads = torch.get_num_threads() if torch else int(os.environ.get("OMP_NUM_THREADS") or 0) or None
+    return {
+        "cpu": _cpu_model(),
+        "cores": os.cpu_count(),
+        "threads": threads or os.cpu_count(),
+        "python": platform.python_version(),
+    }
+
+
+def _cpu_model() -> str:
+    """The processor's name; Linux tells it in /proc alone, the architecture is what is left elsewhere."""
+    info = Path("/proc/cpuinfo")
+    lines = info.read_text().splitlines() if info.is_file() else []
+    names = [line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")]
+    return names[0] if names else platform.processor() or platform.machine()
+
+
+def _git(folder: Path, *arguments: str) -> str:
+    try:
+        done = subprocess.run(["git", *arguments], cwd=folder, capture_output=True, text=True, check=False)
+    except FileNotFoundError:
+        return ""
+    return done.stdout.strip() if done.returncode == 0 else ""

@@ -1,0 +1,166 @@
+"""Quoted figures are found, and what has changed since they were measured."""
+
+import json
+import re
+import subprocess
+from pathlib import Path
+
+import pytest
+from benchmarks.figures import FIGURES
+from benchmarks.staleness import ROOT, origin, quotes, read_result
+
+from lerobot_openspm.bench.results import PROVENANCE
+
+CODE = '"""Moves."""\n\n\ndef speed():\n    """How fast."""\n    return 1  # m/s\n'
+
+
+class Checkout:
+    """A repository with one measured result."""
+
+    def __init__(self, root: Path) -> None:
+        self.root = root
+        self.git("init", "-q")
+        self.commit("src/move.py", CODE)
+        self.measure()
+
+    def git(self, *arguments: str) -> str:
+        identity = ("-c", "user.name=t", "-c", "user.email=t@example.org")
+        done = subprocess.run(
+            ["git", *identity, *arguments], cwd=self.root, capture_output=True, text=True, check=True
+        )
+        return done.stdout.strip()
+
+    def commit(self, name: str, text: str) -> None:
+        path = self.root / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(text)
+        self.git("add", ".")
+        self.git("commit", "-qm", f"Change {name}")
+
+    def measure(self, **changed: object) -> None:
+        told = {
+            "commit": self.git("rev-parse", "--short=12", "HEAD"),
+            "dirty": False,
+            "command": "python -m src.move",
+            "success": 0.5,
+        }
+        self.commit("benchmarks/results/speed.json", json.dumps(told | changed))
+
+    def origin(self):
+        return origin("speed", ["src", "configs"], self.root)
+
+
+@pytest.fixture
+def checkout(tmp_path: Path) -> Checkout:
+    return Checkout(tmp_path)
+
+
+def test_a_result_is_current_until_what_it_measures_changes(checkout: Checkout):
+    assert checkout.origin().problem is None
+    checkout.commit("docs/page.md", "words")
+    assert checkout.origin().problem is None
+    checkout.commit("src/move.py", CODE.replace("return 1", "return 2"))
+    (change,) = checkout.origin().changes
+    assert change.endswith("Change src/move.py")
+    assert checkout.origin().problem == "stale by 1 commits"
+
+
+@pytest.mark.parametrize(
+    ("name", "text"),
+    [
+        ("src/move.py", CODE.replace("How fast", "How quickly").replace("  # m/s", "  # metres per second")),
+        ("src/README.md", "words"),
+    ],
+)
+def test_words_make_nothing_stale(checkout: Checkout, name: str, text: str):
+    checkout.commit(name, text)
+    assert checkout.origin().problem is None
+
+
+def test_a_change_that_was_taken_back_makes_nothing_stale(checkout: Checkout):
+    checkout.commit("src/move.py", CODE.replace("return 1", "return 2"))
+    checkout.commit("src/move.py", CODE)
+    assert checkout.origin().problem is None
+
+
+def test_comments_of_a_configuration_are_words_and_its_values_are_not(checkout: Checkout):
+    checkout.commit("configs/train.yaml", "steps: 3\n")
+    checkout.measure()
+    checkout.commit("configs/train.yaml", "# few\nsteps: 3\n")
+    assert checkout.origin().problem is None
+    checkout.commit("configs/train.yaml", "steps: 4\n")
+    # Both commits touch what has changed.
+    assert checkout.origin().problem == "stale by 2 commits"
+
+
+@pytest.mark.parametrize(
+    ("changed", "reason"),
+    [
+        ({"dirty": True}, "changes that were not committed"),
+        ({"command": None}, "its command is gone"),
+        ({"command": "python -m src.gone"}, "its command is gone: python -m src.gone"),
+        ({"command": "openspm bench juggling"}, "its command is gone"),
+        ({"commit": "0123456789ab"}, "0123456789ab is not in this history"),
+    ],
+)
+def test_what_cannot_be_taken_again_says_why(checkout: Checkout, changed: dict[str, object], reason: str):
+    checkout.measure(**changed)
+    assert reason in str(checkout.origin().missing)
+
+
+def test_a_missing_result_and_one_that_nobody_can_take(checkout: Checkout):
+    assert origin("other", ["src"], checkout.root).missing == "no result file"
+    assert "names no command" in str(origin("speed", None, checkout.root).missing)
+
+
+def test_quotes_are_found_where_they_stand(tmp_path: Path):
+    (tmp_path / "docs").mkdir()
+    (tmp_path / "README.md").write_text("fast:\n1 m/s <!-- figure: speed.mean --> <!-- figure: speed.n -->\n")
+    (tmp_path / "docs/a.md").write_text("<!-- figure: reach.max -->")
+    found = [(quote.page, quote.line, quote.name, quote.key) for quote in quotes(tmp_path)]
+    assert found == [
+        ("README.md", 2, "speed", "mean"), ("README.md", 2, "speed", "n"), ("docs/a.md", 1, "reach", "max")
+    ]  # fmt: skip
+
+
+def report(*options: str) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        ["python", "scripts/stale_figures.py", *options],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+
+
+def test_the_report_counts_what_the_pages_quote():
+    done = report()
+    assert done.returncode == 0, done.stderr
+    counts = json.loads(done.stdout.splitlines()[-1])
+    assert set(counts) == {"quoted", "stale", "unreproducible"}
+    assert counts["quoted"] == len(quotes())
+    bad = counts["stale"] + counts["unreproducible"] > 0
+    assert report("--check").returncode == int(bad)
+
+
+def test_published_results_say_where_they_come_from():
+    for path in (ROOT / "benchmarks/results").glob("*.json"):
+        result = json.loads(path.read_text())
+        assert set(PROVENANCE) <= set(result), path
+        assert path.stem in FIGURES
+        assert result["command"], path
+        assert set(result["machine"]) == {"cpu", "cores", "threads", "python"}, path
+        # No path of the machine it was measured on.
+        assert not re.search(r"(^|[ =])/", result["command"]), path
+
+
+def test_the_code_that_figures_measure_exists():
+    for path in {path for figure in FIGURES.values() for path in figure.paths}:
+        named = path.replace("exclude,", "").replace(":(exclude)", "")
+        listed = subprocess.run(["git", "ls-files", "--", named], cwd=ROOT, capture_output=True, text=True)
+        assert listed.stdout, f"nothing is called {path}"
+
+
+def test_every_quoted_figure_is_in_its_result():
+    missing = [quote for quote in quotes() if quote.key not in (read_result(quote.name) or {})]
+    assert missing == []
