@@ -9,7 +9,7 @@ from benchmarks.staleness import read_result
 
 from lerobot_openspm.bench.results import PROVENANCE
 
-NO_FIGURES = set(PROVENANCE) - {"n"}
+NO_FIGURES = {*PROVENANCE, "interval"}
 
 
 class Quoted(dict[str, Any]):

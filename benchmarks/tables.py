@@ -19,9 +19,9 @@ from benchmarks.staleness import ROOT, origin, read_result
 
 INTRODUCTION = """# Results
 
-Made by `python -m benchmarks.tables` from `benchmarks/results`. `python -m benchmarks.figures NAME` takes a
-figure anew, `python scripts/stale_figures.py` says which ones the code has left behind. Rates come with 95 %
-Wilson intervals."""
+Made by `python -m benchmarks.tables` from `benchmarks/results`. `python -m benchmarks.figures tracking`
+takes a figure anew, `python scripts/stale_figures.py` says which ones the code has left behind. Rates come
+with 95 % Wilson intervals."""
 TABLETOP = """# On the tabletop
 
 From ten demonstrations a task unless said otherwise, on seeds that no demonstration and no tuning used. The

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 import json
 import os
 import time
@@ -72,4 +73,5 @@ def _times(run: Any, n: int) -> dict[str, float]:
 
 if __name__ == "__main__":
     os.environ.setdefault("MUJOCO_GL", "egl")
+    argparse.ArgumentParser(description=__doc__).parse_args()
     print(json.dumps(main()))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 import json
 import logging
 import os
@@ -94,4 +95,5 @@ def _plot(epochs: list[float], losses: dict[str, list[float]]) -> None:
 if __name__ == "__main__":
     logging.basicConfig(level=logging.INFO, format="%(levelname)s %(message)s")
     os.environ.setdefault("MUJOCO_GL", "egl")
+    argparse.ArgumentParser(description=__doc__).parse_args()
     print(json.dumps(main()))

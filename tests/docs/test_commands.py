@@ -1,0 +1,203 @@
+"""What README and the docs say to type can be typed.
+
+Quick commands are run, in a folder laid out as the pages have it by then; of the others the command line is
+read by the very parser that would read it.
+"""
+
+import argparse
+import importlib.util
+import os
+import runpy
+import shutil
+import subprocess
+import sys
+import tomllib
+from collections.abc import Callable
+from importlib.metadata import entry_points
+from pathlib import Path
+from typing import Any
+
+import draccus
+import pytest
+from benchmarks.figures import FIGURES
+from tests.docs.pages import OURS, REPOSITORY, THIRD_PARTY, Line, lines
+from tests.policy.lerobot_commands import CALIBRATION
+
+from lerobot_openspm.configuration_openspm import OpenSPMConfig
+
+LINES = [*lines(), *(Line("benchmarks/figures.py", figure.command, True) for figure in FIGURES.values())]
+RUN = ("openspm inspect", "openspm memory list", "openspm memory search", "openspm teach", "python scripts/")
+HAS_LIBERO = importlib.util.find_spec("libero") is not None
+
+
+class Parsed(BaseException):
+    """What a command's parser made of its line; nothing after it is done."""
+
+    def __init__(self, config: Any) -> None:
+        super().__init__(config)
+        self.config = config
+
+
+def ids(line: Line) -> str:
+    return f"{line.page}: {line.typed[:60]}"
+
+
+def of_ours(*programs: str) -> list[Line]:
+    return [line for line in LINES if line.words[0] in programs]
+
+
+def lay_out(folder: Path, checkpoint: Path, dataset: Path) -> None:
+    """What the pages have made by the time of each command, and what their placeholders mean."""
+    runs = ("outputs/train", "outputs/libero_train", "outputs/demo/demos_10/train")
+    for name in ("CHECKPOINT", *(f"{run}/checkpoints/last/pretrained_model" for run in runs)):
+        shutil.copytree(checkpoint, folder / name)
+    for name in ("outputs/tabletop", "outputs/more", "outputs/libero_goal", "FOLDER"):
+        (folder / name).symlink_to(dataset)
+    (folder / "FILE").symlink_to(CALIBRATION)
+    for name in ("benchmarks", "configs", "docs", "scripts", "src", "README.md"):
+        (folder / name).symlink_to(REPOSITORY / name)
+
+
+@pytest.fixture
+def workplace(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The current folder, where the checkpoint has its configuration alone: enough to read command lines."""
+    OpenSPMConfig(device="cpu", push_to_hub=False).save_pretrained(tmp_path / "checkpoint")
+    lay_out(tmp_path, tmp_path / "checkpoint", tmp_path)
+    monkeypatch.chdir(tmp_path)
+
+
+@pytest.fixture
+def trained_workplace(
+    tmp_path: Path, checkpoint: Path, tiny_dataset: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The current folder, with a policy that was trained."""
+    lay_out(tmp_path, checkpoint, tiny_dataset)
+    monkeypatch.chdir(tmp_path)
+
+
+@pytest.fixture
+def parse(monkeypatch: pytest.MonkeyPatch) -> Callable[[list[str]], Any]:
+    """Call a program up to where it has parsed its command line; returns what it parsed."""
+    depth = 0
+
+    def outermost(original: Callable[..., Any]) -> Callable[..., Any]:
+        def parse(*arguments: Any, **named: Any) -> Any:
+            nonlocal depth
+            depth += 1
+            try:
+                config = original(*arguments, **named)
+            finally:
+                depth -= 1
+            # A configuration that is read on the way, such as a checkpoint's, belongs to the whole.
+            if depth:
+                return config
+            raise Parsed(config)
+
+        return parse
+
+    monkeypatch.setattr(draccus, "parse", outermost(draccus.parse))
+    parser_class = argparse.ArgumentParser
+
+    def parse(words: list[str]) -> Any:
+        program, *arguments = words
+        with monkeypatch.context() as patch:
+            patch.setattr(sys, "argv", words)
+            try:
+                if program.endswith("python"):
+                    patch.setattr(parser_class, "parse_args", outermost(parser_class.parse_args))
+                    _run_python(arguments, patch)
+                else:
+                    (script,) = entry_points(group="console_scripts", name=program)
+                    script.load()()
+            except Parsed as parsed:
+                return parsed.config
+        raise AssertionError(f"{program} ran without having parsed {arguments}")
+
+    return parse
+
+
+def _run_python(arguments: list[str], patch: pytest.MonkeyPatch) -> None:
+    if arguments[0] == "-m":
+        patch.setattr(sys, "argv", arguments[1:])
+        runpy.run_module(arguments[1], run_name="__main__", alter_sys=True)
+    else:
+        patch.setattr(sys, "argv", arguments)
+        runpy.run_path(arguments[0], run_name="__main__")
+
+
+def test_the_pages_show_commands_of_every_kind():
+    assert {line.words[0] for line in LINES} <= {*OURS, *THIRD_PARTY}
+    assert {line.words[0] for line in LINES} >= {"make", "openspm", "lerobot-train", "lerobot-eval", "python"}
+    assert len([line for line in LINES if line.typed.startswith(RUN)]) >= 5
+
+
+@pytest.mark.parametrize(
+    "line",
+    [one for one in of_ours("openspm", "lerobot-train", "lerobot-eval", "python", ".venv/bin/python")
+     if not one.is_mention and "-c" not in one.words],
+    ids=ids,
+)  # fmt: skip
+@pytest.mark.usefixtures("workplace")
+def test_a_command_line_is_understood(line: Line, parse: Callable[[list[str]], Any]):
+    if "libero" in line.typed and not HAS_LIBERO:
+        pytest.skip("LIBERO is not installed")
+    if "--help" in line.words:
+        with pytest.raises(SystemExit) as stopped:
+            parse(line.words)
+        assert stopped.value.code == 0
+        return
+    assert parse(line.words) is not None
+
+
+@pytest.mark.parametrize(
+    "line", [one for one in of_ours("openspm") if one.is_mention], ids=ids
+)  # fmt: skip
+def test_a_command_that_is_named_exists(line: Line, parse: Callable[[list[str]], Any], capsys: Any):
+    with pytest.raises(SystemExit) as stopped:
+        parse([*line.words, "--help"])
+    assert stopped.value.code == 0
+    assert "--" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("line", of_ours("make"), ids=ids)
+def test_a_target_of_make_exists(line: Line):
+    done = subprocess.run(
+        ["make", "-n", *line.words[1:]], cwd=REPOSITORY, capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stderr
+
+
+@pytest.mark.parametrize("line", of_ours("pip"), ids=ids)
+def test_what_pip_installs_of_ours_is_offered(line: Line):
+    extras = tomllib.loads((REPOSITORY / "pyproject.toml").read_text())["project"]["optional-dependencies"]
+    for word in line.words[2:]:
+        package, bracket, extra = word.partition("[")
+        if package == "lerobot_policy_openspm" or (package == "." and line.page == "README.md" and bracket):
+            assert extra.removesuffix("]") in extras
+
+
+def layout_option() -> str:
+    """What README says to type where a dataset's feature names do not tell its layout."""
+    (found,) = [word for word in (REPOSITORY / "README.md").read_text().split("`") if "state_layout=" in word]
+    return " ".join(found.split())
+
+
+@pytest.mark.parametrize("line", [one for one in of_ours("lerobot-train") if not one.is_mention], ids=ids)
+@pytest.mark.usefixtures("workplace")
+def test_a_layout_is_named_beside_any_command_that_trains(line: Line, parse: Callable[[list[str]], Any]):
+    config = parse(Line(line.page, f"{line.typed} {layout_option()}", True).words)
+    assert config.policy.state_layout[:3] == ["x", "y", "z"]
+    assert config.policy.state_layout[-1] == "gripper"
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("line", [one for one in LINES if one.typed.startswith(RUN)], ids=ids)
+@pytest.mark.usefixtures("trained_workplace")
+def test_a_quick_command_does_what_it_says(line: Line):
+    binaries = Path(sys.executable).parent
+    done = subprocess.run(
+        ["bash", "-euc", line.typed], capture_output=True, text=True, timeout=300, check=False,
+        env=os.environ | {"PATH": f"{binaries}:{os.environ['PATH']}", "HF_HUB_OFFLINE": "1"},
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr[-3000:]
+    assert done.stdout.strip()
