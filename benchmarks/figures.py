@@ -3,7 +3,8 @@
     python -m benchmarks.figures                     # take all that need no LIBERO, unless current
     python -m benchmarks.figures tracking libero_goal   # take these, unless current
 
-A figure `NAME` is kept as ``benchmarks/results/NAME.json``. Each command goes on where it was interrupted.
+A figure `NAME` is kept as ``benchmarks/results/NAME.json``. A command that takes hours goes on where it was
+interrupted.
 """
 
 from __future__ import annotations
@@ -17,7 +18,10 @@ import sys
 from dataclasses import dataclass
 from pathlib import Path
 
-from benchmarks.staleness import Origin, origin
+from benchmarks.staleness import origin
+
+from lerobot_openspm.bench.results import code_version
+from lerobot_openspm.errors import OpenSPMError
 
 logger = logging.getLogger(__name__)
 
@@ -145,7 +149,7 @@ def needs_libero(figure: Figure) -> bool:
 
 
 def take(name: str) -> None:
-    """Run a figure's command, unless its result is current."""
+    """Run a figure's command, unless its result is current. One that fails leaves the others to be taken."""
     figure = FIGURES[name]
     problem = origin(name, figure.paths).problem
     if problem is None:
@@ -153,17 +157,26 @@ def take(name: str) -> None:
         return
     logger.info("%s (%s): %s", name, problem, figure.command)
     program, *arguments = shlex.split(figure.command)
-    subprocess.run([str(Path(sys.executable).with_name(program)), *arguments], check=True)
+    done = subprocess.run([str(Path(sys.executable).with_name(program)), *arguments], check=False)
+    if done.returncode:
+        logger.error("%s failed with exit code %d", name, done.returncode)
 
 
-def main(names: list[str]) -> dict[str, Origin]:
-    """Take the figures, then write the pages that quote them."""
+def main(names: list[str]) -> dict[str, str]:
+    """Take the figures, then write the pages that quote them. Returns what is wrong with each, or "current".
+
+    Raises:
+        OpenSPMError: There are changes that are not committed, so that no result could say what it is of.
+    """
     from benchmarks import tables
 
+    _, dirty = code_version()
+    if dirty is not False:
+        raise OpenSPMError("figures are taken of a commit; commit the changes under src, configs, benchmarks")
     for name in names:
         take(name)
     tables.write_pages()
-    return {name: origin(name, FIGURES[name].paths) for name in names}
+    return {name: origin(name, FIGURES[name].paths).problem or "current" for name in names}
 
 
 if __name__ == "__main__":
@@ -175,5 +188,9 @@ if __name__ == "__main__":
     chosen = parser.parse_args().names or [n for n, one in FIGURES.items() if not needs_libero(one)]
     if unknown := sorted(set(chosen) - set(FIGURES)):
         parser.error(f"no figures {', '.join(unknown)}; expected some of {', '.join(FIGURES)}")
-    taken = main(chosen)
-    print(json.dumps({name: found.problem or "current" for name, found in taken.items()}))
+    try:
+        taken = main(chosen)
+    except OpenSPMError as error:
+        parser.error(str(error))
+    print(json.dumps(taken))
+    sys.exit(int(set(taken.values()) != {"current"}))

@@ -4,12 +4,15 @@ import json
 import re
 import subprocess
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 from benchmarks.figures import FIGURES
 from benchmarks.staleness import ROOT, origin, quotes, read_result
 
+from benchmarks import figures, tables
 from lerobot_openspm.bench.results import PROVENANCE
+from lerobot_openspm.errors import OpenSPMError
 
 CODE = '"""Moves."""\n\n\ndef speed():\n    """How fast."""\n    return 1  # m/s\n'
 
@@ -161,6 +164,46 @@ def test_the_code_that_figures_measure_exists():
         assert listed.stdout, f"nothing is called {path}"
 
 
+def test_every_room_is_measured_by_some_figure():
+    rooms = {path.parent.name for path in (ROOT / "src/lerobot_openspm").glob("*/__init__.py")}
+    measured = {path for figure in FIGURES.values() for path in figure.paths}
+    # No figure is taken with a judge.
+    unmeasured = {room for room in rooms if not any(f"lerobot_openspm/{room}" in path for path in measured)}
+    assert unmeasured <= {"judgement"}
+
+
 def test_every_quoted_figure_is_in_its_result():
     missing = [quote for quote in quotes() if quote.key not in (read_result(quote.name) or {})]
     assert missing == []
+
+
+@pytest.fixture
+def taking(monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    """The programs that taking figures starts, of which `openspm` fails; nothing is written."""
+    started: list[str] = []
+
+    def run(command: list[str], check: bool) -> SimpleNamespace:
+        started.append(" ".join([Path(command[0]).name, *command[1:]]))
+        return SimpleNamespace(returncode=int("openspm" in started[-1]))
+
+    monkeypatch.setattr(figures, "subprocess", SimpleNamespace(run=run))
+    monkeypatch.setattr(tables, "write_pages", lambda: None)
+    monkeypatch.setattr(figures, "code_version", lambda: ("0123456789ab", False))
+    problems = {"oracle": None, "tracking": "no result file", "execution": "stale by 2 commits"}
+    monkeypatch.setattr(figures, "origin", lambda name, _: SimpleNamespace(problem=problems[name]))
+    return started
+
+
+def test_what_is_current_is_not_taken_again_and_one_failure_does_not_stop_the_rest(taking: list[str]):
+    told = figures.main(["tracking", "oracle", "execution"])
+    assert taking == [FIGURES["tracking"].command, FIGURES["execution"].command]
+    assert told == {"tracking": "no result file", "oracle": "current", "execution": "stale by 2 commits"}
+
+
+def test_no_figure_is_taken_of_changes_that_are_not_committed(
+    taking: list[str], monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.setattr(figures, "code_version", lambda: ("0123456789ab", True))
+    with pytest.raises(OpenSPMError, match="commit the changes"):
+        figures.main(["tracking"])
+    assert taking == []
