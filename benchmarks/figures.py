@@ -44,6 +44,7 @@ LIBERO = (
     f"{PACKAGE}/envs/recording.py",
     "configs/openspm_libero_train.yaml",
     "configs/cameras/libero.json",
+    "scripts/libero_assets.txt",
     "benchmarks/libero/episode.py",
     "benchmarks/libero/evaluate.py",
     "benchmarks/libero/stages.py",
@@ -60,8 +61,9 @@ KEY_POSES = (
     ),
 )
 LANGUAGE = (
-    f"{PACKAGE}/memory",
+    *(f"{PACKAGE}/{room}" for room in ("control", "geometry", "memory", "mining")),
     f"{PACKAGE}/bench/language.py",
+    f"{PACKAGE}/bench/taught_words.py",
     f"{PACKAGE}/bench/instructions",
 )
 NOISE, NOISE_SCRIPT = "benchmarks.measurement_noise", "benchmarks/measurement_noise.py"

@@ -4,9 +4,20 @@ from pathlib import Path
 
 import pytest
 
+from lerobot_openspm.cli import pipeline
 from lerobot_openspm.cli.demo import EVALUATION_SEED
-from lerobot_openspm.cli.pipeline import Episode, digest, discard_unless, mean_steps, rate, read_episodes
+from lerobot_openspm.cli.pipeline import (
+    Episode,
+    digest,
+    discard_unless,
+    mean_steps,
+    measured_folder,
+    rate,
+    read_episodes,
+    success,
+)
 from lerobot_openspm.envs.seeds import EVALUATION_SEEDS, seed_purpose
+from lerobot_openspm.errors import OpenSPMError
 
 
 def line(**changes: object) -> str:
@@ -49,6 +60,44 @@ def test_a_result_is_kept_only_for_what_it_was_made_of(tmp_path: Path, caplog: p
     assert not output.exists()
     assert "made of something else" in caplog.text
     assert digest([weights], []) != digest([weights], ["--a"])
+
+
+def test_what_some_code_made_is_kept_until_that_code_changes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    package = tmp_path / "package"
+    package.mkdir()
+    for name in ("__init__", "records", "measures"):
+        (package / f"{name}.py").write_text("")
+    monkeypatch.setattr(pipeline.lerobot_openspm, "__file__", str(package / "__init__.py"))
+
+    def folder() -> Path:
+        return measured_folder(tmp_path / "out", digest([], [], ["records.py"]))
+
+    (folder() / "recording").touch()
+    (package / "measures.py").write_text("changed")
+    assert [path.name for path in folder().iterdir()] == ["recording"]
+    (package / "records.py").write_text("changed")
+    assert list(folder().iterdir()) == []
+
+
+def test_what_was_not_measured_here_is_left_alone(tmp_path: Path):
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out/precious.txt").write_text("keep")
+    with pytest.raises(OpenSPMError, match="choose another --output"):
+        measured_folder(tmp_path / "out", "made of this")
+    assert (tmp_path / "out/precious.txt").read_text() == "keep"
+
+
+def test_success_is_told_for_all_and_for_each_task():
+    episodes = [
+        Episode("a", 1, 10, True, "done"),
+        Episode("a", 2, 30, False, "lost"),
+        Episode("b", 1, 20, True, "done"),
+    ]
+    told = success(episodes)
+    assert (told["success"], told["n"], told["mean_steps"]) == (2 / 3, 3, 15.0)
+    assert told["per_task"] == {"a": 0.5, "b": 1.0}
+    assert told["failed"] == [["a", 2, "lost"]]
+    assert success(episodes[1:2])["mean_steps"] is None
 
 
 def test_the_demo_is_evaluated_on_evaluation_seeds():

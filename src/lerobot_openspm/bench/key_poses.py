@@ -27,6 +27,8 @@ from lerobot_openspm.mining.key_poses import find_key_poses
 from lerobot_openspm.mining.signals import Episode, observe_robot
 
 SIMULATORS = ("openspm_tabletop", "libero")
+# The package's files that make a recording what it is.
+RECORDED_BY = ("envs/**/*.py", "bench/recording.py", "bench/contact_sensor.py")
 TOLERANCE_STEPS = 3
 # LIBERO's names of the rotation's numbers are wrong, as in the public dataset.
 ROTATIONS: Mapping[str, RotationKind | None] = {"openspm_tabletop": None, "libero": "axis_angle"}
@@ -61,7 +63,7 @@ class Options(ResultOption):
     seed: int = 10_000  # of the first scene of every task
     operator: str = "unsteady"  # who gives the demonstrations: unsteady, or steady as in `openspm collect`
     workers: int = 2  # episodes at a time, each in a process of its own
-    output: str = "outputs/bench/keyposes"  # folder for the recordings; those that are there are kept
+    output: str = "outputs/bench/keyposes"  # folder for the recordings; kept until what records them changes
 
     def __post_init__(self) -> None:
         if self.env.type not in (*SIMULATORS, "all"):
@@ -103,8 +105,9 @@ class Verdict:
 
 def measure(options: Options) -> dict[str, Any]:
     """Record what is missing, mine it, compare. Called by `openspm bench keyposes`."""
-    folder = Path(options.output)
-    folder.mkdir(parents=True, exist_ok=True)
+    from lerobot_openspm.cli.pipeline import digest, measured_folder
+
+    folder = measured_folder(Path(options.output), digest([], [], RECORDED_BY))
     jobs = {simulator: options.jobs(simulator) for simulator in options.simulators}
     _record(
         [job for ones in jobs.values() for job in ones if not job.file(folder).is_file()], folder, options

@@ -26,6 +26,7 @@ KNOWN, PARAPHRASES, OUT_OF_DOMAIN = "known.json", "paraphrases.json", "out_of_do
 # Everyday instructions, each with a light rewording; half of them the grammar cannot read.
 EVERYDAY = "everyday.json"
 HELD_OUT = "held_out"
+SEED = 0  # of the drawn demonstrations
 # A line of paraphrases.json ("paraphrase", "of", "split") or of out_of_domain.json ("instruction", ...).
 Row = dict[str, str]
 # The suites with demonstrations or their keys, over which the right entry is to come first.
@@ -162,6 +163,7 @@ def measure(options: Options) -> dict[str, Any]:
     read = [known for known in of_libero if _is_read(known)]
     of_split = [row for row in read_rows(PARAPHRASES, options.folder) if row["split"] == split]
     result = {
+        "seed": SEED,
         **_measure_acting(read_rows(EVERYDAY, options.folder), of_split, names, failures),
         **headline,
         "libero_parsed": _wordings(read) / _wordings(of_libero),
@@ -208,7 +210,7 @@ def _rights(
     names: NameSimilarity,
 ) -> dict[str, bool | None]:
     """For every instruction, given with its meaning, whether just the right entry acts; None if none does."""
-    entries = teach_each(taught, np.random.default_rng(0))
+    entries = teach_each(taught, np.random.default_rng(SEED))
     acted = {said: (acted_entries(said, entries, partial(is_meant, of), names), of) for said, of in asked}
     return {
         said: (len(found) == 1 and is_meant(of, found[0])) if found else None

@@ -200,13 +200,11 @@ def run(folder: Path, task: str, demos: int, seed: int) -> Any:
 def measure(options: Options) -> dict[str, Any]:
     """Train, teach, evaluate; each only where that is not done."""
     from lerobot_openspm.bench import tracking
-    from lerobot_openspm.cli.pipeline import digest, discard_unless
+    from lerobot_openspm.cli.pipeline import digest, measured_folder
 
-    data, folder = demonstrations(options), Path(options.output)
-    if folder.is_dir() and any(folder.iterdir()) and not folder.with_name(f"{folder.name}.sha256").is_file():
-        raise OpenSPMError(f"{folder} holds something that was not measured here; choose another --output")
-    discard_unless(folder, digest([Path(data.root) / "meta/info.json"], [data.root, str(options.steps)]))
-    folder.mkdir(parents=True, exist_ok=True)
+    data = demonstrations(options)
+    made_of = digest([Path(data.root) / "meta/info.json"], [data.root, str(options.steps)])
+    folder = measured_folder(Path(options.output), made_of)
     tasks = select_tasks(options.env.task)
     nine = {task: folder / f"without_{task}" for task in tasks}
     left = [(data, task, options.steps, nine[task]) for task in tasks if not nine[task].exists()]

@@ -92,19 +92,12 @@ class BenchConfig(ResultOption):
 
     def folder(self, what: str) -> Path:
         """Where results go; what was measured of other code or another checkpoint is discarded."""
-        from lerobot_openspm.cli.pipeline import digest, discard_unless
+        from lerobot_openspm.cli.pipeline import digest, measured_folder
 
-        folder = Path(self.output or f"outputs/bench/{what}_{self.env.type}")
         files = [self.checkpoint / name for name in ("model.safetensors", "memory.json", "cameras.json")]
-        ours = folder.with_name(f"{folder.name}.sha256")
-        if folder.is_dir() and any(folder.iterdir()) and not ours.is_file():
-            raise OpenSPMError(
-                f"{folder} holds something that was not measured here; choose another --output"
-            )
         options = [what, self.env.type, *([str(self.demonstrations)] if what == "perception" else [])]
-        discard_unless(folder, digest(files, options))
-        folder.mkdir(parents=True, exist_ok=True)
-        return folder
+        folder = Path(self.output or f"outputs/bench/{what}_{self.env.type}")
+        return measured_folder(folder, digest(files, options))
 
 
 def perception(config: BenchConfig) -> dict[str, Any]:

@@ -23,6 +23,7 @@ from tqdm import tqdm
 import lerobot_openspm
 from lerobot_openspm.cli.collect import SUMMARY_FILE, CollectConfig, collect
 from lerobot_openspm.envs.tasks import TASK_NAMES
+from lerobot_openspm.errors import OpenSPMError
 from lerobot_openspm.files import write_beside, write_json
 
 logger = logging.getLogger(__name__)
@@ -115,11 +116,17 @@ def evaluate(
     return found
 
 
-def digest(files: Sequence[Path], options: Sequence[str]) -> str:
-    """What a result is made of, the code too, so that a kept one is only used again for the same."""
+def digest(files: Sequence[Path], options: Sequence[str], code: Sequence[str] = ("**/*.py",)) -> str:
+    """What a result is made of, the code too, so that a kept one is only used again for the same.
+
+    Args:
+        files: What it is made of beside the code.
+        options: With which settings.
+        code: Patterns of the package's files that make it; all if not given.
+    """
     found = hashlib.sha256("\n".join(options).encode())
-    code = sorted(Path(lerobot_openspm.__file__).parent.rglob("*.py"))
-    for file in [*code, *files]:
+    package = Path(lerobot_openspm.__file__).parent
+    for file in [*sorted({path for pattern in code for path in package.glob(pattern)}), *files]:
         found.update(file.read_bytes())
     return found.hexdigest()
 
@@ -133,6 +140,20 @@ def discard_unless(output: Path, made_of: str) -> None:
         shutil.rmtree(output)
     output.parent.mkdir(parents=True, exist_ok=True)
     write_beside(kept, made_of.encode())
+
+
+def measured_folder(folder: Path, made_of: str) -> Path:
+    """A folder for what is measured; what it holds of something else that was measured is removed.
+
+    Raises:
+        OpenSPMError: It holds something that was not measured here.
+    """
+    ours = folder.with_name(f"{folder.name}.sha256")
+    if folder.is_dir() and any(folder.iterdir()) and not ours.is_file():
+        raise OpenSPMError(f"{folder} holds something that was not measured here; choose another --output")
+    discard_unless(folder, made_of)
+    folder.mkdir(parents=True, exist_ok=True)
+    return folder
 
 
 def _start_evaluation(
