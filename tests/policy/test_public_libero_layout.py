@@ -17,6 +17,7 @@ from tests.policy.conftest import NAME
 from tests.policy.lerobot_commands import CALIBRATION
 
 from lerobot_openspm.configuration_openspm import OpenSPMConfig
+from lerobot_openspm.errors import DatasetError
 from lerobot_openspm.memory.entry import MemoryEntry
 from lerobot_openspm.training import mine_experience, open_demonstrations, training_set
 
@@ -26,7 +27,7 @@ CAMERAS = {
     "observation.images.wrist": "observation.images.image2",
 }
 MOTORS = ["x", "y", "z", "roll", "pitch", "yaw"]
-EPISODES = [0, 1, 2]
+EPISODES = [0, 1]
 
 
 def features(size: int) -> dict[str, Any]:
@@ -117,8 +118,9 @@ def test_its_names_alone_would_be_euler_angles(public_meta, calibrations):
 def test_a_card_with_another_rate_than_the_robots_is_explained(
     public_meta, calibrations, caplog, rate, warned
 ):
-    chosen = config(calibrations["public"], control_hz=rate, memory_episodes=[0], **PUBLIC_ROTATION)
-    with caplog.at_level(logging.WARNING):
+    # It is said before anything is mined, and nothing has to be mined to hear it.
+    chosen = config(calibrations["public"], control_hz=rate, memory_episodes=[99], **PUBLIC_ROTATION)
+    with caplog.at_level(logging.WARNING), pytest.raises(DatasetError, match=r"got \[99\]"):
         mine_experience(public_meta, chosen)
     told_of_it = [r.getMessage() for r in caplog.records if "frames per second" in r.getMessage()]
     assert len(told_of_it) == warned
