@@ -62,7 +62,7 @@ test-slow: egl ## run the slow tests, and let the properties explore (PYTEST_ARG
 	@HYPOTHESIS_PROFILE=explore $(BIN)/python -m pytest $(TWO_PROCESSES) \
 		-m "(slow or hypothesis) and not libero and not gpu" $(PYTEST_ARGS)
 
-guard: egl ## record, train and run episodes of SUITE (tabletop or libero) from pixels; fails below the success floor
+guard: $(if $(filter libero,$(SUITE)),libero-setup,egl) ## record, train and run episodes of SUITE (tabletop or libero) from pixels; fails below the success floor
 	@$(BIN)/python -m benchmarks.guard --suite=$(SUITE)
 
 lint: setup ## ruff's rules and format, then the types; changes nothing

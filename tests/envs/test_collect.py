@@ -75,6 +75,7 @@ def test_an_interrupted_recording_goes_on_where_it_stopped(tmp_path, monkeypatch
     assert [e["task"] for e in recorded["episodes"]] == ["turn_on_stove", "bowl_on_plate"]
 
 
+@pytest.mark.slow  # each process imports LeRobot
 def test_two_processes_record_what_one_does(tmp_path, tiny_dataset):
     def recorded(root):
         return json.loads((root / "meta/openspm_collect.json").read_text())["episodes"]
@@ -98,7 +99,7 @@ def test_a_foreign_partial_folder_is_not_touched(tmp_path):
 
 def test_a_broken_expert_stops_the_recording(tmp_path, monkeypatch):
     failed = dataclasses.replace(
-        TabletopSource().record("turn_on_stove", DEMO_SEED_START, 64, 64), success=False
+        TabletopSource().record("turn_on_stove", DEMO_SEED_START, 128, 128), success=False
     )
     monkeypatch.setattr(TabletopSource, "record", lambda *_: failed)
     root = tmp_path / "demos"

@@ -26,7 +26,7 @@ CAMERAS = {
     "observation.images.wrist": "observation.images.image2",
 }
 MOTORS = ["x", "y", "z", "roll", "pitch", "yaw"]
-EPISODES = [0, 1, 2]
+EPISODES = [0, 1]
 
 
 def features(size: int) -> dict[str, Any]:
