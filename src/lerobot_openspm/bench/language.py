@@ -210,12 +210,18 @@ def _rights(
     names: NameSimilarity,
 ) -> dict[str, bool | None]:
     """For every instruction, given with its meaning, whether just the right entry acts; None if none does."""
-    entries = teach_each(taught, np.random.default_rng(SEED))
+    entries = _taught(tuple(taught))
     acted = {said: (acted_entries(said, entries, partial(is_meant, of), names), of) for said, of in asked}
     return {
         said: (len(found) == 1 and is_meant(of, found[0])) if found else None
         for said, (found, of) in acted.items()
     }
+
+
+@cache
+def _taught(instructions: tuple[str, ...]) -> list[MemoryEntry]:
+    """One memory of all instructions, the same whenever it is asked for."""
+    return teach_each(instructions, np.random.default_rng(SEED))
 
 
 def _is_told_as(instruction: str, entry: MemoryEntry) -> bool:
