@@ -6,7 +6,13 @@ import pytest
 from lerobot.datasets import LeRobotDatasetMetadata
 from tests.memory.memory_files import names
 from tests.policy.conftest import NAME
-from tests.policy.lerobot_commands import lerobot_train, pretrained, run_command, training_options
+from tests.policy.lerobot_commands import (
+    call_lerobot,
+    pretrained,
+    run_command,
+    train_arguments,
+    training_options,
+)
 from tests.policy.test_learning import new_config
 
 from lerobot_openspm.mining import processor
@@ -28,7 +34,8 @@ def test_training_on_it_reads_the_key_poses_and_remembers_the_same(
 def test_lerobot_train_on_it_leaves_the_same_memory(
     annotated_dataset: Path, checkpoint: Path, tmp_path: Path
 ):
-    lerobot_train(*training_options(annotated_dataset, tmp_path / "run", 10))
+    options = training_options(annotated_dataset, tmp_path / "run", 10)
+    call_lerobot("lerobot-train", *train_arguments(*options))
     for name in names(checkpoint):
         assert (pretrained(tmp_path / "run") / name).read_bytes() == (checkpoint / name).read_bytes(), name
 
