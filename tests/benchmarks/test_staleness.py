@@ -3,6 +3,7 @@
 import json
 import re
 import subprocess
+import sys
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -128,7 +129,7 @@ def test_quotes_are_found_where_they_stand(tmp_path: Path):
 
 def report(*options: str) -> subprocess.CompletedProcess[str]:
     return subprocess.run(
-        ["python", "scripts/stale_figures.py", *options],
+        [sys.executable, "scripts/stale_figures.py", *options],
         cwd=ROOT,
         capture_output=True,
         text=True,

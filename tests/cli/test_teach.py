@@ -182,7 +182,7 @@ def rename_camera(dataset: Path) -> None:
 def another_instruction(dataset: Path) -> None:
     for file in (dataset / "meta/episodes").rglob("*.parquet"):
         table = pd.read_parquet(file)
-        table["tasks"] = [["juggle the plates"] for _ in range(len(table))]
+        table["tasks"] = [[""] for _ in range(len(table))]
         table.to_parquet(file)
 
 

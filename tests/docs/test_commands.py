@@ -12,6 +12,7 @@ import shutil
 import subprocess
 import sys
 import tomllib
+import warnings
 from collections.abc import Callable
 from importlib.metadata import entry_points
 from pathlib import Path
@@ -119,7 +120,10 @@ def parse(monkeypatch: pytest.MonkeyPatch) -> Callable[[list[str]], Any]:
 def _run_python(arguments: list[str], patch: pytest.MonkeyPatch) -> None:
     if arguments[0] == "-m":
         patch.setattr(sys, "argv", arguments[1:])
-        runpy.run_module(arguments[1], run_name="__main__", alter_sys=True)
+        with warnings.catch_warnings():
+            # Another test may have imported the module; it is run anew all the same.
+            warnings.filterwarnings("ignore", "'.*' found in sys.modules", RuntimeWarning)
+            runpy.run_module(arguments[1], run_name="__main__", alter_sys=True)
     else:
         patch.setattr(sys, "argv", arguments)
         runpy.run_path(arguments[0], run_name="__main__")
