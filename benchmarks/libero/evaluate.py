@@ -9,6 +9,7 @@ two action by action. Every episode is written down as it ends; a second run doe
 
 from __future__ import annotations
 
+import gc
 import json
 import logging
 import multiprocessing
@@ -210,6 +211,8 @@ def _policy(config: EvaluationConfig) -> OpenSPMPolicy:
     if "policy" not in _KEPT:
         torch.set_num_threads(1)
         _KEPT["policy"] = OpenSPMPolicy.from_pretrained(config.checkpoint)
+        # robosuite collects garbage at every reset; it need not look through all modules each time.
+        gc.freeze()
         if config.execution:
             _KEPT["policy"].config.execution = config.execution
     return _KEPT["policy"]

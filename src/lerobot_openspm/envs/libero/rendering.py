@@ -11,6 +11,7 @@ camera cannot see, directly or in a mirror, are left out.
 
 from __future__ import annotations
 
+import os
 from typing import Any
 
 import mujoco
@@ -21,13 +22,17 @@ MAX_GEOMS = 1000
 COLLISION_GROUP, HIDDEN_GROUP = 0, 5
 # Geoms are kept that come this near to what a camera sees.
 MARGIN_M = 0.01
-# What MuJoCo uploads of a model; the same in two models, it is uploaded once.
+# What MuJoCo uploads of a model; where two models have it in common, it is uploaded once. Textures are told
+# apart by their files and sizes: comparing their 143 MB would take as long as another upload.
 UPLOADED = (
     "mesh_vert",
     "mesh_face",
     "mesh_normal",
     "mesh_texcoord",
-    "tex_data",
+    "tex_pathadr",
+    "tex_adr",
+    "tex_height",
+    "tex_width",
     "mat_texid",
     "mat_texuniform",
     "mat_texrepeat",
@@ -39,6 +44,8 @@ class Renderer:
     """Draws the scenes of one LIBERO task."""
 
     def __init__(self) -> None:
+        # Mesa's software driver takes a thread per core, which several processes would contend for.
+        os.environ.setdefault("LP_NUM_THREADS", "1")
         # LIBERO's environments draw by robosuite's choice of OpenGL (EGL, OSMesa, GLFW), and so does this.
         from robosuite.utils.binding_utils import GLContext  # pyright: ignore[reportMissingImports]
 
@@ -114,7 +121,7 @@ class Renderer:
 
 def _look_alike(one: Any, other: Any) -> bool:
     """Whether two models have the same meshes, textures and materials, and the same fog and shadows."""
-    return one.stat.extent == other.stat.extent and all(
+    return (one.paths, one.stat.extent) == (other.paths, other.stat.extent) and all(
         np.array_equal(getattr(one, name), getattr(other, name)) for name in UPLOADED
     )
 

@@ -44,7 +44,8 @@ def tasks() -> dict[str, str]:
     except EOFError as error:
         raise RuntimeError(
             "LIBERO asks once, when it is first imported, whether its datasets go to a folder of yours, and "
-            "there is no terminal to answer on; answer for it with: echo N | python -c 'import libero.libero'"
+            "there is no terminal to answer on; answer for it with: python scripts/libero_assets.py, from a "
+            "checkout, or with: echo N | python -c 'import libero.libero'"
         ) from error
     return {task.name: task.language for task in benchmark.get_benchmark_dict()[SUITE]().tasks}
 
