@@ -121,9 +121,9 @@ def count_calls(owner: Any, name: str, argument: int, monkeypatch: pytest.Monkey
     """How often a function is called, by the index of the episode that it is given as an argument."""
     called, calls = getattr(owner, name), Counter[int]()
 
-    def counted(*given):
+    def counted(*given, **named):
         calls[given[argument].index] += 1
-        return called(*given)
+        return called(*given, **named)
 
     monkeypatch.setattr(owner, name, counted)
     return calls
@@ -162,7 +162,8 @@ def test_held_out_episodes_are_neither_remembered_nor_drawn(
     seen = count_calls(Demonstrations, "views", 1, monkeypatch)
     policy = OpenSPMPolicy(new_config(tiny_meta, memory_episodes=kept), dataset_meta=tiny_meta)
     assert mined == Counter(range(6)), "every episode is mined once"
-    assert seen == Counter(kept * 2), "two frames are looked at, and none of what is held out"
+    assert set(seen) == set(kept), "of what is held out no image is looked at"
+    assert max(seen.values()) <= 2
     assert policy.experience is not None
     assert sorted(e.source for e in policy.experience.entries) == [f"{tiny_meta.repo_id}#{i}" for i in kept]
 
