@@ -179,7 +179,7 @@ def rename_camera(dataset: Path) -> None:
     (dataset / "meta/info.json").write_text(json.dumps(info))
 
 
-def another_instruction(dataset: Path) -> None:
+def no_instruction(dataset: Path) -> None:
     for file in (dataset / "meta/episodes").rglob("*.parquet"):
         table = pd.read_parquet(file)
         table["tasks"] = [[""] for _ in range(len(table))]
@@ -204,8 +204,8 @@ def cameras_that_look_away(dataset: Path) -> None:
         (rename_state, "the state of dataset local/openspm_tabletop is ['joint_0', "),
         (rename_camera, "cameras['observation.images.front'] has no images here"),
         (
-            another_instruction,
-            "episode 0 of dataset local/openspm_tabletop: the instruction ",
+            no_instruction,
+            "episode 0 of dataset local/openspm_tabletop has the task '', expected an instruction to find it",
         ),
         (cameras_that_look_away, "the objects they belong to were found in none; check --policy.cameras"),
     ],
