@@ -29,7 +29,8 @@ from lerobot_openspm.memory.strict_json import loads
 
 # Version 2: objects known by patches. Version 3: key poses with the axis of their constraint. Version 4:
 # objects known by boxes, or by shapes whose pixels a segmenter finds. Version 5: a line for every entry.
-FORMAT, VERSION = "openspm-memory", 5
+# Version 6: outcomes, and sub-tasks kept by their own words.
+FORMAT, VERSION = "openspm-memory", 6
 MEMORY_JSON, CAMERAS_JSON = "memory.json", "cameras.json"
 # Until version 4 the arrays had one name.
 OLD_ARRAYS = "memory.safetensors"
