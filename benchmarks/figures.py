@@ -35,13 +35,19 @@ POLICY = (
     f":(exclude,glob){PACKAGE}/perception/segmentation/*sam*.py",
 )
 RECORDING = (f"{PACKAGE}/cli/collect.py", f":(glob){PACKAGE}/envs/*.py")
-TABLETOP = (*POLICY, *RECORDING, "configs/openspm_tabletop_train.yaml")
+TABLETOP = (
+    *POLICY,
+    *RECORDING,
+    *(f"{PACKAGE}/cli/{name}.py" for name in ("pipeline", "demo")),
+    "configs/openspm_tabletop_train.yaml",
+    "configs/cameras/openspm_tabletop.json",
+)
 LIBERO = (
     *POLICY,
     f"{PACKAGE}/cli/collect.py",
     f"{PACKAGE}/envs/libero",
-    f"{PACKAGE}/envs/motions.py",
-    f"{PACKAGE}/envs/recording.py",
+    *(f"{PACKAGE}/envs/{name}.py" for name in ("motions", "recording", "seeds")),
+    *(f"{PACKAGE}/bench/{name}.py" for name in ("episode", "libero")),
     "configs/openspm_libero_train.yaml",
     "configs/cameras/libero.json",
     "scripts/libero_assets.txt",
@@ -67,6 +73,8 @@ LANGUAGE = (
     f"{PACKAGE}/bench/instructions",
 )
 NOISE, NOISE_SCRIPT = "benchmarks.measurement_noise", "benchmarks/measurement_noise.py"
+# As `make libero` types it.
+LIBERO_GOAL = "--demos=10 --states=50 --tasks=0-9"
 NEW_TASKS = (
     "open_the_middle_drawer_of_the_cabinet",
     "put_the_bowl_on_the_plate",
@@ -94,7 +102,8 @@ def _bench(what: str, name: str, paths: tuple[str, ...], options: str = "") -> F
 
 
 def _tabletop(comparison: str) -> Figure:
-    return Figure(f"python -m benchmarks.tabletop {comparison}", TABLETOP)
+    own = ("benchmarks/tabletop.py", "benchmarks/common.py")
+    return Figure(f"python -m benchmarks.tabletop {comparison}", (*TABLETOP, *own))
 
 
 def _libero(script: str, *own: str, options: str = "") -> Figure:
@@ -103,7 +112,9 @@ def _libero(script: str, *own: str, options: str = "") -> Figure:
 
 
 FIGURES: dict[str, Figure] = {
-    "tabletop": Figure("openspm demo --result=benchmarks/results/tabletop.json", TABLETOP),
+    "tabletop": Figure(
+        "openspm demo --demos=10 --episodes=20 --result=benchmarks/results/tabletop.json", TABLETOP
+    ),
     **{name: _tabletop(name) for name in ("execution", "oracle", "conditioning", "compound", "two_bowls")},
     "perception_tabletop": _bench("perception", "perception_tabletop", (*TABLETOP, *ALONG)),
     "tracking": _bench("tracking", "tracking", (*TABLETOP, *TRACKING)),
@@ -123,11 +134,11 @@ FIGURES: dict[str, Figure] = {
     "measurement_noise_libero": Figure(
         f"python -m {NOISE} --env.type=libero", (*LIBERO, *ALONG, NOISE_SCRIPT)
     ),
-    "libero_goal": _libero("run", "benchmarks/libero/accuracy.py"),
-    "libero_accuracy": _libero("run", "benchmarks/libero/accuracy.py"),
+    "libero_goal": _libero("run", "benchmarks/libero/accuracy.py", options=LIBERO_GOAL),
+    "libero_accuracy": _libero("run", "benchmarks/libero/accuracy.py", options=LIBERO_GOAL),
     "libero_few_shot_3": _libero("few_shot", options="--demos=3"),
     "libero_few_shot_1": _libero("few_shot", options="--demos=1 --states=10"),
-    "libero_ablations": _libero("ablations", "benchmarks/libero/geometric_guess.py"),
+    "libero_ablations": _libero("ablations", "benchmarks/libero/geometric_guess.py", f"{PACKAGE}/judgement"),
     **{f"libero_new_task_{task}_3": _libero("new_task", options=f"--task={task}") for task in NEW_TASKS},
     "libero_losses": _libero("losses"),
     "libero_latency": _libero("latency"),
@@ -153,7 +164,7 @@ def needs_libero(figure: Figure) -> bool:
 def take(name: str) -> None:
     """Run a figure's command, unless its result is current. One that fails leaves the others to be taken."""
     figure = FIGURES[name]
-    problem = origin(name, figure.paths).problem
+    problem = origin(name, figure.paths, expected_command=figure.command).problem
     if problem is None:
         logger.info("%s is current", name)
         return
@@ -178,7 +189,10 @@ def main(names: list[str]) -> dict[str, str]:
     for name in names:
         take(name)
     tables.write_pages()
-    return {name: origin(name, FIGURES[name].paths).problem or "current" for name in names}
+    return {
+        name: origin(name, FIGURES[name].paths, expected_command=FIGURES[name].command).problem or "current"
+        for name in names
+    }
 
 
 if __name__ == "__main__":

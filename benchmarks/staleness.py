@@ -68,13 +68,16 @@ def read_result(name: str, root: Path = ROOT) -> dict[str, Any] | None:
     return json.loads(path.read_text()) if path.is_file() else None
 
 
-def origin(name: str, paths: Sequence[str] | None, root: Path = ROOT) -> Origin:
+def origin(
+    name: str, paths: Sequence[str] | None, root: Path = ROOT, expected_command: str | None = None
+) -> Origin:
     """Where a result comes from, and whether what it measures has changed.
 
     Args:
         name: The result's name.
         paths: Git's names (pathspecs) of the code that it measures; None if nobody knows how to take it.
         root: The checkout.
+        expected_command: The command line that takes the published figure; None if any will do.
     """
     result = read_result(name, root)
     if result is None:
@@ -84,11 +87,18 @@ def origin(name: str, paths: Sequence[str] | None, root: Path = ROOT) -> Origin:
         return Origin(commit, "benchmarks/figures.py names no command that takes it")
     if not command or not _is_there(command, root):
         return Origin(commit, f"its command is gone: {command}")
+    if expected_command is not None and _options(command) != _options(expected_command):
+        return Origin(commit, f"taken with other options: {command}, expected {expected_command}")
     if not commit or not _git(root, "merge-base", commit, "HEAD").startswith(commit):
         return Origin(commit, f"its commit {commit} is not in this history")
     if result.get("dirty") is not False:
         return Origin(commit, "measured with changes that were not committed")
     return Origin(commit, None, tuple(changes(commit, paths, root)))
+
+
+def _options(command: str) -> set[str]:
+    """The words of a command line, but for those that change no figure."""
+    return {word for word in shlex.split(command) if not word.startswith(("--result=", "--started_at="))}
 
 
 def _is_there(command: str, root: Path) -> bool:

@@ -157,7 +157,11 @@ def drop_what_is_not_current() -> list[Path]:
     """Delete results that are stale or cannot be taken again; returns them."""
     files = sorted((ROOT / "benchmarks/results").glob("*.json"))
     known = {path: FIGURES.get(path.stem) for path in files}
-    dropped = [path for path, one in known.items() if origin(path.stem, one and one.paths).problem]
+    dropped = [
+        path
+        for path, one in known.items()
+        if origin(path.stem, one and one.paths, expected_command=one and one.command).problem
+    ]
     for path in dropped:
         path.unlink()
     return dropped

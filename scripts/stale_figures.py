@@ -28,7 +28,7 @@ def main(root: Path = ROOT) -> dict[str, int]:
     found = quotes(root)
     for name in dict.fromkeys(quote.name for quote in found):
         figure, result = FIGURES.get(name), read_result(name, root) or {}
-        known = origin(name, figure and figure.paths, root)
+        known = origin(name, figure and figure.paths, root, figure and figure.command)
         print(f"benchmarks/results/{name}.json, commit {known.commit}: {known.problem or 'current'}")
         for change in known.changes:
             print(f"    {change}")

@@ -170,7 +170,7 @@ class OpenSPMPolicy(PreTrainedPolicy):
         """Act on copies of the running episodes; at the end those that were running are back."""
         rows, eyes, is_training = self.rows, self._eyes, self.training
         # Entries, models and a segmenter's weights are large and never change: the copies share them.
-        shared = [self.experience, self.segmenter]
+        shared = [self.experience, self.segmenter, *(one.experience for one in eyes)]
         for row in rows:
             shared += [row.candidates, *row.used_entries, *(one.entry for one in row.ranked)]
         try:

@@ -108,6 +108,7 @@ def test_the_tabletops_episodes_are_those_of_the_demos_steps(monkeypatch: pytest
     ]
 
 
+@pytest.mark.libero
 def test_liberos_scenes_are_drawn_from_the_guards_own_seeds(monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
     collected, jobs = [], []
     checkpoint = tmp_path / "trained"

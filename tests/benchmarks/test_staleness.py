@@ -69,6 +69,14 @@ def test_a_result_is_current_until_what_it_measures_changes(checkout: Checkout):
     assert checkout.origin().problem == "stale by 1 commits"
 
 
+def test_a_result_of_other_options_is_not_the_published_one(checkout: Checkout):
+    expected = "python -m src.move --n=50 --result=benchmarks/results/speed.json"
+    for options, is_published in (("--n=50 --started_at=3", True), ("--n=5", False), ("", False)):
+        checkout.measure(command=f"python -m src.move {options}")
+        problem = origin("speed", ["src", "configs"], checkout.root, expected).problem
+        assert (problem is None) is is_published, problem
+
+
 @pytest.mark.parametrize(
     ("name", "text"),
     [

@@ -1,5 +1,7 @@
 """What is not done is taken up again where it can be mended."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
@@ -8,7 +10,7 @@ from tests.memory.builders import entry, hand_pose, key_pose
 
 from lerobot_openspm.control.executor import Hand, Status
 from lerobot_openspm.geometry import se3
-from lerobot_openspm.memory.entry import Axis
+from lerobot_openspm.memory.entry import Anchor, Axis, Outcome
 
 OPEN = "open the top drawer"
 CABINET = {"cabinet": se3.from_yaw([0.1, 0.0, 0.0], 0.5)}
@@ -94,3 +96,54 @@ def test_what_is_no_more_in_the_hand_is_fetched():
     one = carrying(opening=0.0)
     assert one.executor.plan[one.executor.index].memory.phase == "approach"
     assert one.tracker.held == frozenset()
+
+
+def ended(at, instruction="put the bowl on the plate", visible=1.0):
+    """A bowl that was let go, seen at a place relative to the plate, and the hand gone."""
+    place = entry().layout["plate"] @ se3.from_yaw([*at], 0.0)
+    outcome = Outcome(0, "bowl", Anchor("plate", "plate"), np.zeros(3), np.zeros(3), 0.02)
+    eyes, one = Eyes(entry().layout), row(entry(outcomes=(outcome,)), instruction=instruction)
+    one.observe(HAND, eyes)
+    one.executor.begin(one.executor.plan, HAND, 7)
+    eyes.layout["bowl"], eyes.visible = place, visible
+    watch(one, eyes, Hand(one.executor.plan[7].T_world_ee, 0.08), 12)
+    return one, place
+
+
+def test_what_fell_beside_its_place_is_fetched_from_where_it_lies():
+    one, place = ended([0.06, 0.0, 0.0])
+    assert one.status is Status.RUNNING
+    assert one.executor.attempts == 1
+    assert one.executor.index == 0
+    assert_allclose(one.executor.plan[0].T_world_ee, place @ entry().key_poses[0].T_obj_ee, atol=1e-9)
+    assert one.succeeded is None, "it is not over"
+
+
+def test_what_lies_in_its_place_is_left_alone():
+    one, _ = ended([0.01, 0.0, -0.03])
+    assert one.status is Status.DONE
+    assert one.succeeded is True
+
+
+def test_of_a_whole_of_which_a_part_was_not_seen_nothing_is_said():
+    one, _ = ended([0.01, 0.0, 0.0])
+    one._parts_known = False
+    assert one.succeeded is None
+
+
+def test_an_episode_that_is_given_up_has_failed():
+    one = carrying(opening=0.0)
+    one.executor.stop(Status.NO_PROGRESS)
+    assert one.succeeded is False
+
+
+def test_a_handle_that_went_all_the_way_is_a_success_if_the_fingers_could_feel_it():
+    for opening, expected in ((0.03, True), (0.001, None)):
+        poses = [replace(pose, opening=opening) for pose in handle(KINDS["slide"]).key_poses]
+        eyes, one = Eyes(CABINET), row(entry(OPEN, poses, CABINET), instruction=OPEN)
+        one.observe(HAND, eyes)
+        last = len(one.executor.plan) - 1
+        one.executor.begin(one.executor.plan, HAND, last)
+        watch(one, eyes, Hand(one.executor.plan[last].T_world_ee, 0.08), 12)
+        assert one.status is Status.DONE
+        assert one.succeeded is expected

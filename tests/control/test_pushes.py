@@ -9,7 +9,7 @@ from tests.memory.builders import entry, hand_pose, key_pose, robot
 
 from lerobot_openspm.control.executor import ControlSettings, Executor, Hand, Status
 from lerobot_openspm.control.row import LEFT_BEHIND_M
-from lerobot_openspm.control.transfer import Target, transfer
+from lerobot_openspm.control.transfer import Target, push_ways, transfer
 from lerobot_openspm.geometry import se3
 from lerobot_openspm.memory.entry import Anchor, Outcome
 from lerobot_openspm.perception.tracker import TrackStatus
@@ -100,9 +100,9 @@ def test_a_push_without_a_known_outcome_ends_where_the_demonstration_did():
 
 def test_a_hand_that_strays_while_it_pushes_is_led_back_to_its_way():
     executor = Executor(ControlSettings(), robot())
-    memory = push().key_poses[2]
+    memory, ways = push().key_poses[2], push_ways(push(), LAYOUT)[0]
     start, end = hand_pose(0.3, 0.0, 0.02), hand_pose(0.1, 0.0, 0.02)
-    executor.begin([Target(end, memory, precise=True)], Hand(start, 0.0))
+    executor.begin([Target(end, memory, precise=True, push=ways)], Hand(start, 0.0))
     strayed = Hand(hand_pose(0.2, 0.004, 0.028), 0.0)
     executor.push_chunk(np.tile([-0.5, 0.3, 0.3, 0, 0, 0.1, 1.0], (5, 1)))
     action = executor.next_action(strayed)

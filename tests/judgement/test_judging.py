@@ -299,7 +299,8 @@ def test_a_checkpoint_holds_what_was_judged_and_not_where_it_was_asked(mined: Mi
     saved = json.loads((tmp_path / "checkpoint/config.json").read_text())
     assert (saved["phase_judge"], saved["phase_judge_model_id"]) == ("openai", "tiny-vl")
     assert (saved["phase_judge_api_base"], saved["phase_judge_cache"]) == (None, None)
-    plain = experience_of(dataset_processor(mined.meta, config(**chosen)).mine(), config(**chosen))
+    unjudged = config(**chosen)
+    plain = experience_of(dataset_processor(mined.meta, unjudged).mine(), unjudged)
     sure = load_experience(tmp_path / "checkpoint")
     for before, after in zip(plain.entries, sure.entries, strict=True):
         assert before.key == after.key

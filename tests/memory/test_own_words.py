@@ -108,3 +108,28 @@ def test_what_is_learned_keeps_its_name_beside_another_of_its_kind():
 def test_tasks_are_read_together():
     tasks = read_tasks(["wipe the table", "put the bowl on the plate", "  "])
     assert list(tasks) == ["wipe the table", "put the bowl on the plate"]
+
+
+@pytest.mark.parametrize(
+    ("asked", "known"), [("wash the tub", "wash the tube"), ("fold the cap", "fold the cape")]
+)
+def test_things_whose_names_are_nearly_written_alike_are_different_things(asked: str, known: str):
+    assert words_similarity(normal_words(asked), normal_words(known), TABLE_NAMES) == 0.0
+
+
+def test_just_the_same_words_come_before_the_same_with_other_endings():
+    one, several = normal_words("shake the bottle"), normal_words("shake the bottles")
+    assert words_similarity(one, one, TABLE_NAMES) == 1.0
+    assert 0.9 < words_similarity(one, several, TABLE_NAMES) < 1.0
+
+
+class EverythingAlike:
+    """Embeddings that find any two words alike."""
+
+    def similarity(self, asked: str, known: str) -> float:
+        return 0.9
+
+
+def test_verbs_are_not_compared_by_embeddings():
+    words = normal_words("unfold the towel"), normal_words("fold the towel")
+    assert words_similarity(*words, EverythingAlike()) == 0.0

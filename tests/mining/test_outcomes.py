@@ -90,3 +90,21 @@ def test_a_target_that_is_moved_on_has_one_outcome_the_last():
     twice = (*SUB_TASKS, *SUB_TASKS)
     shown = demonstrations(3)
     assert all([one.sub_task for one in found] == [1] for found in outcomes(shown, ends(shown), twice))
+
+
+@pytest.mark.parametrize(("height", "is_met"), [(-0.05, True), (-0.07, False), (0.01, True), (0.03, False)])
+def test_what_is_let_go_may_have_fallen_but_not_risen(height, is_met):
+    shown, ended = pushed(5)
+    outcome = outcomes(shown, ended, PUSH)[0][0]
+    place = se3.from_yaw(ended[0]["plate"][:3, 3] + [0.0, 0.0, height], 0.0)
+    assert outcome.is_met({**shown[0].layout, "plate": place}) is is_met
+
+
+def test_a_landmark_that_is_carried_off_later_tells_no_outcome():
+    tasks = parse_instruction("put the bowl on the plate and put the plate on the stove")
+    layout = {
+        name: se3.from_yaw([0.1 * i, 0.0, 0.0], 0.0) for i, name in enumerate(("bowl", "plate", "stove"))
+    }
+    ended = {"bowl": layout["plate"], "plate": layout["stove"]}
+    (found,) = outcomes([Demonstration((), layout)], [ended], tasks)
+    assert [outcome.target for outcome in found] == ["plate"]

@@ -63,8 +63,9 @@ def test_what_is_known_to_be_hidden_does_not_pull_the_pose(models):
             found.append(np.linalg.norm(one.T_world_obj[:2, 3] - clear.T_world_obj[:2, 3]))
             if masks:
                 shares.append(one.visible)
-    assert np.median(told) < 0.5 * np.median(untold)
-    assert np.median(told) < 0.004
+    # What pulls a pose at all pulls it far: of eight scenes it is a few, by centimetres.
+    assert np.mean(told) < 0.5 * np.mean(untold)
+    assert np.max(told) < 0.004
     assert all(0.2 < share < 0.95 for share in shares)
 
 

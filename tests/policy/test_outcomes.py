@@ -6,6 +6,7 @@ from pathlib import Path
 import pytest
 from tests.policy.conftest import Frame, batch_of
 
+from lerobot_openspm.control.executor import Status
 from lerobot_openspm.errors import OpenSPMError
 from lerobot_openspm.experience import load_experience
 from lerobot_openspm.modeling_openspm import OpenSPMPolicy
@@ -49,7 +50,8 @@ def test_without_a_word_from_outside_what_the_policy_saw_itself_counts(
     policy.report_outcomes()
     assert trials(policy) == {}
     seen, missed = (policy.rows[i].used_entries[0].source for i in (0, 1))
-    policy.rows[0].succeeded, policy.rows[1].succeeded = True, False
+    for row, verdict in zip(policy.rows[:2], (True, False), strict=True):
+        row.executor.status, row._verdict = Status.DONE, verdict
     assert policy.outcomes == [True, False, None]
     policy.report_outcomes()
     assert trials(policy) == {seen: (1, 1), missed: (1, 0)}

@@ -165,7 +165,8 @@ class Executor:
             action = self._toward(hand)
         elif self._queue:
             action = self._queue.popleft()
-            if self.plan[self.index].memory.phase == "push":
+            is_corrected = self._settings.execution == "closed_loop_trc"
+            if is_corrected and self.plan[self.index].push is not None:
                 action = self._kept_on_way(action, hand)
         elif self._settings.execution == "closed_loop_trc" and self._steps >= self._nominal_steps():
             action = self._correct(hand)
@@ -219,7 +220,8 @@ class Executor:
         way = way / length
         left = target - here
         across = left - (left @ way) * way
-        motion = (action[:3] @ way) * way + CORRECTION_SHARE * across / self._robot.metres_per_action
+        back = CORRECTION_SHARE * across / self._robot.metres_per_action
+        motion = (action[:3] @ way) * way + back / max(1.0, float(np.abs(back).max()))
         return np.concatenate([motion, action[3:]])
 
     def _gains(self) -> Array:
@@ -304,12 +306,21 @@ class Executor:
             return False
         return hand.opening < HELD_SHARE * grasped.opening
 
-    def has_followed_axes(self) -> bool:
-        """Whether there were handles to lead, all were led to the end, and the fingers felt each of them."""
+    def followed_sub_tasks(self) -> set[int]:
+        """The sub-tasks whose drawer or knob went all the way, once the plan is done.
+
+        The hand met the end of the way, and fingers that lose a handle are noticed. So where the fingers can
+        feel the handle, it came along. Only ``closed_loop_trc`` checks either.
+        """
+        if self._settings.execution != "closed_loop_trc":
+            return set()
         ends = [i for i, target in enumerate(self.plan) if target.axis is not None]
+        return {self.plan[i].memory.sub_task for i in ends if self.feels_handle(i)}
+
+    def feels_handle(self, index: int) -> bool:
+        """Whether the fingers stand open around what was grasped before a key pose: a loss is felt."""
         held = self._robot.open_width * HOLDING_SHARE
-        # A key pose of an axis was met by the hand; fingers that lose what they hold are noticed on the way.
-        return bool(ends) and all(i > 0 and self.plan[i - 1].memory.opening >= held for i in ends)
+        return index > 0 and self.plan[index - 1].memory.opening >= held
 
     def try_again(self, why: str) -> bool:
         """Count another attempt at the present key pose; without one left there is no progress."""

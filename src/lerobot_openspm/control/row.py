@@ -22,7 +22,7 @@ from lerobot_openspm.flow.condition import Query
 from lerobot_openspm.geometry import se3
 from lerobot_openspm.geometry.se3 import Array
 from lerobot_openspm.memory.compound import Candidate, plan_parts
-from lerobot_openspm.memory.entry import MemoryEntry, Outcome
+from lerobot_openspm.memory.entry import WORLD, MemoryEntry, Outcome
 from lerobot_openspm.memory.retrieval import Scored
 from lerobot_openspm.perception.camera_watch import Fault
 from lerobot_openspm.perception.tracker import Tracker, TrackStatus
@@ -38,7 +38,7 @@ SECOND_LOOK_S = 0.15
 # Without a sound picture of every camera the hand goes on for so long, then holds still, then gives up.
 BLIND_S, GIVE_UP_S = 0.5, 2.0
 
-# So many looks may be taken after the last key pose to see how it went; then it stays unknown.
+# After the last key pose the policy looks up to three times at what it moved. Then the outcome stays unknown.
 LOOKS_AT_OUTCOME = 3
 
 # A hand that has gone this far beyond what it pushes has lost it.
@@ -77,8 +77,6 @@ class Row:
         layout: Poses ``T_world_obj`` that the plan was made with: of what the hand has touched, from before.
         seen: What the last look brought; None before the first.
         is_paused: Whether the hand holds still until something is seen again.
-        succeeded: Whether what was to be done is seen to be done; None before the end, and where it cannot be
-            seen.
         refusal: Why the instruction is not acted on; "" unless the status is NOT_UNDERSTOOD.
     """
 
@@ -91,7 +89,8 @@ class Row:
         self.layout: dict[str, Array] = {}
         self.seen: Seen | None = None
         self.is_paused = False
-        self.succeeded: bool | None = None
+        self._verdict: bool | None = None  # whether the present part is seen to be done
+        self._parts_known = True  # whether all parts before it were
         self._looks_left = LOOKS_AT_OUTCOME  # at how the present part ended
         self.refusal = ""
         # What the instruction is carried out by; made at the first look, because it may be refused.
@@ -115,6 +114,13 @@ class Row:
     def status(self) -> Status:
         """What the execution is up to."""
         return self.executor.status
+
+    @property
+    def succeeded(self) -> bool | None:
+        """Whether what was to be done is seen to be done; None before the end and where it is not seen."""
+        if self.status is Status.NO_PROGRESS:
+            return False
+        return self._verdict if self.status is Status.DONE and self._parts_known else None
 
     @property
     def used_entries(self) -> tuple[MemoryEntry, ...]:
@@ -237,7 +243,7 @@ class Row:
         expected = self.ranked[0].entry.outcomes
         names = dict.fromkeys(name for one in expected for name in one.objects)
         if not names:
-            self.succeeded = self.executor.has_followed_axes() or None
+            self._verdict = self._is_all_known(()) or None
             return ()
         self._looks_left -= 1
         self._see([name for name in names if name not in self._altered], hand, look)
@@ -245,17 +251,30 @@ class Row:
         seen = [
             one for one in expected if self.tracker.is_seen(one.target) and poses.keys() >= set(one.objects)
         ]
-        missed = tuple(one for one in seen if not one.is_met(poses))
+        missed = tuple(one for one in seen if not self._is_met(one, poses))
         if len(seen) < len(expected) and not missed:
             return None
-        self.succeeded = not missed
+        self._verdict = False if missed else self._is_all_known(expected) or None
         return missed
+
+    def _is_all_known(self, met: Sequence[Outcome]) -> bool:
+        """Whether met outcomes, and handles that went all the way, tell that every sub-task is done."""
+        done = {one.sub_task for one in met} | self.executor.followed_sub_tasks()
+        return done >= set(range(len(self.ranked[0].entry.key.sub_tasks)))
+
+    def _is_met(self, outcome: Outcome, poses: Mapping[str, Array]) -> bool:
+        """Whether an outcome is met whichever way round a symmetric landmark was seen."""
+        axes = outcome.anchor.axes
+        if axes == WORLD:
+            return outcome.is_met(poses)
+        turned = se3.yaw_equivalents(poses[axes], self._knowledge.yaw_periods.get(axes, 2 * np.pi))
+        return any(outcome.is_met({**poses, axes: T}) for T in turned)
 
     def _go_back(self, missed: Outcome, hand: Hand) -> None:
         """Do a sub-task again, from where its target is now, if an attempt is left."""
         if not self.executor.try_again(f"the {missed.target} is not where it should be"):
             return
-        self._looks_left = LOOKS_AT_OUTCOME
+        self._looks_left, self._verdict = LOOKS_AT_OUTCOME, None
         poses = self.ranked[0].entry.key_poses
         index = next(i for i, pose in enumerate(poses) if pose.sub_task == missed.sub_task)
         self._update(self._anchors(index), hand)
@@ -267,7 +286,8 @@ class Row:
         self._refer()
         logger.info("%r: part %d of %d", self.instruction, self._part + 1, len(self._parts))
         self.executor.finish_part()
-        self._looks_left, self.succeeded = LOOKS_AT_OUTCOME, None
+        self._parts_known &= self._verdict is True
+        self._looks_left, self._verdict = LOOKS_AT_OUTCOME, None
         self._gone.clear()
         self._plan(hand, look)
 
@@ -289,9 +309,9 @@ class Row:
     def _retry_index(self, hand: Hand) -> int:
         """Where to go back to: the approach to what is grasped or, with it in the hand, to its place."""
         target = self.executor.plan[self.executor.index]
-        if target.axis is not None:
+        if target.axis is not None and self.executor.feels_handle(self.executor.index):
             gone = self._gone.get(target.memory.sub_task, 0.0)
-            self._gone[target.memory.sub_task] = gone + self.executor.travelled
+            self._gone[target.memory.sub_task] = gone + max(self.executor.travelled, 0.0)
         is_carrying = bool(self.tracker.held) and target.memory.phase == "place"
         if is_carrying and not self.executor.has_lost_grip(hand):
             return self.executor.entry_index()
@@ -351,6 +371,9 @@ class Row:
             return
         if dropped := {name for name in moved & held if self._is_left_behind(name, hand)}:
             logger.info("%r: dropped: %s", self.instruction, ", ".join(sorted(dropped)))
+            # What slips out of the hand is no fault of the plan; a push that loses its object may be.
+            if self._is_pushing and not self.executor.try_again("what is pushed was left behind"):
+                return
             index = self.executor.retry_index()
             self._update(self._anchors(index), hand)
             self._begin(index, hand)
@@ -396,6 +419,11 @@ class Row:
             self.tracker.hold(target.push.target, hand.T_world_ee)
         if self.status is Status.DONE:
             self.tracker.release(self.tracker.held, hand.T_world_ee)
+
+    @property
+    def _is_pushing(self) -> bool:
+        target = self.executor.target
+        return target is not None and target.push is not None
 
     def _beyond(self, target: Target, push: PushWays, hand: Hand) -> float:
         """Metres by which the hand has gone beyond where it meets what it pushes."""

@@ -66,7 +66,7 @@ class PushWays:
     def beyond(self, T_world_ee: Array, T_world_end: Array, target: Array) -> float:
         """How far the hand has gone beyond where it meets its target, along the way, in metres.
 
-        Where it meets the target it leads, or follows, it by as much as it does at the end of the push.
+        It meets the target where it is as far ahead of it as at the end of the push.
 
         Args:
             T_world_ee: The hand ``(4, 4)``.
@@ -157,6 +157,7 @@ def _gone_on(targets: Sequence[Target], sub_task: int, amount: float) -> list[Ta
     end, axis = next(found, (0, None))
     if axis is None:
         return list(targets)
+    amount = min(max(amount, 0.0), axis.amount)
     so_far, left = replace(axis, amount=amount), replace(axis, amount=axis.amount - amount)
     before = [
         replace(one, T_world_ee=so_far.follow(one.T_world_ee)) if one.memory.sub_task == sub_task else one
@@ -174,8 +175,14 @@ def _length(way: Array) -> float:
 
 
 def push_ways(entry: MemoryEntry, layout: Mapping[str, Array]) -> dict[int, PushWays]:
-    """The ways of an entry's pushes by sub-task, of those whose outcome is known."""
-    pushing = {pose.sub_task for pose in entry.key_poses if pose.phase == "push"}
+    """The ways of an entry's pushes by sub-task, of those whose outcome is known.
+
+    What is grasped as well is placed by its grasp, not by its way.
+    """
+    pushing, grasping = (
+        {pose.sub_task for pose in entry.key_poses if pose.phase == phase} for phase in ("push", "grasp")
+    )
+    pushing -= grasping
     ways: dict[int, PushWays] = {}
     for outcome in entry.outcomes:
         if outcome.sub_task not in pushing or any(

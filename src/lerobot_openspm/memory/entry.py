@@ -172,6 +172,10 @@ class MemoryKeyPose:
     covariance: Array | None = None
 
 
+# How far an object may fall after the hand has let go of it: into a bowl, a drawer or a basket.
+MAX_FALL_M = 0.06
+
+
 @dataclass(frozen=True)
 class Outcome:
     """Where a sub-task leaves its target: what "done" means for it.
@@ -182,7 +186,8 @@ class Outcome:
         anchor: The frame in which the demonstrations agree most on where it ended.
         position: Origin ``(3,)`` of the target in that frame, metres; what the demonstrations have in common.
         shown: The same of this demonstration alone.
-        tolerance_m: The sub-task is done while the target is at most this far from there.
+        tolerance_m: The sub-task is done while the target is at most this far from there; it may lie lower by
+            :data:`MAX_FALL_M`, because what is let go falls.
     """
 
     sub_task: int
@@ -207,8 +212,9 @@ class Outcome:
 
     def is_met(self, layout: Mapping[str, Array]) -> bool:
         """Whether the target is where it should be, given the objects' poses ``T_world_obj``."""
-        off = np.linalg.norm(layout[self.target][:3, 3] - self.place(layout))
-        return bool(off <= self.tolerance_m)
+        off = layout[self.target][:3, 3] - self.place(layout)
+        beside = float(np.linalg.norm(off[:2]))
+        return beside <= self.tolerance_m and -MAX_FALL_M <= float(off[2]) <= self.tolerance_m
 
 
 @dataclass(frozen=True)

@@ -15,11 +15,13 @@ from functools import lru_cache
 from lerobot_openspm.errors import InstructionError
 from lerobot_openspm.memory import vocabulary as v
 from lerobot_openspm.memory.entry import OWN_WORDS, SubTask
-from lerobot_openspm.memory.names import NameSimilarity
+from lerobot_openspm.memory.names import TABLE_NAMES, NameSimilarity
 from lerobot_openspm.memory.wording import plain_words
 
 # One phrase fewer than the demonstration's instruction has: "wipe the table" for "... with the sponge".
 PHRASE_UNSAID = 0.9
+# Other words that mean the same.
+NOT_VERBATIM = 0.99
 # A name that is made of words is cut here.
 MAX_NAME = 60
 
@@ -113,11 +115,13 @@ def words_similarity(asked: str, known: str, names: NameSimilarity) -> float:
     a, k = _clauses(asked), _clauses(known)
     if len(a) != len(k):
         return 0.0
-    return min(_clause_score(one, other, names) for one, other in zip(a, k, strict=True))
+    # Just the same words come before words that only mean the same.
+    return NOT_VERBATIM * min(_clause_score(one, other, names) for one, other in zip(a, k, strict=True))
 
 
 def _clause_score(asked: _Clause, known: _Clause, names: NameSimilarity) -> float:
-    score = _same(asked.verb, known.verb, names)
+    # Verbs are never compared by embeddings: "fold" and "unfold" are used alike.
+    score = 1.0 if _stem(asked.verb) == _stem(known.verb) else TABLE_NAMES.similarity(asked.verb, known.verb)
     left = list(asked.phrases)
     unsaid = 0
     for role, noun in known.phrases:
@@ -134,15 +138,16 @@ def _clause_score(asked: _Clause, known: _Clause, names: NameSimilarity) -> floa
 
 
 def _same(asked: str, known: str, names: NameSimilarity) -> float:
-    if _stem(asked) == _stem(known):
+    """How alike two nouns are; singular and plural are one, a tub and a tube are not."""
+    if [*map(v.singular, asked.split())] == [*map(v.singular, known.split())]:
         return 1.0
     return names.similarity(asked, known)
 
 
-def _stem(phrase: str) -> str:
-    """Words without their endings: "wiping" and "wipe", "mugs" and "mug" are one."""
+def _stem(verb: str) -> str:
+    """A verb without its ending: "wiping", "wipes" and "wipe" are one."""
     stems: list[str] = []
-    for word in phrase.split():
+    for word in verb.split():
         word = v.singular(word)
         word = word[:-3] if word.endswith("ing") and len(word) > 5 else word
         word = word.removesuffix("e")

@@ -127,19 +127,24 @@ def _place(name: str, estimate: PoseEstimate, touched: Sequence[Hint]) -> Array 
 
 def simulator_poses(
     demonstrations: Demonstrations, mined: Sequence[MinedEpisode], models: Mapping[str, KnownObject]
-) -> tuple[list[dict[str, Array]], tuple[str, ...]]:
+) -> tuple[list[dict[str, Array]], list[dict[str, Array]], tuple[str, ...]]:
     """The simulator's poses of the named objects instead of perception's (oracle ablation only).
 
     Returns:
-        Poses per episode, and the simulator's object names in the order of its pose vector.
+        Poses per episode in its first frame, those of the targets in its last one, and the simulator's object
+        names in the order of its pose vector.
     """
-    found, names = [], ()
+    found, ends, names = [], [], ()
     for item in mined:
-        poses = demonstrations.simulator_poses(item.episode, 0)
-        names = tuple(poses)
+        first, last = (
+            demonstrations.simulator_poses(item.episode, frame) for frame in (0, len(item.episode) - 1)
+        )
+        names = tuple(first)
         nouns = sorted({name for sub_task in item.sub_tasks for name in sub_task.objects})
-        found.append(name_simulator_poses(poses, nouns, models))
-    return found, names
+        targets = sorted({sub_task.target for sub_task in item.sub_tasks})
+        found.append(name_simulator_poses(first, nouns, models))
+        ends.append(name_simulator_poses(last, targets, models))
+    return found, ends, names
 
 
 def hints(item: MinedEpisode) -> tuple[Hint, ...]:

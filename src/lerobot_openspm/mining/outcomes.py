@@ -56,8 +56,8 @@ def outcomes(
     """
     found: list[list[Outcome]] = [[] for _ in demonstrations]
     for i, sub_task in enumerate(sub_tasks):
-        # A target that a later sub-task moves on ends where that one leaves it.
-        moved_on = any(later.target == sub_task.target for later in sub_tasks[i + 1 :])
+        # What a later sub-task moves on, or moves away from under it, is not where this one left it.
+        moved_on = any(later.target in sub_task.objects for later in sub_tasks[i + 1 :])
         is_told = sub_task.relation and not sub_task.words  # else nobody says that it is to end there
         if is_told and sub_task.landmark != sub_task.target and not moved_on:
             for n, outcome in _outcomes(i, sub_task, demonstrations, ends).items():

@@ -120,11 +120,13 @@ class DatasetProcessor:
                 scenes, found.episodes, self._options.known_objects, np.random.default_rng(0),
                 self._options.segmenter, self._options.shape, shapes,
             )  # fmt: skip
-        poses, simulator_objects = objects.poses, ()
+        poses, ends, simulator_objects = objects.poses, objects.ends, ()
         if self._options.is_oracle:
-            poses, simulator_objects = simulator_poses(self.demonstrations, found.episodes, objects.models)
+            poses, ends, simulator_objects = simulator_poses(
+                self.demonstrations, found.episodes, objects.models
+            )
         yaw_periods = {name: model.yaw_period for name, model in objects.models.items()}
-        tasks = compare(found.episodes, poses, objects.ends, yaw_periods)
+        tasks = compare(found.episodes, poses, ends, yaw_periods)
         return MinedDataset(
             **vars(found), cameras=cameras, objects=objects.models, object_poses=tuple(poses), tasks=tasks,
             simulator_objects=simulator_objects,
