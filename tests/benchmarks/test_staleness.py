@@ -199,7 +199,7 @@ def taking(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     monkeypatch.setattr(tables, "write_pages", lambda: None)
     monkeypatch.setattr(figures, "code_version", lambda: ("0123456789ab", False))
     problems = {"oracle": None, "tracking": "no result file", "execution": "stale by 2 commits"}
-    monkeypatch.setattr(figures, "origin", lambda name, _: SimpleNamespace(problem=problems[name]))
+    monkeypatch.setattr(figures, "origin", lambda name, _, **__: SimpleNamespace(problem=problems[name]))
     return started
 
 

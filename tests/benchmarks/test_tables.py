@@ -122,7 +122,7 @@ def test_results_that_are_not_current_can_be_dropped(tmp_path: Path, monkeypatch
     monkeypatch.setattr(tables, "ROOT", tmp_path)
     current = {"tracking": None, "nobody_knows": "names no command"}
     monkeypatch.setattr(
-        tables, "origin", lambda name, paths: type("Origin", (), {"problem": current[name]})
+        tables, "origin", lambda name, paths, **_: type("Origin", (), {"problem": current[name]})
     )  # fmt: skip
     assert [path.stem for path in tables.drop_what_is_not_current()] == ["nobody_knows"]
     assert [path.stem for path in folder.iterdir()] == ["tracking"]
