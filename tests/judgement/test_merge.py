@@ -1,7 +1,7 @@
 """Evidence is pooled as its formula says, and what no hand can follow never comes out."""
 
 import pytest
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 
 from lerobot_openspm.errors import JudgementError
@@ -76,6 +76,7 @@ def test_below_its_threshold_a_judge_changes_nothing(g, phase, threshold, data):
 
 
 @given(confidences, confidences, confidences)
+@example(1.0, 0.0, 0.5625)
 def test_agreement_never_lowers_and_more_of_it_never_less(g, m, more):
     m, more = sorted((m, more))
     kinematic = PhaseAnswer("lift", g)

@@ -69,7 +69,8 @@ def _pooled(kinematic: PhaseAnswer, judged: PhaseAnswer | None, name: str) -> Ph
     if odds == 1:  # not even the last digit changes
         return kinematic
     if judged.phase == kinematic.phase:
-        return PhaseAnswer(name, g * odds / (g * odds + 1 - g))
+        # 1 - g first: rounding must not lift the quotient above 1.
+        return PhaseAnswer(name, g * odds / (g * odds + (1 - g)))
     return PhaseAnswer(name, g / (g + (1 - g) * odds))
 
 
