@@ -15,7 +15,7 @@ SUITE ?= tabletop
 PYTEST_ARGS ?=
 RESULT ?=
 FIGURES ?=
-# The tests of a file share what they make, so a file stays in one process.
+# The tests of a file share what they make, so a file stays in one process; each has one of two cores.
 TWO_PROCESSES := -n 2 --dist loadfile
 
 BIN := .venv/bin
@@ -55,11 +55,11 @@ tables: setup ## write docs/results.md and README's figures from what was measur
 	@$(BIN)/python -m benchmarks.tables
 
 test: egl ## run the tests, without those marked slow, libero or gpu (PYTEST_ARGS=... adds arguments)
-	@$(BIN)/python -m pytest $(TWO_PROCESSES) $(PYTEST_ARGS)
+	@OMP_NUM_THREADS=1 $(BIN)/python -m pytest $(TWO_PROCESSES) $(PYTEST_ARGS)
 
 # Properties run again here, on more examples than in the default tests.
 test-slow: egl ## run the slow tests, and let the properties explore (PYTEST_ARGS=--hypothesis-seed=0 repeats a run)
-	@HYPOTHESIS_PROFILE=explore $(BIN)/python -m pytest $(TWO_PROCESSES) \
+	@OMP_NUM_THREADS=1 HYPOTHESIS_PROFILE=explore $(BIN)/python -m pytest $(TWO_PROCESSES) \
 		-m "(slow or hypothesis) and not libero and not gpu" $(PYTEST_ARGS)
 
 guard: $(if $(filter libero,$(SUITE)),libero-setup,egl) ## record, train and run episodes of SUITE (tabletop or libero) from pixels; fails below the success floor

@@ -15,7 +15,7 @@ from functools import lru_cache
 from lerobot_openspm.errors import InstructionError
 from lerobot_openspm.memory import vocabulary as v
 from lerobot_openspm.memory.entry import OWN_WORDS, SubTask
-from lerobot_openspm.memory.names import TABLE_NAMES, NameSimilarity
+from lerobot_openspm.memory.names import NameSimilarity
 from lerobot_openspm.memory.wording import plain_words
 
 # One phrase fewer than the demonstration's instruction has: "wipe the table" for "... with the sponge".
@@ -120,8 +120,8 @@ def words_similarity(asked: str, known: str, names: NameSimilarity) -> float:
 
 
 def _clause_score(asked: _Clause, known: _Clause, names: NameSimilarity) -> float:
-    # Verbs are never compared by embeddings: "fold" and "unfold" are used alike.
-    score = 1.0 if _stem(asked.verb) == _stem(known.verb) else TABLE_NAMES.similarity(asked.verb, known.verb)
+    is_same_verb = _stem(asked.verb) == _stem(known.verb)
+    score = 1.0 if is_same_verb else names.similarity(asked.verb, known.verb)
     left = list(asked.phrases)
     unsaid = 0
     for role, noun in known.phrases:
