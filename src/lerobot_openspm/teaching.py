@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -13,6 +13,7 @@ from lerobot_openspm.errors import DatasetError, LayoutError
 from lerobot_openspm.experience import Experience, check_labels
 from lerobot_openspm.geometry.camera import load_cameras
 from lerobot_openspm.memory.entry import MemoryEntry
+from lerobot_openspm.memory.indexed_entries import known_names
 from lerobot_openspm.memory.instruction import read_tasks
 from lerobot_openspm.memory.own_words import normal_words
 from lerobot_openspm.perception.types import Segmenter
@@ -93,7 +94,8 @@ def teach(
     taught = {entry.language for entry in added}
     for task in dict.fromkeys(tasks.values()):
         if task not in taught:
-            raise DatasetError(_nothing_learned(dataset_meta.repo_id, task, tasks, mined))
+            known = known_names(experience.entries)
+            raise DatasetError(_nothing_learned(dataset_meta.repo_id, task, tasks, mined, known))
     named = dict.fromkeys(name for entry in added for name in entry.layout)
     objects = {name: mined.objects[name] for name in named if name in mined.objects}
     learned = replace(mined, entries=added, objects=objects)
@@ -171,13 +173,15 @@ def _unseen(entry: MemoryEntry) -> list[str]:
     return [name for name in named if name not in entry.layout]
 
 
-def _nothing_learned(name: str, task: str, tasks: dict[int, str], mined: Experience) -> str:
-    """Why an instruction has no entry."""
+def _nothing_learned(
+    name: str, task: str, tasks: dict[int, str], mined: Experience, known: Collection[str]
+) -> str:
+    """Why an instruction has no entry; it was read with the known names."""
     episodes = [index for index, told in tasks.items() if told == task]
     own = [entry for entry in mined.entries if entry.language == task]
     unseen = sorted({name for entry in own for name in _unseen(entry)})
     if not unseen:
-        read = read_tasks([task], mined.objects)[task]
+        read = read_tasks([task], known)[task]
         named = (one for sub_task in read for one in sub_task.objects)
         unseen = sorted(set(named) - set(mined.objects))
     why = f"could not find {' and '.join(unseen)}" if unseen else "found no key poses with all their anchors"

@@ -24,6 +24,7 @@ from lerobot_openspm.geometry.camera import Camera, load_cameras
 from lerobot_openspm.judgement.cache import AnswerCache
 from lerobot_openspm.judgement.judging import judge_episodes
 from lerobot_openspm.judgement.make import make_judge
+from lerobot_openspm.memory.indexed_entries import known_names
 from lerobot_openspm.memory.robot import RobotModel
 from lerobot_openspm.mining.dataset import Demonstrations, open_dataset
 from lerobot_openspm.mining.entries import build_entries
@@ -74,6 +75,7 @@ def dataset_processor(
         calibration=config.cameras or "the checkpoint's calibration",
         episodes=config.memory_episodes,
         known_objects=known.objects if known else {},
+        known_names=known_names(known.entries) if known else (),
         known_robot=known.robot if known else None,
         judge=None if config.phase_judge == "none" else partial(judged, config=config),
         segmenter=segmenter or segmenter_of(config),

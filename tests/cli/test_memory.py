@@ -16,6 +16,7 @@ from lerobot_openspm import experience as module
 from lerobot_openspm.cli.memory import COMMANDS
 from lerobot_openspm.experience import Experience, load_experience, save_experience
 from lerobot_openspm.memory.bank import EntryBank
+from lerobot_openspm.memory.entry import Anchor, Outcome
 
 BOWL, DRAWER, STOVE = "put the bowl on the plate", "open the top drawer", "put the bowl on the stove"
 OBJECTS = {"bowl": model("bowl", 1), "plate": model("plate", 2), "cabinet": model("cabinet", 3)}
@@ -89,10 +90,13 @@ def test_list(openspm: Openspm, memory: Path):
 
 
 def test_show(openspm: Openspm, memory: Path):
-    save_experience(replace(made(), entries=(merged_entry(source="local/demos#0, local/demos#1"),)), memory)
+    outcome = Outcome(0, "bowl", Anchor("plate", "plate"), np.array([0.0, 0.0, 0.01]), np.zeros(3), 0.02)
+    shown = merged_entry(source="local/demos#0, local/demos#1", outcomes=(outcome,))
+    save_experience(replace(made(), entries=(shown,)), memory)
     code, out, _ = openspm("memory", "show", f"--path={memory}", "--source=local/demos#0, local/demos#1")
     assert code == 0
     assert out.count(" mm, ") == len(merged_entry().key_poses) == out.count("  spread ")
+    assert "done when the bowl is within 20.0 mm of 0.0 0.0 10.0 mm from the plate (axes of the plate)" in out
     assert json.loads(out.splitlines()[-1]) == {"entries": 1, "shown": 1}
     assert "holds nothing from 'elsewhere#1'" in refused(openspm, memory, "show", "--source=elsewhere#1")
 

@@ -99,6 +99,18 @@ def test_a_part_ends_as_high_as_the_episode_began_but_the_last_one_does_not():
     assert len(one.executor.plan) == len(PLATE.key_poses), "it began lower than it ends"
 
 
+def test_another_object_of_the_same_name_is_not_taken_to_be_where_the_first_one_was():
+    asked = "put the left bowl on the plate and put the right bowl on the plate"
+    eyes, one = Eyes(LAYOUT), row(PLATE, instruction=asked)
+    one.observe(HAND, eyes)
+    del eyes.layout["bowl"]
+    one.tracker.release(one.tracker.held, HAND.T_world_ee)
+    one.executor.begin(one.executor.plan, HAND, len(one.executor.plan) - 1)
+    watch(one, eyes, Hand(one.executor.plan[-1].T_world_ee, HAND.opening), 12)
+    assert one._part == 1
+    assert one.status is Status.OBJECT_NOT_FOUND
+
+
 def test_the_whole_is_preferred_where_it_was_demonstrated():
     whole = entry(BOTH, PLATE.key_poses, LAYOUT, source="local/demos#9")
     one = row(PLATE, BOX, whole)

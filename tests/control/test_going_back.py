@@ -6,11 +6,13 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 from tests.control.test_row import HAND, Eyes, row, watch
-from tests.memory.builders import entry, hand_pose, key_pose
+from tests.memory.builders import entry, hand_pose, key_pose, pick_and_place
 
 from lerobot_openspm.control.executor import Hand, Status
+from lerobot_openspm.control.row import GIVE_UP_S, Seen
 from lerobot_openspm.geometry import se3
 from lerobot_openspm.memory.entry import Anchor, Axis, Outcome
+from lerobot_openspm.perception.camera_watch import Fault
 
 OPEN = "open the top drawer"
 CABINET = {"cabinet": se3.from_yaw([0.1, 0.0, 0.0], 0.5)}
@@ -98,15 +100,17 @@ def test_what_is_no_more_in_the_hand_is_fetched():
     assert one.tracker.held == frozenset()
 
 
-def ended(at, instruction="put the bowl on the plate", visible=1.0):
-    """A bowl that was let go, seen at a place relative to the plate, and the hand gone."""
+ON_PLATE = Outcome(0, "bowl", Anchor("plate", "plate"), np.zeros(3), np.zeros(3), 0.02)
+
+
+def ended(at, look=None):
+    """A bowl that was let go at a place relative to the plate, the hand gone, and looks from then on."""
     place = entry().layout["plate"] @ se3.from_yaw([*at], 0.0)
-    outcome = Outcome(0, "bowl", Anchor("plate", "plate"), np.zeros(3), np.zeros(3), 0.02)
-    eyes, one = Eyes(entry().layout), row(entry(outcomes=(outcome,)), instruction=instruction)
+    eyes, one = Eyes(entry().layout), row(entry(outcomes=(ON_PLATE,)))
     one.observe(HAND, eyes)
     one.executor.begin(one.executor.plan, HAND, 7)
-    eyes.layout["bowl"], eyes.visible = place, visible
-    watch(one, eyes, Hand(one.executor.plan[7].T_world_ee, 0.08), 12)
+    eyes.layout["bowl"] = place
+    watch(one, look or eyes, Hand(one.executor.plan[7].T_world_ee, 0.08), 12)
     return one, place
 
 
@@ -123,6 +127,36 @@ def test_what_lies_in_its_place_is_left_alone():
     one, _ = ended([0.01, 0.0, -0.03])
     assert one.status is Status.DONE
     assert one.succeeded is True
+
+
+@pytest.mark.parametrize("seconds", [0.1, GIVE_UP_S])
+@pytest.mark.parametrize("off_m", [0.0, 0.06])
+def test_without_a_picture_what_was_done_is_neither_seen_nor_tried_again(off_m, seconds):
+    one, _ = ended([off_m, 0.0, 0.0], lambda *_: Seen({}, {"front": Fault("black", seconds)}))
+    assert one.status is Status.DONE
+    assert one.executor.attempts == 0
+    assert one.succeeded is None
+
+
+def test_of_several_things_to_do_only_the_one_that_is_missed_is_done_again():
+    pull = [replace(pose, sub_task=1) for pose in handle(KINDS["slide"]).key_poses]
+    layout = {**entry().layout, **CABINET}
+    both = "put the bowl on the plate and open the top drawer"
+    whole = entry(both, (*pick_and_place(), *pull), layout, outcomes=(ON_PLATE,))
+    eyes, one = Eyes(layout), row(whole, instruction=both)
+    one.observe(HAND, eyes)
+    last = len(one.executor.plan) - 1
+    one.executor.begin(one.executor.plan, HAND, last)
+    eyes.layout["bowl"] = layout["plate"] @ se3.from_yaw([0.06, 0.0, 0.0], 0.0)
+    watch(one, eyes, Hand(one.executor.plan[last].T_world_ee, 0.08), 12)
+    assert one.executor.index == 0
+    assert {target.memory.sub_task for target in one.executor.plan} == {0}
+    one.executor.begin(one.executor.plan, HAND, 7)
+    eyes.layout["bowl"] = layout["plate"]
+    watch(one, eyes, Hand(one.executor.plan[7].T_world_ee, 0.08), 12)
+    assert one.status is Status.DONE
+    assert one.executor.attempts == 1
+    assert one.succeeded is True, "the drawer went all the way before"
 
 
 def test_of_a_whole_of_which_a_part_was_not_seen_nothing_is_said():

@@ -112,6 +112,17 @@ def test_a_hand_that_strays_while_it_pushes_is_led_back_to_its_way():
     assert_allclose(action[3:], [0, 0, 0.1, 1.0])
 
 
+@given(st.floats(-0.05, 0.05), st.floats(-0.05, 0.05), st.floats(-1, 1), st.floats(-1, 1))
+def test_an_action_that_leads_back_to_the_way_stays_within_bounds(y, z, along, across):
+    executor = Executor(ControlSettings(), robot())
+    memory, ways = push().key_poses[2], push_ways(push(), LAYOUT)[0]
+    start, end = hand_pose(0.3, 0.0, 0.02), hand_pose(0.1, -0.1, 0.02)
+    executor.begin([Target(end, memory, precise=True, push=ways)], Hand(start, 0.0))
+    executor.push_chunk(np.array([[along, across, 0.0, 0.0, 0.0, 0.0, 1.0]]))
+    action = executor.next_action(Hand(hand_pose(0.2, -0.05 + y, 0.02 + z), 0.0))
+    assert np.abs(action[:3]).max() <= 1 + 1e-9
+
+
 def pushing(one, eyes, ahead_m):
     """The hand during a push, so far ahead of where it entered the plate."""
     one.observe(HAND, eyes)

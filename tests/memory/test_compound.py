@@ -196,9 +196,11 @@ WIPE, SINK = "wipe the table with the sponge", "put the sponge in the sink"
 
 def test_what_the_grammar_cannot_read_is_carried_out_sentence_by_sentence():
     bank = [entry(WIPE, source="wipe"), entry(SINK, source="sink")]
-    for asked in (f"{WIPE}, and then {SINK}", f"Please {WIPE}. Then {SINK}!"):
+    for asked in (f"{WIPE}, and then {SINK}", f"Please {WIPE}. Then {SINK}!", f"{WIPE} and {SINK}"):
         chain = plan_parts(asked, bank)
         assert [[one.source.source for one in part] for part in chain] == [["wipe"], ["sink"]]
+    chain = plan_parts(f"{SINK} and {WIPE}", bank)
+    assert [[one.source.source for one in part] for part in chain] == [["sink"], ["wipe"]]
     for asked in (f"sing, then {SINK}", f"{WIPE} and then sing", f"do not {WIPE}, then {SINK}"):
         with pytest.raises(InstructionError, match="it knows"):
             plan_parts(asked, bank)

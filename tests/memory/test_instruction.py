@@ -322,6 +322,8 @@ def test_any_words_are_read_or_refused(words):
         ("put block a on block b", [SubTask("put", "block a", "", "on", "block b")]),
         ("pick up block 1 and put it on block 2.", [SubTask("put", "block 1", "", "on", "block 2")]),
         ("put 3 mugs on the plate", [SubTask("put", "mug", "", "on", "plate")] * 3),
+        ("put 10 mugs on the plate", [SubTask("put", "mug", "", "on", "plate")] * 10),
+        ("put twelve mugs on the plate", [SubTask("put", "mug", "", "on", "plate")] * 12),
         (
             "put the can in the left bin",
             [SubTask("put", "can", "", "in", "bin", landmark_where=Reference("left"))],

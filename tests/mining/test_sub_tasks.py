@@ -3,6 +3,7 @@
 from functools import partial
 
 import numpy as np
+import pytest
 from tests.memory.builders import robot
 from tests.mining.episodes import Drawer, pick_and_place
 
@@ -70,7 +71,8 @@ def test_a_task_that_the_grammar_cannot_read_is_mined_with_the_things_that_the_h
     assert touched == [("coffee", "grasp"), ("cup", "release")]
 
 
-def test_every_thing_that_such_a_task_takes_has_a_name_of_its_own():
+def twice():
+    """Takes a thing and puts it down, then another one."""
     drawer, _ = pick_and_place()
     drawer.move([-0.1, 0.1, 0.14])
     drawer.move([-0.1, 0.1, 0.02])
@@ -79,7 +81,20 @@ def test_every_thing_that_such_a_task_takes_has_a_name_of_its_own():
     drawer.move([0.1, 0.1, 0.05])
     drawer.grip(False)
     drawer.move([0.1, 0.1, 0.2])
-    (item,), _ = mined(drawer.episode(0, "set the table"))
+    return drawer
+
+
+@pytest.mark.parametrize("again", [0, 1, 2])
+def test_one_demonstration_of_several_that_grasps_twice_leaves_the_others_as_they_are(again):
+    drawers = [twice() if i == again else pick_and_place()[0] for i in range(3)]
+    items, _ = mined(*(one.episode(i, "wipe the table with the sponge") for i, one in enumerate(drawers)))
+    assert {s.target for item in items for s in item.sub_tasks} == {"sponge"}
+    (task,) = compare(items, [{"sponge": np.eye(4)}] * 3, [{}] * 3, {})
+    assert len(task_entries(task, "local/any")) == 3
+
+
+def test_every_thing_that_such_a_task_takes_has_a_name_of_its_own():
+    (item,), _ = mined(twice().episode(0, "set the table"))
     assert [s.target for s in item.sub_tasks] == ["set table object", "set table object 2"]
     assert [hint.name for hint in hints(item)] == ["set table object", "set table object 2"]
     layout = {"set table object": np.eye(4), "set table object 2": np.eye(4)}

@@ -14,7 +14,7 @@ import numpy as np
 from lerobot_openspm.errors import OpenSPMError
 from lerobot_openspm.experience import load_experience
 from lerobot_openspm.geometry import se3
-from lerobot_openspm.memory.entry import MemoryEntry, MemoryKeyPose
+from lerobot_openspm.memory.entry import MemoryEntry, MemoryKeyPose, Outcome
 
 
 @dataclass
@@ -126,7 +126,7 @@ def _task_line(language: str, qualities: list[float]) -> str:
 
 
 def table(entry: MemoryEntry) -> list[str]:
-    """An entry as lines: a head, then a row for every key pose."""
+    """An entry as lines: a head, a row for every key pose, and where what was moved should end."""
     outcomes = f", succeeded {entry.successes} of {entry.trials} times" if entry.trials else ""
     head = (
         f"{entry.language!r} from {entry.source}, version {entry.version}, quality {entry.quality:.2f}"
@@ -134,7 +134,16 @@ def table(entry: MemoryEntry) -> list[str]:
     )
     names = f"{'phase':10s} {'place':18s} {'axes':18s}"
     columns = f"  {names} {'hand in its frame, mm':>24s} {'turn, deg':>22s} gripper conf."
-    return [head, columns, *(_row(pose) for pose in entry.key_poses)]
+    rows = (_row(pose) for pose in entry.key_poses)
+    return [head, columns, *rows, *(_outcome_row(outcome) for outcome in entry.outcomes)]
+
+
+def _outcome_row(outcome: Outcome) -> str:
+    mm = " ".join(f"{1000 * x:.1f}" for x in outcome.position)
+    return (
+        f"  done when the {outcome.target} is within {1000 * outcome.tolerance_m:.1f} mm of {mm} mm from the "
+        f"{outcome.anchor.place} (axes of the {outcome.anchor.axes})"
+    )
 
 
 def _row(pose: MemoryKeyPose) -> str:

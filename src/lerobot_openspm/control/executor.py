@@ -221,8 +221,8 @@ class Executor:
         left = target - here
         across = left - (left @ way) * way
         back = CORRECTION_SHARE * across / self._robot.metres_per_action
-        motion = (action[:3] @ way) * way + back / max(1.0, float(np.abs(back).max()))
-        return np.concatenate([motion, action[3:]])
+        motion = (action[:3] @ way) * way + back
+        return np.concatenate([motion / max(1.0, float(np.abs(motion).max())), action[3:]])
 
     def _gains(self) -> Array:
         """How far the hand moves per unit of each of the six numbers of an action."""
@@ -318,7 +318,7 @@ class Executor:
         return {self.plan[i].memory.sub_task for i in ends if self.feels_handle(i)}
 
     def feels_handle(self, index: int) -> bool:
-        """Whether the fingers stand open around what was grasped before a key pose: a loss is felt."""
+        """Whether the fingers hold something before a key pose, so that a loss would show in the opening."""
         held = self._robot.open_width * HOLDING_SHARE
         return index > 0 and self.plan[index - 1].memory.opening >= held
 

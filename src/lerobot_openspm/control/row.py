@@ -100,6 +100,8 @@ class Row:
         self._referents = Referents()
         self._altered: set[str] = set()  # opened or turned: looks different now, and stands still
         self._gone: dict[int, float] = {}  # how far drawers and knobs are on their way, by sub-task
+        self._followed: set[int] = set()  # sub-tasks whose drawer or knob went all the way
+        self._repeated: int | None = None  # the sub-task that is done again, if one is
         self._start_height = np.inf
         self._step = -1
         # Both at least one step; four looks a second whatever the robot's rate.
@@ -223,14 +225,16 @@ class Row:
         """Take in which of several like objects this part is about."""
         meant = self._knowledge.object_meant
         said = {k: where for one in self._parts[self._part] for k, where in references(one, meant).items()}
-        self.tracker.forget(self._referents.hear(said))
+        others = self._referents.hear(said)
+        self.tracker.forget(others)
+        self.layout = {name: T for name, T in self.layout.items() if name not in others}
 
     def _check_outcomes(self, hand: Hand, look: Look) -> None:
         """Look whether what was to be done is done: go on if so, else go back to what can mend it."""
         if self._looks_left < LOOKS_AT_OUTCOME and self._waited_steps < self._second_look_steps:
             return
         missed = self._missed(hand, look) if self._is_tracking else ()
-        if self.status is Status.CAMERA_FAULT or (missed is None and self._looks_left > 0):
+        if missed is None and self._looks_left > 0:
             return
         self._looks_left = 0
         if missed:
@@ -241,6 +245,7 @@ class Row:
     def _missed(self, hand: Hand, look: Look) -> tuple[Outcome, ...] | None:
         """Look at what was moved: the outcomes that are not met, in order; None where that is not seen."""
         expected = self.ranked[0].entry.outcomes
+        self._followed |= self.executor.followed_sub_tasks()
         names = dict.fromkeys(name for one in expected for name in one.objects)
         if not names:
             self._verdict = self._is_all_known(()) or None
@@ -248,9 +253,9 @@ class Row:
         self._looks_left -= 1
         self._see([name for name in names if name not in self._altered], hand, look)
         poses = self.tracker.poses(hand.T_world_ee)
-        seen = [
-            one for one in expected if self.tracker.is_seen(one.target) and poses.keys() >= set(one.objects)
-        ]
+        looked_for = list(self.seen.estimates) if self.seen else []
+        recognised = {name for name in looked_for if self.tracker.is_seen(name)}
+        seen = [one for one in expected if one.target in recognised and poses.keys() >= set(one.objects)]
         missed = tuple(one for one in seen if not self._is_met(one, poses))
         if len(seen) < len(expected) and not missed:
             return None
@@ -259,7 +264,7 @@ class Row:
 
     def _is_all_known(self, met: Sequence[Outcome]) -> bool:
         """Whether met outcomes, and handles that went all the way, tell that every sub-task is done."""
-        done = {one.sub_task for one in met} | self.executor.followed_sub_tasks()
+        done = {one.sub_task for one in met} | self._followed
         return done >= set(range(len(self.ranked[0].entry.key.sub_tasks)))
 
     def _is_met(self, outcome: Outcome, poses: Mapping[str, Array]) -> bool:
@@ -271,10 +276,14 @@ class Row:
         return any(outcome.is_met({**poses, axes: T}) for T in turned)
 
     def _go_back(self, missed: Outcome, hand: Hand) -> None:
-        """Do a sub-task again, from where its target is now, if an attempt is left."""
+        """Do one sub-task again, from where its target is now, if an attempt is left.
+
+        Those after it are not done again: a drawer that was opened is not where it was grasped.
+        """
         if not self.executor.try_again(f"the {missed.target} is not where it should be"):
             return
         self._looks_left, self._verdict = LOOKS_AT_OUTCOME, None
+        self._repeated = missed.sub_task
         poses = self.ranked[0].entry.key_poses
         index = next(i for i, pose in enumerate(poses) if pose.sub_task == missed.sub_task)
         self._update(self._anchors(index), hand)
@@ -289,6 +298,8 @@ class Row:
         self._parts_known &= self._verdict is True
         self._looks_left, self._verdict = LOOKS_AT_OUTCOME, None
         self._gone.clear()
+        self._followed.clear()
+        self._repeated = None
         self._plan(hand, look)
 
     def _try_again(self, hand: Hand, look: Look) -> None:
@@ -356,7 +367,7 @@ class Row:
         self.seen = look(names, expected, self._step * self._knowledge.step_s)
         self._looked_at_step = self._step
         for camera, fault in self.faults.items():
-            if fault.seconds >= GIVE_UP_S:
+            if fault.seconds >= GIVE_UP_S and self.status is not Status.DONE:
                 logger.warning("%r: stopping, camera %r: %s", self.instruction, camera, fault.reason)
                 self.executor.stop(Status.CAMERA_FAULT)
         layout = {**self._knowledge.surfaces, **self.tracker.poses(hand.T_world_ee)}
@@ -406,7 +417,7 @@ class Row:
         for i in range(index_before, self.executor.index):
             passed, after = self.executor.plan[i].memory, self.executor.plan[i + 1].memory
             is_carried = passed.phase == "grasp" and after.phase not in ("open", "turn")
-            # What is pushed a known way moves only once the hand has met it.
+            # Where the way of a push is known, the target moves from where the hand meets it; see below.
             is_pushed = after.phase == "push" != passed.phase and self.executor.plan[i + 1].push is None
             if is_carried or is_pushed:
                 self.tracker.hold(passed.anchor.place, hand.T_world_ee)
@@ -488,6 +499,8 @@ class Row:
 
     def _transfer(self, entry: MemoryEntry, T_world_ee: Array) -> tuple[Target, ...]:
         targets = self._knowledge.transfer(entry, self.layout, T_world_ee, self._gone)
+        if self._repeated is not None:
+            targets = tuple(one for one in targets if one.memory.sub_task <= self._repeated)
         return targets if self._is_last_part else (*targets, *rise(targets[-1], self._start_height))
 
 

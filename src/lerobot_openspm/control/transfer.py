@@ -9,11 +9,8 @@ import numpy as np
 
 from lerobot_openspm.geometry import se3
 from lerobot_openspm.geometry.se3 import Array
-from lerobot_openspm.memory.entry import Axis, MemoryEntry, MemoryKeyPose
+from lerobot_openspm.memory.entry import CONTACT_PHASES, Axis, MemoryEntry, MemoryKeyPose
 from lerobot_openspm.memory.robot import RobotModel
-
-# Phases in which the hand touches something: their key poses are met precisely, the others in passing.
-PRECISE_PHASES = ("grasp", "place", "release", "push", "open", "turn")
 
 # Phases in which an object follows the hand along a constraint.
 CONSTRAINED_PHASES = ("push", "open", "turn")
@@ -137,7 +134,7 @@ def transfer(
             before = se3.transform(before[:3, :3], ways.position(pose, entry.layout))
         after = entry.key_poses[i + 1] if i + 1 < len(entry.key_poses) else None
         # The arrival before the fingers move is where a grasp or a release is decided.
-        precise = pose.phase in PRECISE_PHASES or (
+        precise = pose.phase in CONTACT_PHASES or (
             after is not None and (after.dwell or after.phase == "push")
         )
         axis = pose.axis
@@ -177,7 +174,7 @@ def _length(way: Array) -> float:
 def push_ways(entry: MemoryEntry, layout: Mapping[str, Array]) -> dict[int, PushWays]:
     """The ways of an entry's pushes by sub-task, of those whose outcome is known.
 
-    What is grasped as well is placed by its grasp, not by its way.
+    A sub-task that also grasps its target is no push: the target goes where the hand carries it.
     """
     pushing, grasping = (
         {pose.sub_task for pose in entry.key_poses if pose.phase == phase} for phase in ("push", "grasp")
@@ -222,7 +219,7 @@ def _retreat(targets: Sequence[Target]) -> tuple[Target, ...]:
         if i > 0
         and (target.memory.phase == "place" or (target.memory.phase == "approach" and target.precise))
     ]
-    contacts = [target for target in targets if target.memory.phase in PRECISE_PHASES]
+    contacts = [target for target in targets if target.memory.phase in CONTACT_PHASES]
     if not arrivals or not contacts:
         return ()
     last, contact = targets[-1], contacts[-1]

@@ -1,8 +1,6 @@
-"""Calibration of the tabletop's cameras, read from the MuJoCo model and written as a camera file."""
+"""Calibration of the tabletop's cameras, read from the MuJoCo model."""
 
-import json
 import math
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -52,12 +50,6 @@ def calibration_document(height: int = 256, width: int = 256) -> dict[str, Any]:
     """All cameras in the camera file's format, keyed by LeRobot's observation names."""
     cameras = {f"observation.images.{name}": camera_calibration(name, height, width) for name in CAMERA_NAMES}
     return {"format": "openspm-cameras", "version": 1, "cameras": cameras}
-
-
-def write_calibration(path: Path, height: int = 256, width: int = 256) -> None:
-    """Write the camera file to `path`."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(json.dumps(calibration_document(height, width), indent=2) + "\n", encoding="utf-8")
 
 
 def _matrix(quat_wxyz: np.ndarray) -> np.ndarray:

@@ -33,6 +33,7 @@ _PREPOSITIONS = {
 _VERBS = {"pick": "pick up"}
 # What one thing after another is said with: "wipe the table, and then open the drawer".
 _NEXT = re.compile(r"(?:\band )?\bthen\b|[;.!?\n]+", re.IGNORECASE)
+_AND = re.compile(r"\band\b", re.IGNORECASE)
 
 
 @dataclass(frozen=True)
@@ -153,14 +154,14 @@ def plan_parts(
 def _plan_by_words(
     instruction: str, asked: tuple[SubTask, ...], entries: Sequence[MemoryEntry], names: NameSimilarity
 ) -> tuple[tuple[Candidate, ...], ...]:
-    """Likewise of an instruction that the grammar cannot read: as a whole, else sentence by sentence."""
+    """Likewise where the grammar cannot read: as a whole, else each of what "then" or "and" joins."""
     close = near(asked, entries, partial(semantic_score, names=names))
     try:
         return (_about(asked, instruction, [Candidate(entry, 0.0, entry) for entry in close], names),)
     except InstructionError as error:
-        sentences = [one for one in _NEXT.split(instruction) if normal_words(one)]
+        splits = ([one for one in joint.split(instruction) if normal_words(one)] for joint in (_NEXT, _AND))
         with suppress(InstructionError):
-            if len(sentences) > 1:
+            if sentences := next((pieces for pieces in splits if len(pieces) > 1), None):
                 return tuple(part for one in sentences for part in plan_parts(one, entries, names))
         why = why_unread(instruction, entries)
         raise InstructionError(f"{why}; and {error}" if why else str(error)) from error

@@ -14,6 +14,8 @@ from lerobot_openspm.geometry.se3 import Array
 PHASES = (
     "approach", "grasp", "lift", "pre-place", "place", "release", "retreat", "push", "open", "turn",
 )  # fmt: skip
+# Phases in which the hand touches something: their key poses are met precisely, the others in passing.
+CONTACT_PHASES = ("grasp", "place", "release", "push", "open", "turn")
 
 
 @dataclass(frozen=True)

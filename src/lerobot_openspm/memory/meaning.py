@@ -47,7 +47,7 @@ def same_meaning(one: Sequence[SubTask], other: Sequence[SubTask]) -> bool:
 def means_the_same(one: Sequence[SubTask], other: Sequence[SubTask]) -> bool:
     """Whether two keys are about things of the same names, one perhaps not saying which of several is meant.
 
-    Unlike :func:`same_meaning` it knows no other names of a thing: what is held under two names is two.
+    Unlike :func:`same_meaning` it takes two names for two things, even if they can mean the same.
     """
     if not one or not other or len(one) != len(other) or one[0].words or other[0].words:
         return bool(one and other) and one[0].words == other[0].words != ""

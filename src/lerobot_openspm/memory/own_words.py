@@ -35,6 +35,8 @@ _ROLES: dict[tuple[str, ...], str] = {
     **{(word,): word for word in ("off", "out", "up", "down", "away", "back", "open", "apart", "together")},
 }  # fmt: skip
 _LONGEST = max(map(len, _ROLES))
+# Verbs whose last letter doubles before "-ing": "tapping" is of "tap", so "taping" is not.
+_DOUBLES = re.compile("[^aeiou]*[aeiou][^aeiouwxy]")
 # Where a thing ends that is put, poured or laid there.
 _GOALS = {"on": "on", "in": "in", "under": "under", "over": "on", "at": "at", "between": "between"}
 _ARTICLES = v.word_set("the an some my your our its this that these those 's , ;")
@@ -120,7 +122,7 @@ def words_similarity(asked: str, known: str, names: NameSimilarity) -> float:
 
 
 def _clause_score(asked: _Clause, known: _Clause, names: NameSimilarity) -> float:
-    is_same_verb = _stem(asked.verb) == _stem(known.verb)
+    is_same_verb = bool(_base_forms(asked.verb) & _base_forms(known.verb))
     score = 1.0 if is_same_verb else names.similarity(asked.verb, known.verb)
     left = list(asked.phrases)
     unsaid = 0
@@ -144,15 +146,17 @@ def _same(asked: str, known: str, names: NameSimilarity) -> float:
     return names.similarity(asked, known)
 
 
-def _stem(verb: str) -> str:
-    """A verb without its ending: "wiping", "wipes" and "wipe" are one."""
-    stems: list[str] = []
-    for word in verb.split():
-        word = v.singular(word)
-        word = word[:-3] if word.endswith("ing") and len(word) > 5 else word
-        word = word.removesuffix("e")
-        stems.append(word[:-1] if len(word) > 3 and word[-1] == word[-2] else word)
-    return " ".join(stems)
+def _base_forms(verb: str) -> set[str]:
+    """What a verb may be a form of: "wiping" and "wipes" of "wipe"; "tap" and "tape" only of themselves."""
+    forms = {verb, v.singular(verb)}
+    if verb.endswith("ing") and len(verb) > 5:
+        stem = verb[:-3]
+        forms.add(f"{stem}e")
+        if stem[-1] == stem[-2]:
+            forms |= {stem, stem[:-1]}
+        elif not _DOUBLES.fullmatch(stem):
+            forms.add(stem)
+    return forms
 
 
 @lru_cache(maxsize=4096)

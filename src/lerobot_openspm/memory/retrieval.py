@@ -47,9 +47,9 @@ def read_instruction(
 ) -> tuple[SubTask, ...]:
     """What an instruction asks for, read by someone who knows the memory.
 
-    It is read by the grammar, with the names of the memory's things. Where just that is not known, the words
-    of a demonstration mean what it showed, and other words are compared with those of demonstrations that the
-    grammar cannot read either.
+    It is read by the grammar, with the names of the memory's things. If no entry is about exactly that, an
+    instruction in the words of a demonstration means what that showed, and any other is also compared by its
+    words with the demonstrations that the grammar cannot read.
 
     Args:
         instruction: What is asked.

@@ -147,8 +147,6 @@ REFERENCES = tuple(
 PART_OF = {"drawer": "cabinet", "burner": "stove", "knob": "stove", "compartment": "caddy"}
 # Things in whose left, right, front or back there is a part: "in the front of the caddy".
 PART_BY_PLACE = {"caddy": "compartment"}
-# Things with parts in them: "the shelf inside the cabinet".
-WITH_PARTS = ("cabinet", "caddy", "stove")
 # Parts that are named together with their thing alone; "the shelf" by itself may be a thing.
 NAMED_PARTS = ("shelf", "door")
 PART_SYNONYMS = {
@@ -245,7 +243,6 @@ CONTAINERS = word_set(
     "can tin bottle box carton jar package packet pack tub stick block container bag brick jug tube "
     "cup slab bar"
 )
-NAMED_WITH_CONTAINER = ("wine bottle", "cream cheese box", "cookie box")
 # Things that hold what is put on them: "on the bowl" and "in the bowl" are one.
 HOLLOW = word_set("bowl basket tray mug drawer compartment microwave caddy")
 SURFACES = word_set("table desk counter floor")
@@ -260,10 +257,11 @@ DESCRIPTIONS = word_set(
 COLOURS = word_set("black white red yellow green blue brown grey gray orange purple pink golden silver beige")
 DETERMINERS = word_set("the a an some this that these those my your our its")
 FILLERS = word_set("stacked also furthest farthest far other same entire whole single little said very")
+_COUNTS = ("two", "three", "four", "five", "six", "seven", "eight", "nine", "ten", "eleven", "twelve")
 NUMBERS = {
     "both": 2, "pair of": 2, "couple of": 2,
-    **{word: i for i, word in enumerate(("two", "three", "four", "five", "six"), start=2)},
-    **{str(i): i for i in range(2, 10)},
+    **{word: i for i, word in enumerate(_COUNTS, start=2)},
+    **{str(i): i for i in range(2, 100)},
 }  # fmt: skip
 PRONOUNS = {
     **dict.fromkeys(("it", "this", "that", "itself"), "it"),

@@ -1,1 +1,1 @@
-"""From demonstrations to what is remembered and learned from them; `processor` is the front door."""
+"""From demonstrations to what is remembered and learned from them; begin with `processor`."""

@@ -11,7 +11,7 @@ import numpy as np
 from lerobot_openspm.geometry import se3
 from lerobot_openspm.geometry.se3 import Array
 from lerobot_openspm.memory.compound import sub_task_index
-from lerobot_openspm.memory.entry import WORLD, Anchor, SubTask
+from lerobot_openspm.memory.entry import CONTACT_PHASES, WORLD, Anchor, SubTask
 from lerobot_openspm.mining.key_poses import KeyPose
 
 # An anchor other than the one the instruction suggests must explain the demonstrations better by this much,
@@ -23,7 +23,6 @@ AXES_PRIOR_M = 0.03
 QUALITY_SCALE_M = 0.02
 
 Role = tuple[int, str, int]
-CONTACT_PHASES = ("grasp", "place", "release", "push", "open", "turn")
 
 
 @dataclass(frozen=True)
@@ -58,16 +57,20 @@ def sub_task_of(pose: KeyPose, sub_tasks: Sequence[SubTask]) -> SubTask:
     return sub_tasks[sub_task_index(pose.contact, pose.phase, len(sub_tasks))]
 
 
-def as_shown(sub_tasks: Sequence[SubTask], key_poses: Sequence[KeyPose]) -> tuple[SubTask, ...]:
+def things_taken(key_poses: Sequence[KeyPose]) -> int:
+    """How many things the hand took and let go, at least 1."""
+    return 1 + max((sub_task_index(p.contact, p.phase, len(key_poses)) for p in key_poses), default=0)
+
+
+def as_shown(sub_tasks: Sequence[SubTask], count: int) -> tuple[SubTask, ...]:
     """Sub-tasks with as many things as the hand took, where the instruction is only kept by its words.
 
-    "Set the table" does not say what is moved; the demonstration shows how many things are. Each gets a name
+    "Set the table" does not say what is moved; the demonstrations show how many things are. Each gets a name
     of its own, so that perception learns it from where the hand touched it.
     """
     told = sub_tasks[0]
     if not told.words:
         return tuple(sub_tasks)
-    count = 1 + max((sub_task_index(p.contact, p.phase, len(key_poses)) for p in key_poses), default=0)
     names = [told.target, *(f"{told.target} {i}" for i in range(2, count + 1))]
     return tuple(replace(told, target=name) for name in names)
 

@@ -8,8 +8,15 @@ from collections.abc import Mapping
 from lerobot_openspm.errors import DatasetError
 from lerobot_openspm.geometry import se3
 from lerobot_openspm.memory.compound import sub_task_index
-from lerobot_openspm.memory.entry import Anchor, Axis, MemoryEntry, MemoryKeyPose, RetrievalKey
-from lerobot_openspm.mining.anchors import CONTACT_PHASES, Demonstration, Role, roles
+from lerobot_openspm.memory.entry import (
+    CONTACT_PHASES,
+    Anchor,
+    Axis,
+    MemoryEntry,
+    MemoryKeyPose,
+    RetrievalKey,
+)
+from lerobot_openspm.mining.anchors import Demonstration, Role, roles
 from lerobot_openspm.mining.mined import MinedDataset, MinedTask
 
 logger = logging.getLogger(__name__)

@@ -1,4 +1,4 @@
-"""The front door of mining: a LeRobotDataset goes in, a MinedDataset comes out.
+"""Mining as a whole: a LeRobotDataset goes in, a MinedDataset comes out.
 
     mined = DatasetProcessor(dataset, options).mine()
 
@@ -8,10 +8,12 @@ Memory entries (`mining/entries.py`) and flow samples (`flow/samples.py`) are bo
 from __future__ import annotations
 
 import logging
+from collections import defaultdict
 from collections.abc import Callable, Collection, Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, field
 from functools import cached_property, partial
+from statistics import median_low
 
 import numpy as np
 from lerobot.datasets import LeRobotDataset, LeRobotDatasetMetadata
@@ -21,7 +23,7 @@ from lerobot_openspm.geometry.camera import Camera, check_sizes
 from lerobot_openspm.geometry.layout import VectorLayout
 from lerobot_openspm.memory.instruction import read_tasks
 from lerobot_openspm.memory.robot import RobotModel
-from lerobot_openspm.mining.anchors import as_shown
+from lerobot_openspm.mining.anchors import as_shown, things_taken
 from lerobot_openspm.mining.dataset import Demonstrations, open_dataset
 from lerobot_openspm.mining.key_poses import KeyPose, find_key_poses
 from lerobot_openspm.mining.mined import MinedDataset, MinedEpisode, MinedKeyPoses
@@ -50,6 +52,7 @@ class MiningOptions:
         calibration: Names the calibration in errors.
         episodes: Episodes that may be remembered and learned from; all if not given.
         known_objects: Objects by name that are recognised instead of learned.
+        known_names: Names of the things that a memory is about, by which instructions are read.
         known_robot: The same robot as seen before; tells which gripper command closes where these episodes
             do not.
         judge: Says, beside motion and gripper, which phase ends at a key pose.
@@ -65,6 +68,7 @@ class MiningOptions:
     calibration: str = "the calibration"
     episodes: Sequence[int] | None = None
     known_objects: Mapping[str, KnownObject] = field(default_factory=dict[str, KnownObject])
+    known_names: Collection[str] = frozenset()
     known_robot: RobotModel | None = None
     judge: PhaseJudgement | None = None
     segmenter: Segmenter | None = None
@@ -153,7 +157,7 @@ class DatasetProcessor:
             find = demonstrations.key_poses
         else:
             find = partial(find_key_poses, robot=robot)
-        names = set(self._options.known_objects)
+        names = set(self._options.known_names)
         mined, skipped = mine_episodes(allowed, find, names)
         if not mined:
             raise DatasetError(
@@ -202,14 +206,18 @@ def mine_episodes(
     Returns:
         The episodes with key poses, and the reason by index of the others.
     """
-    mined, skipped = list[MinedEpisode](), dict[int, str]()
+    found, skipped = list[tuple[Episode, Sequence[KeyPose]]](), dict[int, str]()
     tasks = read_tasks((episode.task for episode in episodes), names)
     for episode in episodes:
         if episode.task not in tasks:
             skipped[episode.index] = f"its task {episode.task!r} says nothing"
         elif key_poses := find(episode):
-            sub_tasks = as_shown(tasks[episode.task], key_poses)
-            mined.append(MinedEpisode(episode, tuple(key_poses), sub_tasks))
+            found.append((episode, key_poses))
         else:
             skipped[episode.index] = "nothing is grasped or pushed in it"
-    return tuple(mined), skipped
+    taken: dict[str, list[int]] = defaultdict(list)
+    for episode, key_poses in found:
+        taken[episode.task].append(things_taken(key_poses))
+    # What most demonstrations of a task show: one may have grasped again what had slipped.
+    shown = {task: as_shown(tasks[task], median_low(counts)) for task, counts in taken.items()}
+    return tuple(MinedEpisode(one, tuple(poses), shown[one.task]) for one, poses in found), skipped
