@@ -69,6 +69,16 @@ def test_a_later_piece_depends_on_what_was_written_before(model: Qwen3VL):
     assert second.text in {"no ": ("never", "none"), "yes ": ("always", "all")}[first.text]
 
 
+def test_nothing_is_computed_after_the_end_of_the_grammar(model: Qwen3VL, monkeypatch: pytest.MonkeyPatch):
+    """Although the tiny model's settings, unlike the real one's, name no token that ends an answer."""
+    generate, outputs = model._model.generate, []
+    monkeypatch.setattr(model._model, "generate", lambda **o: outputs.append(generate(**o)) or outputs[-1])
+    model.write(Prompt("Say it."), one_of("ab"))
+    prompt = model._inputs(Prompt("Say it."))["input_ids"]
+    spelled = model._processor.tokenizer.decode(outputs[0][0, prompt.shape[1] :])
+    assert spelled == "ab<|im_end|>"
+
+
 def test_a_grammar_without_end_is_an_error(model: Qwen3VL, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(qwen3vl, "MAX_NEW_TOKENS", 12)
     with pytest.raises(JudgementError, match="wrote 12 tokens and came to no end"):

@@ -69,6 +69,8 @@ class Qwen3VL:
                 output = self._model.generate(
                     **inputs,
                     max_new_tokens=MAX_NEW_TOKENS,
+                    # The speller ends with this one, also where the model's own settings name none.
+                    eos_token_id=self._processor.tokenizer.eos_token_id,
                     do_sample=False,
                     # Some releases of the family ask for one, and would vary what they repeat.
                     repetition_penalty=1.0,
