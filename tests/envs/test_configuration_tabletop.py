@@ -1,15 +1,21 @@
 import subprocess
 import sys
+from collections.abc import Iterator
 
+import gymnasium as gym
 import numpy as np
 import pytest
 from lerobot.envs.utils import NEW_ROLLOUT_OPTION, env_to_policy_features, preprocess_observation
 
 from lerobot_openspm.envs.configuration_tabletop import TabletopEnvConfig
+from lerobot_openspm.envs.scene import CAMERA_NAMES
 from lerobot_openspm.envs.tasks import TASK_NAMES
 
 NEW_ROLLOUT = {NEW_ROLLOUT_OPTION: True}
 SMALL = {"observation_height": 128, "observation_width": 128}
+RICH = TabletopEnvConfig(
+    "turn_on_stove", episode_length=3, object_poses=True, masks=True, depth=True, **SMALL
+)
 
 
 def test_importing_the_config_does_not_import_mujoco():
@@ -38,26 +44,41 @@ def test_unknown_tasks_are_refused_with_the_valid_ones(task):
         TabletopEnvConfig(task=task)
 
 
-@pytest.mark.parametrize("use_async_envs", [False, True])
-def test_vector_envs_freeze_finished_rows(use_async_envs):
-    config = TabletopEnvConfig(task="turn_on_stove", episode_length=3, object_poses=True, **SMALL)
-    env = config.create_envs(2, use_async_envs)["openspm_tabletop"][9]
-    try:
-        observation, info = env.reset(seed=[0, 1], options=NEW_ROLLOUT)
-        assert not np.any(info["is_success"])
-        assert preprocess_observation(observation)["observation.object_poses"].shape == (2, 49)
-        assert list(env.call("task_description")) == ["turn on the stove"] * 2
-        assert env.call("_max_episode_steps")[0] == 3
-        assert env.unwrapped.metadata["render_fps"] == 20
-        for _ in range(5):
-            previous = observation
-            observation, _, _, _, _ = env.step(np.ones((2, 7), np.float32))
-        np.testing.assert_array_equal(observation["agent_pos"], previous["agent_pos"])
-        again, _ = env.reset(seed=[1, 0], options=NEW_ROLLOUT)
-        assert not np.array_equal(again["object_poses"][0], observation["object_poses"][0])
-        assert env.call("render")[0].shape == (256, 256, 3)
-    finally:
-        env.close()
+# Each of its processes imports LeRobot first, so the tests below share them.
+@pytest.fixture(scope="module", params=[False, True], ids=["in this process", "in processes of their own"])
+def vector_env(request: pytest.FixtureRequest) -> Iterator[gym.vector.VectorEnv]:
+    """Two rows of a short episode, with everything that can be observed."""
+    env = RICH.create_envs(2, use_async_envs=request.param)["openspm_tabletop"][9]
+    yield env
+    env.close()
+
+
+def test_masks_and_depth_travel_to_the_policys_batch(vector_env: gym.vector.VectorEnv):
+    raw, _ = vector_env.reset(seed=[0, 1], options=NEW_ROLLOUT)
+    batch = preprocess_observation(raw)
+    features = env_to_policy_features(RICH)
+    for name in CAMERA_NAMES:
+        for key in (f"observation.masks.{name}", f"observation.depth.{name}"):
+            assert batch[key].shape == (2, 1, 128, 128)
+            assert features[key].shape == (1, 128, 128)
+        np.testing.assert_array_equal(batch[f"observation.masks.{name}"], raw[f"masks.{name}"])
+        np.testing.assert_array_equal(batch[f"observation.depth.{name}"], raw[f"depth.{name}"])
+
+
+def test_vector_envs_freeze_finished_rows(vector_env: gym.vector.VectorEnv):
+    observation, info = vector_env.reset(seed=[0, 1], options=NEW_ROLLOUT)
+    assert not np.any(info["is_success"])
+    assert preprocess_observation(observation)["observation.object_poses"].shape == (2, 49)
+    assert list(vector_env.call("task_description")) == ["turn on the stove"] * 2
+    assert vector_env.call("_max_episode_steps")[0] == 3
+    assert vector_env.unwrapped.metadata["render_fps"] == 20
+    for _ in range(5):
+        previous = observation
+        observation, _, _, _, _ = vector_env.step(np.ones((2, 7), np.float32))
+    np.testing.assert_array_equal(observation["agent_pos"], previous["agent_pos"])
+    again, _ = vector_env.reset(seed=[1, 0], options=NEW_ROLLOUT)
+    assert not np.array_equal(again["object_poses"][0], observation["object_poses"][0])
+    assert vector_env.call("render")[0].shape == (256, 256, 3)
 
 
 def test_missing_egl_is_one_clear_error(monkeypatch):

@@ -2,11 +2,9 @@
 
 import numpy as np
 import pytest
-from lerobot.envs.utils import env_to_policy_features, preprocess_observation
 
 from lerobot_openspm.envs import scene
 from lerobot_openspm.envs.calibration import calibration_document
-from lerobot_openspm.envs.configuration_tabletop import TabletopEnvConfig
 from lerobot_openspm.geometry import se3
 from lerobot_openspm.geometry.camera import cameras_from_dict, project, ray_directions
 
@@ -110,23 +108,3 @@ def test_colours_are_the_same_with_and_without(env, make_env):
     assert set(without) == {"pixels", "agent_pos"}
     for name in scene.CAMERA_NAMES:
         np.testing.assert_array_equal(with_both["pixels"][name], without["pixels"][name])
-
-
-@pytest.mark.parametrize("use_async_envs", [False, True])
-def test_they_travel_to_the_policys_batch(use_async_envs):
-    config = TabletopEnvConfig(
-        "turn_on_stove", masks=True, depth=True, observation_height=SIZE, observation_width=SIZE
-    )
-    env = config.create_envs(2, use_async_envs)["openspm_tabletop"][9]
-    try:
-        raw, _ = env.reset(seed=[0, 1])
-        batch = preprocess_observation(raw)
-    finally:
-        env.close()
-    features = env_to_policy_features(config)
-    for name in scene.CAMERA_NAMES:
-        for key in (f"observation.masks.{name}", f"observation.depth.{name}"):
-            assert batch[key].shape == (2, 1, SIZE, SIZE)
-            assert features[key].shape == (1, SIZE, SIZE)
-        np.testing.assert_array_equal(batch[f"observation.masks.{name}"], raw[f"masks.{name}"])
-        np.testing.assert_array_equal(batch[f"observation.depth.{name}"], raw[f"depth.{name}"])
