@@ -1,10 +1,12 @@
 """Whatever keeps weights from being loaded is one error that says what to do."""
 
 import json
+import shutil
 import socket
 import subprocess
 import sys
 import time
+from dataclasses import dataclass
 from http import HTTPStatus
 from pathlib import Path
 
@@ -73,35 +75,54 @@ def publish(hub: LoopbackHub, name: str, folder: Path) -> None:
     hub.repos["models", name].commit({path.name: path.read_bytes() for path in folder.iterdir()}, "weights")
 
 
-def test_weights_come_from_the_hub_or_say_why_not(loopback_hub: LoopbackHub, saved: Path, tmp_path: Path):
-    publish(loopback_hub, "tester/sam3", saved)
-    for name in ("tester/asked", "tester/denied", "tester/bare"):
-        publish(loopback_hub, name, saved)
-    loopback_hub.gated = {"tester/asked": HTTPStatus.UNAUTHORIZED, "tester/denied": HTTPStatus.FORBIDDEN}
-    tree = loopback_hub.files("tester/bare")
-    tree["pytorch_model.bin"] = tree.pop("model.safetensors")
-    env = loopback_hub.env(tmp_path)
-    told = load(env, "tester/sam3", "tester/asked", "tester/denied", "tester/nowhere", "tester/bare")
-    assert told["tester/sam3"][0] == "loaded"
-    for name in loopback_hub.gated:
+@dataclass(frozen=True)
+class Visit:
+    """What one process was told by the Hub about several names, and the cache that it left."""
+
+    told: dict[str, list]
+    gated: dict[str, HTTPStatus]
+    requests: list[str]
+    home: Path
+
+
+@pytest.fixture(scope="module")
+def visit(saved: Path, tmp_path_factory: pytest.TempPathFactory) -> Visit:
+    """Each process imports transformers first, so one asks for everything. Nobody may change its cache."""
+    home = tmp_path_factory.mktemp("home")
+    with LoopbackHub().running() as hub:
+        for name in ("tester/sam3", "tester/half", "tester/asked", "tester/denied", "tester/bare"):
+            publish(hub, name, saved)
+        hub.gated = {"tester/asked": HTTPStatus.UNAUTHORIZED, "tester/denied": HTTPStatus.FORBIDDEN}
+        tree = hub.files("tester/bare")
+        tree["pytorch_model.bin"] = tree.pop("model.safetensors")
+        told = load(hub.env(home), *(name for _, name in hub.repos), "tester/nowhere")
+    return Visit(told, hub.gated, hub.requests, home)
+
+
+@pytest.fixture
+def home(visit: Visit, tmp_path: Path) -> Path:
+    """A copy of the cache that was left, to change and to use."""
+    return Path(shutil.copytree(visit.home, tmp_path / "home", symlinks=True))
+
+
+def test_weights_come_from_the_hub_or_say_why_not(visit: Visit):
+    told = visit.told
+    assert told["tester/sam3"][0] == told["tester/half"][0] == "loaded"
+    for name in visit.gated:
         assert f"access at https://huggingface.co/{name}, then" in told[name][0]
         assert told[name][0].endswith("hf auth login")
         assert "GatedRepoError" in told[name][1]
     assert "no model 'tester/nowhere' on the Hugging Face Hub that you may see" in told["tester/nowhere"][0]
     assert "RepositoryNotFoundError" in told["tester/nowhere"][1]
     assert "'tester/bare' is no checkpoint of Sam3Model" in told["tester/bare"][0]
-    assert not [request for request in loopback_hub.requests if request.endswith("pytorch_model.bin")]
+    assert not [request for request in visit.requests if request.endswith("pytorch_model.bin")]
 
 
-def test_offline_what_is_in_the_cache_is_loaded(loopback_hub: LoopbackHub, saved: Path, tmp_path: Path):
-    names = ("tester/whole", "tester/half")
-    for name in names:
-        publish(loopback_hub, name, saved)
-    load(loopback_hub.env(tmp_path), *names)
-    for path in tmp_path.glob("hub/models--tester--half/snapshots/*/model.safetensors"):
-        path.unlink()
-    told = load(loopback_hub.env(tmp_path, offline=True), *names, "tester/none")
-    assert told["tester/whole"][0] == "loaded"
+def test_offline_what_is_in_the_cache_is_loaded(loopback_hub: LoopbackHub, home: Path):
+    (half,) = home.glob("hub/models--tester--half/snapshots/*/model.safetensors")
+    half.unlink()
+    told = load(loopback_hub.env(home, offline=True), "tester/sam3", "tester/half", "tester/none")
+    assert told["tester/sam3"][0] == "loaded"
     for name in ("tester/half", "tester/none"):
         message, causes, _ = told[name]
         assert message.startswith(f"{name!r} is not or not wholly in the cache, and HF_HUB_OFFLINE forbids")
@@ -109,14 +130,12 @@ def test_offline_what_is_in_the_cache_is_loaded(loopback_hub: LoopbackHub, saved
         assert "OfflineModeIsEnabled" in causes
 
 
-def test_no_network_ends_within_seconds(loopback_hub: LoopbackHub, saved: Path, tmp_path: Path):
-    publish(loopback_hub, "tester/sam3", saved)
-    load(loopback_hub.env(tmp_path), "tester/sam3")
+def test_no_network_ends_within_seconds(loopback_hub: LoopbackHub, home: Path):
     with socket.socket() as closed:
         closed.bind(("127.0.0.1", 0))
         # Bound but not listening: every connection is refused.
         port = closed.getsockname()[1]
-        env = loopback_hub.env(tmp_path) | {"HF_ENDPOINT": f"http://127.0.0.1:{port}"}
+        env = loopback_hub.env(home) | {"HF_ENDPOINT": f"http://127.0.0.1:{port}"}
         told = load(env, "facebook/sam3", "tester/sam3")
     message, causes, _ = told["facebook/sam3"]
     assert "'facebook/sam3' is not or not wholly in the cache, and the Hugging Face Hub cannot be" in message
