@@ -66,7 +66,7 @@ def test_a_result_is_current_until_what_it_measures_changes(checkout: Checkout):
     checkout.commit("src/move.py", CODE.replace("return 1", "return 2"))
     (change,) = checkout.origin().changes
     assert change.endswith("Change src/move.py")
-    assert checkout.origin().problem == "stale by 1 commits"
+    assert checkout.origin().problem == "stale by 1 changes"
 
 
 def test_a_result_of_other_options_is_not_the_published_one(checkout: Checkout):
@@ -89,6 +89,33 @@ def test_words_make_nothing_stale(checkout: Checkout, name: str, text: str):
     assert checkout.origin().problem is None
 
 
+@pytest.mark.parametrize("name", ["src/move.py", "src/other.py"])
+def test_code_that_is_not_committed_makes_stale(checkout: Checkout, name: str):
+    (checkout.root / name).write_text(CODE.replace("return 1", "return 2"))
+    assert checkout.origin().changes == (f"not in a commit of its own: {name}",)
+
+
+def test_a_merge_that_kept_the_other_code_makes_stale(checkout: Checkout):
+    checkout.git("checkout", "-qb", "side")
+    checkout.commit("src/move.py", CODE.replace("return 1", "return 2"))
+    checkout.measure()
+    checkout.git("checkout", "-q", "-")
+    checkout.commit("docs/page.md", "words")
+    checkout.git("merge", "-q", "--no-ff", "--no-commit", "side")
+    checkout.commit("src/move.py", CODE)
+    # No commit since changed the code.
+    assert checkout.origin().changes == ("not in a commit of its own: src/move.py",)
+
+
+def test_a_shallow_clone_says_that_it_is(checkout: Checkout, tmp_path: Path):
+    shallow = tmp_path / "shallow"
+    checkout.commit("docs/page.md", "words")
+    checkout.git("clone", "-q", "--depth=1", f"file://{checkout.root}", str(shallow))
+    missing = origin("speed", ["src"], shallow).missing
+    assert "this clone is shallow, run: git fetch --unshallow" in str(missing)
+    assert "shallow" not in str(origin("speed", ["src"], checkout.root).missing)
+
+
 def test_a_change_that_was_taken_back_makes_nothing_stale(checkout: Checkout):
     checkout.commit("src/move.py", CODE.replace("return 1", "return 2"))
     checkout.commit("src/move.py", CODE)
@@ -102,7 +129,7 @@ def test_comments_of_a_configuration_are_words_and_its_values_are_not(checkout: 
     assert checkout.origin().problem is None
     checkout.commit("configs/train.yaml", "steps: 4\n")
     # Both commits touch what has changed.
-    assert checkout.origin().problem == "stale by 2 commits"
+    assert checkout.origin().problem == "stale by 2 changes"
 
 
 @pytest.mark.parametrize(
@@ -198,7 +225,7 @@ def taking(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     monkeypatch.setattr(figures, "subprocess", SimpleNamespace(run=run))
     monkeypatch.setattr(tables, "write_pages", lambda: None)
     monkeypatch.setattr(figures, "code_version", lambda: ("0123456789ab", False))
-    problems = {"oracle": None, "tracking": "no result file", "execution": "stale by 2 commits"}
+    problems = {"oracle": None, "tracking": "no result file", "execution": "stale by 2 changes"}
     monkeypatch.setattr(figures, "origin", lambda name, _, **__: SimpleNamespace(problem=problems[name]))
     return started
 
@@ -206,7 +233,7 @@ def taking(monkeypatch: pytest.MonkeyPatch) -> list[str]:
 def test_what_is_current_is_not_taken_again_and_one_failure_does_not_stop_the_rest(taking: list[str]):
     told = figures.main(["tracking", "oracle", "execution"])
     assert taking == [FIGURES["tracking"].command, FIGURES["execution"].command]
-    assert told == {"tracking": "no result file", "oracle": "current", "execution": "stale by 2 commits"}
+    assert told == {"tracking": "no result file", "oracle": "current", "execution": "stale by 2 changes"}
 
 
 def test_no_figure_is_taken_of_changes_that_are_not_committed(
