@@ -20,7 +20,7 @@ from pathlib import Path
 
 from benchmarks.staleness import origin
 
-from lerobot_openspm.bench.results import code_version
+from lerobot_openspm.bench.results import MEASURED_CODE, code_version
 from lerobot_openspm.cli.pipeline import LIBERO_ASSETS, RECORDED_BY
 from lerobot_openspm.errors import OpenSPMError
 
@@ -206,7 +206,9 @@ def main(names: list[str]) -> dict[str, str]:
 
     _, dirty = code_version()
     if dirty is not False:
-        raise OpenSPMError("figures are taken of a commit; commit the changes under src, configs, benchmarks")
+        raise OpenSPMError(
+            f"figures are taken of a commit; commit the changes under {', '.join(MEASURED_CODE)}"
+        )
     for name in names:
         take(name)
     tables.write_pages()

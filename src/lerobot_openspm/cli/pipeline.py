@@ -31,6 +31,8 @@ logger = logging.getLogger(__name__)
 REPO_ID = "local/openspm_tabletop"
 TRAIN_CONFIG = Path("configs/openspm_tabletop_train.yaml")
 LIBERO_ASSETS = Path("scripts/libero_assets.txt")
+# Each process computes with one; several run side by side.
+THREADS = 1
 DONE, LOG = "done.json", "output.log"
 # The package's files that make a simulator's demonstrations what they are.
 RECORDED_BY = {
@@ -239,7 +241,7 @@ def _line(command: Sequence[str]) -> list[str]:
 
 
 def _environment() -> dict[str, str]:
-    return {**os.environ, "OMP_NUM_THREADS": "1", "HF_HUB_OFFLINE": "1"}
+    return {**os.environ, "OMP_NUM_THREADS": str(THREADS), "HF_HUB_OFFLINE": "1"}
 
 
 def rate(successes: int, n: int) -> dict[str, Any]:
