@@ -1,18 +1,21 @@
 """Quoted figures are found, and what has changed since they were measured."""
 
 import json
+import os
 import re
 import subprocess
 import sys
+from collections.abc import Iterable
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import pytest
-from benchmarks.figures import FIGURES
-from benchmarks.staleness import ROOT, origin, quotes, read_result
+from benchmarks.figures import FIGURES, PACKAGE, Figure
+from benchmarks.staleness import ROOT, Quote, origin, quotes, read_result
 
 from benchmarks import figures, tables
-from lerobot_openspm.bench.results import PROVENANCE
+from lerobot_openspm.bench.results import PROVENANCE, write_result
 from lerobot_openspm.errors import OpenSPMError
 
 CODE = '"""Moves."""\n\n\ndef speed():\n    """How fast."""\n    return 1  # m/s\n'
@@ -41,14 +44,14 @@ class Checkout:
         self.git("add", ".")
         self.git("commit", "-qm", f"Change {name}")
 
-    def measure(self, **changed: object) -> None:
+    def measure(self, name: str = "speed", **changed: object) -> None:
         told = {
             "commit": self.git("rev-parse", "--short=12", "HEAD"),
             "dirty": False,
             "command": "python -m src.move",
             "success": 0.5,
         }
-        self.commit("benchmarks/results/speed.json", json.dumps(told | changed))
+        self.commit(f"benchmarks/results/{name}.json", json.dumps(told | changed))
 
     def origin(self):
         return origin("speed", ["src", "configs"], self.root)
@@ -162,55 +165,116 @@ def test_quotes_are_found_where_they_stand(tmp_path: Path):
     ]  # fmt: skip
 
 
-def report(*options: str) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(
-        [sys.executable, "scripts/stale_figures.py", *options],
-        cwd=ROOT,
-        capture_output=True,
-        text=True,
-        check=False,
-    )
+def report(root: Path, *options: str) -> tuple[dict[str, int], int]:
+    """What the script counts in a checkout, and its exit code."""
+    script = "scripts/stale_figures.py"
+    done = subprocess.run(
+        [sys.executable, script, *options], cwd=root, capture_output=True, text=True, check=False,
+        env={**os.environ, "PYTHONPATH": os.pathsep.join([str(ROOT), *sys.path])},
+    )  # fmt: skip
+    assert done.stdout, done.stderr
+    return json.loads(done.stdout.splitlines()[-1]), done.returncode
 
 
-def test_the_report_counts_what_the_pages_quote():
-    done = report()
-    assert done.returncode == 0, done.stderr
-    counts = json.loads(done.stdout.splitlines()[-1])
-    assert set(counts) == {"quoted", "stale", "unreproducible"}
-    assert counts["quoted"] == len(quotes())
-    bad = counts["stale"] + counts["unreproducible"] > 0
-    assert report("--check").returncode == int(bad)
+def test_the_report_counts_what_the_pages_quote(checkout: Checkout):
+    checkout.commit("scripts/stale_figures.py", (ROOT / "scripts/stale_figures.py").read_text())
+    bank = f"{PACKAGE}/memory/bank.py"
+    checkout.commit(bank, CODE)
+    assert report(checkout.root, "--check") == ({"quoted": 0, "stale": 0, "unreproducible": 0}, 0)
+    checkout.commit("README.md", "<!-- figure: memory.n -->")
+    checkout.measure("memory", command=FIGURES["memory"].command, n=3)
+    assert report(checkout.root, "--check") == ({"quoted": 1, "stale": 0, "unreproducible": 0}, 0)
+    checkout.commit("docs/a.md", "<!-- figure: memory.gone --> <!-- figure: language.n -->")
+    assert report(checkout.root, "--check") == ({"quoted": 3, "stale": 0, "unreproducible": 2}, 1)
+    checkout.commit("docs/a.md", "")
+    checkout.commit(bank, CODE.replace("return 1", "return 2"))
+    assert report(checkout.root, "--check") == ({"quoted": 1, "stale": 1, "unreproducible": 0}, 1)
+    assert report(checkout.root)[1] == 0
+
+
+def complaints(name: str, result: dict[str, Any]) -> list[str]:
+    """What a published result does not say of where it comes from."""
+    machine = {"cpu", "cores", "threads", "python", "packages"}
+    # No path of the machine it was measured on.
+    command = result.get("command") or "/"
+    return [
+        what
+        for what, is_wrong in (
+            ("provenance", not set(PROVENANCE) <= set(result)),
+            ("machine", set(result.get("machine", ())) != machine),
+            ("command", re.search(r"(^|[ =])/", command) is not None),
+            ("name", name not in FIGURES),
+        )
+        if is_wrong
+    ]
 
 
 def test_published_results_say_where_they_come_from():
     for path in (ROOT / "benchmarks/results").glob("*.json"):
-        result = json.loads(path.read_text())
-        assert set(PROVENANCE) <= set(result), path
-        assert path.stem in FIGURES
-        assert result["command"], path
-        assert set(result["machine"]) == {"cpu", "cores", "threads", "python"}, path
-        # No path of the machine it was measured on.
-        assert not re.search(r"(^|[ =])/", result["command"]), path
+        assert complaints(path.stem, json.loads(path.read_text())) == [], path
+
+
+@pytest.mark.parametrize(
+    ("name", "changed", "found"),
+    [
+        ("memory", {}, []),
+        ("speed", {}, ["name"]),
+        ("memory", {"command": "openspm bench memory --result=/home/me/memory.json"}, ["command"]),
+        ("memory", {"command": None}, ["command"]),
+        ("memory", {"machine": {"cpu": "Some CPU"}}, ["machine"]),
+    ],
+)
+def test_a_result_that_does_not_say_where_it_comes_from_is_seen(
+    tmp_path: Path, name: str, changed: dict[str, Any], found: list[str]
+):
+    written = write_result(tmp_path / "memory.json", {"seed": None, "n": 3})
+    assert complaints(name, {**written, "command": FIGURES["memory"].command, **changed}) == found
+    del written["date"]
+    assert "provenance" in complaints(name, {**written, **changed})
 
 
 def test_the_code_that_figures_measure_exists():
     for path in {path for figure in FIGURES.values() for path in figure.paths}:
         named = path.replace("exclude,", "").replace(":(exclude)", "")
-        listed = subprocess.run(["git", "ls-files", "--", named], cwd=ROOT, capture_output=True, text=True)
-        assert listed.stdout, f"nothing is called {path}"
+        assert git_files(named), f"nothing is called {path}"
+
+
+def git_files(*paths: str) -> list[str]:
+    """The committed files that git's names stand for."""
+    listed = subprocess.run(
+        ["git", "ls-files", "--", *paths], cwd=ROOT, capture_output=True, text=True, check=True
+    )
+    return listed.stdout.splitlines()
 
 
 def test_every_room_is_measured_by_some_figure():
-    rooms = {path.parent.name for path in (ROOT / "src/lerobot_openspm").glob("*/__init__.py")}
-    measured = {path for figure in FIGURES.values() for path in figure.paths}
-    # No figure is taken with a judge.
-    unmeasured = {room for room in rooms if not any(f"lerobot_openspm/{room}" in path for path in measured)}
-    assert unmeasured <= {"judgement"}
+    rooms = {path.parent.name for path in (ROOT / PACKAGE).glob("*/__init__.py")}
+    assert unmeasured(rooms, FIGURES.values()) == set()
+    without = [figure for name, figure in FIGURES.items() if "calibration" not in name]
+    assert unmeasured(rooms, without) == {"calibration"}
+    excluding = Figure("", (f"{PACKAGE}/flow", f":(exclude){PACKAGE}/flow"))
+    assert unmeasured({"flow"}, [excluding]) == {"flow"}
 
 
-def test_every_quoted_figure_is_in_its_result():
-    missing = [quote for quote in quotes() if quote.key not in (read_result(quote.name) or {})]
-    assert missing == []
+def unmeasured(rooms: set[str], among: Iterable[Figure]) -> set[str]:
+    """Folders of the package of which no figure's paths hold any code."""
+    measured = {
+        Path(name).relative_to(PACKAGE).parts[0]
+        for figure in among
+        for name in git_files(*figure.paths)
+        if name.startswith(f"{PACKAGE}/") and not name.endswith("__init__.py")
+    }
+    return rooms - measured
+
+
+def test_every_quoted_figure_is_in_its_result(checkout: Checkout):
+    assert not_in_their_results(ROOT) == []
+    checkout.commit("README.md", "<!-- figure: speed.success --> <!-- figure: speed.gone -->")
+    assert [quote.key for quote in not_in_their_results(checkout.root)] == ["gone"]
+
+
+def not_in_their_results(root: Path) -> list[Quote]:
+    return [quote for quote in quotes(root) if quote.key not in (read_result(quote.name, root) or {})]
 
 
 @pytest.fixture
