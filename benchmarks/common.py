@@ -32,6 +32,6 @@ def known(seconds: float) -> float | None:
     return None if math.isnan(seconds) else seconds
 
 
-def write(name: str, measured: dict[str, Any]) -> dict[str, Any]:
-    """Write one result with its provenance into ``benchmarks/results``, and return it."""
-    return write_result(RESULTS / f"{name}.json", measured)
+def write(name: str, measured: dict[str, Any], threads: int | None = None) -> dict[str, Any]:
+    """Write one result with its provenance into ``benchmarks/results``, and return it; see `write_result`."""
+    return write_result(RESULTS / f"{name}.json", measured, threads)

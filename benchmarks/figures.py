@@ -20,7 +20,8 @@ from pathlib import Path
 
 from benchmarks.staleness import origin
 
-from lerobot_openspm.bench.results import code_version
+from lerobot_openspm.bench.results import MEASURED_CODE, code_version
+from lerobot_openspm.cli.pipeline import LIBERO_ASSETS, RECORDED_BY
 from lerobot_openspm.errors import OpenSPMError
 
 logger = logging.getLogger(__name__)
@@ -34,33 +35,45 @@ POLICY = (
     f":(exclude,glob){PACKAGE}/perception/sam3d*.py",
     f":(exclude,glob){PACKAGE}/perception/segmentation/*sam*.py",
 )
-RECORDING = (f"{PACKAGE}/cli/collect.py", f":(glob){PACKAGE}/envs/*.py")
+RECORDING = {
+    simulator: tuple(f":(glob){PACKAGE}/{pattern}" for pattern in patterns)
+    for simulator, patterns in RECORDED_BY.items()
+}
 TABLETOP = (
     *POLICY,
-    *RECORDING,
+    *RECORDING["openspm_tabletop"],
     *(f"{PACKAGE}/cli/{name}.py" for name in ("pipeline", "demo")),
     "configs/openspm_tabletop_train.yaml",
     "configs/cameras/openspm_tabletop.json",
 )
 LIBERO = (
     *POLICY,
-    f"{PACKAGE}/cli/collect.py",
-    f"{PACKAGE}/envs/libero",
-    *(f"{PACKAGE}/envs/{name}.py" for name in ("motions", "recording", "seeds")),
+    *RECORDING["libero"],
+    str(LIBERO_ASSETS),
+    f"{PACKAGE}/cli/pipeline.py",
     *(f"{PACKAGE}/bench/{name}.py" for name in ("episode", "libero")),
     "configs/openspm_libero_train.yaml",
     "configs/cameras/libero.json",
-    "scripts/libero_assets.txt",
+    "benchmarks/common.py",
     "benchmarks/libero/episode.py",
     "benchmarks/libero/evaluate.py",
     "benchmarks/libero/stages.py",
 )
-TRACKING = (f"{PACKAGE}/bench/tracking.py", f"{PACKAGE}/bench/tabletop.py", f"{PACKAGE}/bench/episode.py")
-ALONG = tuple(
-    f"{PACKAGE}/bench/{name}.py" for name in ("perception", "truth", "object_frames", "episode", "tabletop")
+TRACKING = (
+    f"{PACKAGE}/cli/bench.py",
+    *(f"{PACKAGE}/bench/{name}.py" for name in ("tracking", "tabletop", "episode")),
+)
+ALONG = (
+    f"{PACKAGE}/cli/bench.py",
+    *(
+        f"{PACKAGE}/bench/{name}.py"
+        for name in ("perception", "truth", "object_frames", "episode", "tabletop")
+    ),
 )
 KEY_POSES = (
     *(f"{PACKAGE}/{room}" for room in ("geometry", "mining")),
+    f"{PACKAGE}/memory/robot.py",
+    f"{PACKAGE}/envs/unsteady.py",
     *(
         f"{PACKAGE}/bench/{name}.py"
         for name in ("key_poses", "recording", "contact_events", "contact_sensor")
@@ -72,7 +85,16 @@ LANGUAGE = (
     f"{PACKAGE}/bench/taught_words.py",
     f"{PACKAGE}/bench/instructions",
 )
-NOISE, NOISE_SCRIPT = "benchmarks.measurement_noise", "benchmarks/measurement_noise.py"
+ACCURACY = ("benchmarks/libero/accuracy.py", f"{PACKAGE}/bench/object_frames.py")
+CALIBRATION = (
+    *(f"{PACKAGE}/{room}" for room in ("calibration", "geometry")),
+    *(f"{PACKAGE}/mining/{name}.py" for name in ("columns", "dataset", "signals")),
+    f"{PACKAGE}/memory/robot.py",
+    *(f"{PACKAGE}/cli/{name}.py" for name in ("calibrate", "pipeline")),
+    *(f"benchmarks/{name}.py" for name in ("calibration", "common")),
+)
+NOISE = "benchmarks.measurement_noise"
+NOISE_PATHS = ("benchmarks/measurement_noise.py", "benchmarks/common.py")
 # As `make libero` types it.
 LIBERO_GOAL = "--demos=10 --states=50 --tasks=0-9"
 NEW_TASKS = (
@@ -121,21 +143,21 @@ FIGURES: dict[str, Figure] = {
     "cameras": _bench("cameras", "cameras", (*TABLETOP, *TRACKING)),
     "teach": _bench("teach", "teach", (*TABLETOP, f"{PACKAGE}/bench/teach.py", *TRACKING)),
     "keyposes_tabletop": _bench(
-        "keyposes", "keyposes_tabletop", (*KEY_POSES, f":(glob){PACKAGE}/envs/*.py"),
+        "keyposes", "keyposes_tabletop", (*KEY_POSES, *RECORDING["openspm_tabletop"]),
         "--env.type=openspm_tabletop --seed=30000",
     ),
     "language": _bench("language", "language", LANGUAGE),
     "memory": _bench(
         "memory", "memory",
-        (f"{PACKAGE}/memory", f":(glob){PACKAGE}/experience*.py", f":(glob){PACKAGE}/bench/synthetic_*.py",
-         f"{PACKAGE}/bench/memory.py"),
+        (f"{PACKAGE}/memory", f"{PACKAGE}/geometry", f":(glob){PACKAGE}/experience*.py",
+         f":(glob){PACKAGE}/bench/synthetic_*.py", f"{PACKAGE}/bench/memory.py"),
     ),
-    "measurement_noise": Figure(f"python -m {NOISE}", (*TABLETOP, *ALONG, NOISE_SCRIPT)),
+    "measurement_noise": Figure(f"python -m {NOISE}", (*TABLETOP, *ALONG, *NOISE_PATHS)),
     "measurement_noise_libero": Figure(
-        f"python -m {NOISE} --env.type=libero", (*LIBERO, *ALONG, NOISE_SCRIPT)
+        f"python -m {NOISE} --env.type=libero", (*LIBERO, *ALONG, *NOISE_PATHS)
     ),
-    "libero_goal": _libero("run", "benchmarks/libero/accuracy.py", options=LIBERO_GOAL),
-    "libero_accuracy": _libero("run", "benchmarks/libero/accuracy.py", options=LIBERO_GOAL),
+    "libero_goal": _libero("run", *ACCURACY, options=LIBERO_GOAL),
+    "libero_accuracy": _libero("run", *ACCURACY, options=LIBERO_GOAL),
     "libero_few_shot_3": _libero("few_shot", options="--demos=3"),
     "libero_few_shot_1": _libero("few_shot", options="--demos=1 --states=10"),
     "libero_ablations": _libero("ablations", "benchmarks/libero/geometric_guess.py", f"{PACKAGE}/judgement"),
@@ -145,13 +167,12 @@ FIGURES: dict[str, Figure] = {
     "libero_equality": _libero("equality"),
     "perception_libero": _bench("perception", "perception_libero", (*LIBERO, *ALONG), "--env.type=libero"),
     "keyposes_libero": _bench(
-        "keyposes", "keyposes_libero", (*KEY_POSES, f"{PACKAGE}/envs/libero"),
+        "keyposes", "keyposes_libero", (*KEY_POSES, *RECORDING["libero"], str(LIBERO_ASSETS)),
         "--env.type=libero --seed=30000",
     ),
     "calibration": Figure(
         "python -m benchmarks.calibration --libero=outputs/libero/demos_10/dataset",
-        (f"{PACKAGE}/calibration", f"{PACKAGE}/geometry", *RECORDING, f"{PACKAGE}/envs/libero",
-         "benchmarks/calibration.py"),
+        (*CALIBRATION, *RECORDING["openspm_tabletop"], *RECORDING["libero"], str(LIBERO_ASSETS)),
     ),
 }  # fmt: skip
 
@@ -185,7 +206,9 @@ def main(names: list[str]) -> dict[str, str]:
 
     _, dirty = code_version()
     if dirty is not False:
-        raise OpenSPMError("figures are taken of a commit; commit the changes under src, configs, benchmarks")
+        raise OpenSPMError(
+            f"figures are taken of a commit; commit the changes under {', '.join(MEASURED_CODE)}"
+        )
     for name in names:
         take(name)
     tables.write_pages()

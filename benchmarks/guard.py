@@ -32,7 +32,6 @@ from scipy.optimize import brentq
 from scipy.stats import binom
 
 from lerobot_openspm.cli import pipeline
-from lerobot_openspm.cli.collect import CollectConfig, SimulatorConfig, collect
 from lerobot_openspm.envs.seeds import TUNING_SEED_START
 
 FALSE_ALARM, POWER = 0.01, 0.9
@@ -130,7 +129,7 @@ def tabletop(standard: Standard, output: Path) -> list[Run]:
 def libero(standard: Standard, output: Path) -> list[Run]:
     """LIBERO-GOAL's episodes, from scenes drawn by the guard's seeds, not the benchmark's initial states."""
     root = output / "dataset"
-    collect(CollectConfig(SimulatorConfig("libero"), standard.demos, str(root), repo_id=stages.REPO_ID))
+    pipeline.collect_dataset(root, standard.demos, "libero")
     checkpoint, _ = stages.policy(root, "train")
     config = harness.EvaluationConfig(
         str(checkpoint), str(output / "evaluation"),

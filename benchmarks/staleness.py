@@ -38,7 +38,7 @@ class Origin:
     Attributes:
         commit: What it was measured on, if known.
         missing: Why it cannot be taken again as it is, or None.
-        changes: The commits since that touch what it measures.
+        changes: What has changed since in what it measures, by commits where these are known.
     """
 
     commit: str | None
@@ -48,7 +48,7 @@ class Origin:
     @property
     def problem(self) -> str | None:
         """Why it is not current, or None."""
-        return self.missing or (f"stale by {len(self.changes)} commits" if self.changes else None)
+        return self.missing or (f"stale by {len(self.changes)} changes" if self.changes else None)
 
 
 def quotes(root: Path = ROOT) -> list[Quote]:
@@ -90,7 +90,9 @@ def origin(
     if expected_command is not None and _options(command) != _options(expected_command):
         return Origin(commit, f"taken with other options: {command}, expected {expected_command}")
     if not commit or not _git(root, "merge-base", commit, "HEAD").startswith(commit):
-        return Origin(commit, f"its commit {commit} is not in this history")
+        is_shallow = _git(root, "rev-parse", "--is-shallow-repository").strip() == "true"
+        way_out = "; this clone is shallow, run: git fetch --unshallow" if is_shallow else ""
+        return Origin(commit, f"its commit {commit} is not in this history{way_out}")
     if result.get("dirty") is not False:
         return Origin(commit, "measured with changes that were not committed")
     return Origin(commit, None, tuple(changes(commit, paths, root)))
@@ -121,18 +123,30 @@ def _is_there(command: str, root: Path) -> bool:
 
 
 def changes(commit: str, paths: Sequence[str], root: Path = ROOT) -> Iterator[str]:
-    """Commits since that touch files whose code is another now; comments and docstrings are no code."""
-    head = _git(root, "rev-parse", "HEAD").strip()
-    names = _git(root, "diff", "--name-only", "--no-renames", commit, head, "--", *paths).splitlines()
-    changed = [name for name in names if _code(root, commit, name) != _code(root, head, name)]
+    """What has changed since in files whose code is another now; comments and docstrings are no code."""
+    names = [
+        *_git(root, "diff", "--name-only", "--no-renames", commit, "--", *paths).splitlines(),
+        *_git(root, "ls-files", "--others", "--exclude-standard", "--", *paths).splitlines(),
+    ]
+    changed = [name for name in names if _committed_code(root, commit, name) != _present_code(root, name)]
     if changed:
-        yield from _git(root, "log", "--format=%h %s", f"{commit}..{head}", "--", *changed).splitlines()
+        commits = _git(root, "log", "--format=%h %s", f"{commit}..HEAD", "--", *changed).splitlines()
+        # None for what is not committed, or was changed in merging.
+        yield from commits or [f"not in a commit of its own: {', '.join(changed)}"]
 
 
 @functools.cache
-def _code(root: Path, commit: str, name: str) -> str:
-    """What a file does at a commit, without what only people read; empty if it is not there."""
-    text = _git(root, "show", f"{commit}:{name}")
+def _committed_code(root: Path, commit: str, name: str) -> str:
+    return _code(name, _git(root, "show", f"{commit}:{name}"))
+
+
+def _present_code(root: Path, name: str) -> str:
+    path = root / name
+    return _code(name, path.read_text() if path.is_file() else "")
+
+
+def _code(name: str, text: str) -> str:
+    """What a file does, without what only people read; empty if it is not there."""
     match Path(name).suffix:
         case ".py":
             return _without_docstrings(text)

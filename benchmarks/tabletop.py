@@ -20,7 +20,7 @@ from typing import Any
 from benchmarks.common import DEMOS, EPISODES, RUN, dataset, policy, write
 
 from lerobot_openspm.cli.demo import EVALUATION_SEED
-from lerobot_openspm.cli.pipeline import collect_dataset, evaluate, success
+from lerobot_openspm.cli.pipeline import THREADS, collect_dataset, evaluate, success
 from lerobot_openspm.envs.tasks import ANY_TASK, SELECTIONS
 
 # Seeds of evaluation that nothing else was measured on; the code was tuned on 2,600,000 and more.
@@ -78,7 +78,7 @@ def main(name: str) -> dict[str, Any]:
     """Measure, write and return the result."""
     measured = COMPARISONS[name]() if name in COMPARISONS else selection(name)
     n = min(run["n"] for run in measured["runs"].values())
-    return write(name, {"seed": SELECTION_SEEDS.get(name, EVALUATION_SEED), "n": n, **measured})
+    return write(name, {"seed": SELECTION_SEEDS.get(name, EVALUATION_SEED), "n": n, **measured}, THREADS)
 
 
 if __name__ == "__main__":

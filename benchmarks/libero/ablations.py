@@ -20,6 +20,8 @@ from benchmarks.libero.evaluate import SEED, summary
 from benchmarks.libero.geometric_guess import GuessConfig, Source, guessing_policy, source_of
 from benchmarks.libero.stages import dataset, evaluation, policy, run_folder
 
+from lerobot_openspm.cli.pipeline import THREADS
+
 
 @dataclass
 class AblationConfig:
@@ -60,7 +62,7 @@ def main(config: AblationConfig) -> dict[str, Any]:
         variants["zero_shot"] = evaluation(folder / "ablation_zero_shot", model, config.states)
     runs = {name: summary(found) for name, found in variants.items()}
     n = min(run["n"] for run in runs.values())
-    return write("libero_ablations", {"seed": SEED, "n": n, "states": config.states, "runs": runs})
+    return write("libero_ablations", {"seed": SEED, "n": n, "states": config.states, "runs": runs}, THREADS)
 
 
 if __name__ == "__main__":

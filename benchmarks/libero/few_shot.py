@@ -14,6 +14,8 @@ from benchmarks.common import write
 from benchmarks.libero.evaluate import SEED, summary
 from benchmarks.libero.stages import STATES, dataset, evaluation, first_episodes, policy, run_folder
 
+from lerobot_openspm.cli.pipeline import THREADS
+
 
 @dataclass
 class FewShotConfig:
@@ -30,7 +32,7 @@ def main(config: FewShotConfig) -> dict[str, Any]:
     checkpoint, seconds = policy(root, variant, episodes=first_episodes(root, config.demos))
     episodes = evaluation(run_folder() / f"{variant}_evaluation", checkpoint, config.states)
     figures = {"seed": SEED, "demonstrations": config.demos, "mine_and_train_s": seconds, **summary(episodes)}
-    return write(f"libero_few_shot_{config.demos}", figures)
+    return write(f"libero_few_shot_{config.demos}", figures, THREADS)
 
 
 if __name__ == "__main__":

@@ -18,6 +18,7 @@ from benchmarks.libero.accuracy import accuracy
 from benchmarks.libero.evaluate import SEED, summary
 from benchmarks.libero.stages import DEMOS, STATES, dataset, evaluation, policy, run_folder, select_tasks
 
+from lerobot_openspm.cli.pipeline import THREADS
 from lerobot_openspm.envs.libero.simulator import tasks
 
 logger = logging.getLogger(__name__)
@@ -59,8 +60,8 @@ def main(config: RunConfig) -> dict[str, Any]:
     timing = {"mine_and_train_s": seconds}
     if config.demos == DEMOS and config.states == STATES and selected == list(tasks()):
         about = {"seed": SEED, "demonstrations": DEMOS}
-        write("libero_goal", {**about, **timing, **figures})
-        write("libero_accuracy", {**about, "n": figures["n"], **errors})
+        write("libero_goal", {**about, **timing, **figures}, THREADS)
+        write("libero_accuracy", {**about, "n": figures["n"], **errors}, THREADS)
     told = {key: figures[key] for key in ("success", "n", "mean_steps")}
     per_task = {task: row["success"] for task, row in figures["per_task"].items()}
     places = {key: errors[key] for key in ("position_mm_mean", "position_mm_p95")}

@@ -10,8 +10,8 @@ from typing import Any
 from benchmarks.common import known
 from benchmarks.libero.evaluate import EvaluationConfig, evaluate
 
-from lerobot_openspm.cli.collect import SUMMARY_FILE, CollectConfig, SimulatorConfig, collect
-from lerobot_openspm.cli.pipeline import train
+from lerobot_openspm.cli.collect import SUMMARY_FILE
+from lerobot_openspm.cli.pipeline import collect_dataset, train
 from lerobot_openspm.control.executor import Execution
 from lerobot_openspm.envs.libero.simulator import tasks
 
@@ -54,7 +54,7 @@ def dataset(demos: int = DEMOS, selected: Sequence[str] | None = None) -> Path:
     """The demonstrations, recorded if need be."""
     root = run_folder(demos, selected) / "dataset"
     names = ",".join(selected) if selected and list(selected) != list(tasks()) else "all"
-    collect(CollectConfig(SimulatorConfig("libero", names), episodes=demos, root=str(root), repo_id=REPO_ID))
+    collect_dataset(root, demos, "libero", names)
     return root
 
 

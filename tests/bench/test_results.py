@@ -6,6 +6,7 @@ import sys
 from pathlib import Path
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
 
 from lerobot_openspm.bench import results
@@ -19,7 +20,8 @@ def test_a_result_says_what_it_was_measured_on(tmp_path: Path):
     assert json.loads(path.read_text()) == content
     assert list(content) == [*PROVENANCE, "median_ms"]
     assert (content["seed"], content["n"], content["median_ms"]) == (5, 3, 1.5)
-    assert set(content["machine"]) == {"cpu", "cores", "threads", "python"}
+    assert set(content["machine"]) == {"cpu", "cores", "threads", "python", "packages"}
+    assert content["machine"]["packages"]["numpy"] == np.__version__
     head = subprocess.run(
         ["git", "rev-parse", "HEAD"], cwd=Path(__file__).parent, capture_output=True, text=True
     )
@@ -86,13 +88,18 @@ def test_changes_of_code_are_told_and_of_results_are_not(checkout: Path):
     (checkout / "benchmarks/results/speed.json").write_text("{}")
     (checkout / "README.md").write_text("faster")
     assert code_version() == (commit, False)
-    (checkout / "src/lerobot_openspm/new.py").write_text("")
-    assert code_version() == (commit, True)
+    for name in ("src/lerobot_openspm/new.py", "scripts/libero_assets.txt", "Makefile", "pyproject.toml"):
+        (checkout / name).parent.mkdir(exist_ok=True)
+        (checkout / name).write_text("")
+        assert code_version() == (commit, True), name
+        (checkout / name).unlink()
 
 
 def test_the_threads_are_those_of_this_process(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setitem(sys.modules, "torch", SimpleNamespace(get_num_threads=lambda: 3))  # pyright: ignore
     assert machine()["threads"] == 3
+    # Those of the processes that it started, if they measured.
+    assert machine(1)["threads"] == 1
     monkeypatch.delitem(sys.modules, "torch")
     monkeypatch.setenv("OMP_NUM_THREADS", "5")
     assert machine()["threads"] == 5

@@ -122,7 +122,7 @@ def test_liberos_scenes_are_drawn_from_the_guards_own_seeds(monkeypatch: pytest.
         told = {"steps": 90, "success": state == 0, "status": "done", "phase": "retreat"}
         return {"task": task, "state": state, "seed": config.tuning_seed + state, **told}
 
-    monkeypatch.setattr(guard, "collect", collected.append)
+    monkeypatch.setattr(pipeline, "collect_dataset", lambda *given: collected.append(given))
     monkeypatch.setattr(stages, "policy", lambda root, variant: (checkpoint, 1.0))
     monkeypatch.setattr(harness, "tasks", lambda: {"push_the_plate": "push the plate"})
     monkeypatch.setattr(harness, "evaluate_one", run_one)
@@ -134,7 +134,7 @@ def test_liberos_scenes_are_drawn_from_the_guards_own_seeds(monkeypatch: pytest.
         Run("push_the_plate", standard.seed + 1, False, 90, reason),
     ]
     assert jobs == [(True, standard.seed), (True, standard.seed + 1)]
-    assert [(one.env.type, one.episodes) for one in collected] == [("libero", 1)]
+    assert collected == [(tmp_path / "dataset", 1, "libero")]
 
 
 def test_its_seeds_are_tuning_seeds_that_nobody_else_uses():

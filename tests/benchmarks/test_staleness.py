@@ -1,18 +1,21 @@
 """Quoted figures are found, and what has changed since they were measured."""
 
 import json
+import os
 import re
 import subprocess
 import sys
+from collections.abc import Iterable
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import pytest
-from benchmarks.figures import FIGURES
-from benchmarks.staleness import ROOT, origin, quotes, read_result
+from benchmarks.figures import FIGURES, PACKAGE, Figure
+from benchmarks.staleness import ROOT, Quote, origin, quotes, read_result
 
 from benchmarks import figures, tables
-from lerobot_openspm.bench.results import PROVENANCE
+from lerobot_openspm.bench.results import PROVENANCE, write_result
 from lerobot_openspm.errors import OpenSPMError
 
 CODE = '"""Moves."""\n\n\ndef speed():\n    """How fast."""\n    return 1  # m/s\n'
@@ -41,14 +44,14 @@ class Checkout:
         self.git("add", ".")
         self.git("commit", "-qm", f"Change {name}")
 
-    def measure(self, **changed: object) -> None:
+    def measure(self, name: str = "speed", **changed: object) -> None:
         told = {
             "commit": self.git("rev-parse", "--short=12", "HEAD"),
             "dirty": False,
             "command": "python -m src.move",
             "success": 0.5,
         }
-        self.commit("benchmarks/results/speed.json", json.dumps(told | changed))
+        self.commit(f"benchmarks/results/{name}.json", json.dumps(told | changed))
 
     def origin(self):
         return origin("speed", ["src", "configs"], self.root)
@@ -66,7 +69,7 @@ def test_a_result_is_current_until_what_it_measures_changes(checkout: Checkout):
     checkout.commit("src/move.py", CODE.replace("return 1", "return 2"))
     (change,) = checkout.origin().changes
     assert change.endswith("Change src/move.py")
-    assert checkout.origin().problem == "stale by 1 commits"
+    assert checkout.origin().problem == "stale by 1 changes"
 
 
 def test_a_result_of_other_options_is_not_the_published_one(checkout: Checkout):
@@ -89,6 +92,33 @@ def test_words_make_nothing_stale(checkout: Checkout, name: str, text: str):
     assert checkout.origin().problem is None
 
 
+@pytest.mark.parametrize("name", ["src/move.py", "src/other.py"])
+def test_code_that_is_not_committed_makes_stale(checkout: Checkout, name: str):
+    (checkout.root / name).write_text(CODE.replace("return 1", "return 2"))
+    assert checkout.origin().changes == (f"not in a commit of its own: {name}",)
+
+
+def test_a_merge_that_kept_the_other_code_makes_stale(checkout: Checkout):
+    checkout.git("checkout", "-qb", "side")
+    checkout.commit("src/move.py", CODE.replace("return 1", "return 2"))
+    checkout.measure()
+    checkout.git("checkout", "-q", "-")
+    checkout.commit("docs/page.md", "words")
+    checkout.git("merge", "-q", "--no-ff", "--no-commit", "side")
+    checkout.commit("src/move.py", CODE)
+    # No commit since changed the code.
+    assert checkout.origin().changes == ("not in a commit of its own: src/move.py",)
+
+
+def test_a_shallow_clone_says_that_it_is(checkout: Checkout, tmp_path: Path):
+    shallow = tmp_path / "shallow"
+    checkout.commit("docs/page.md", "words")
+    checkout.git("clone", "-q", "--depth=1", f"file://{checkout.root}", str(shallow))
+    missing = origin("speed", ["src"], shallow).missing
+    assert "this clone is shallow, run: git fetch --unshallow" in str(missing)
+    assert "shallow" not in str(origin("speed", ["src"], checkout.root).missing)
+
+
 def test_a_change_that_was_taken_back_makes_nothing_stale(checkout: Checkout):
     checkout.commit("src/move.py", CODE.replace("return 1", "return 2"))
     checkout.commit("src/move.py", CODE)
@@ -102,7 +132,7 @@ def test_comments_of_a_configuration_are_words_and_its_values_are_not(checkout: 
     assert checkout.origin().problem is None
     checkout.commit("configs/train.yaml", "steps: 4\n")
     # Both commits touch what has changed.
-    assert checkout.origin().problem == "stale by 2 commits"
+    assert checkout.origin().problem == "stale by 2 changes"
 
 
 @pytest.mark.parametrize(
@@ -135,55 +165,116 @@ def test_quotes_are_found_where_they_stand(tmp_path: Path):
     ]  # fmt: skip
 
 
-def report(*options: str) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(
-        [sys.executable, "scripts/stale_figures.py", *options],
-        cwd=ROOT,
-        capture_output=True,
-        text=True,
-        check=False,
-    )
+def report(root: Path, *options: str) -> tuple[dict[str, int], int]:
+    """What the script counts in a checkout, and its exit code."""
+    script = "scripts/stale_figures.py"
+    done = subprocess.run(
+        [sys.executable, script, *options], cwd=root, capture_output=True, text=True, check=False,
+        env={**os.environ, "PYTHONPATH": os.pathsep.join([str(ROOT), *sys.path])},
+    )  # fmt: skip
+    assert done.stdout, done.stderr
+    return json.loads(done.stdout.splitlines()[-1]), done.returncode
 
 
-def test_the_report_counts_what_the_pages_quote():
-    done = report()
-    assert done.returncode == 0, done.stderr
-    counts = json.loads(done.stdout.splitlines()[-1])
-    assert set(counts) == {"quoted", "stale", "unreproducible"}
-    assert counts["quoted"] == len(quotes())
-    bad = counts["stale"] + counts["unreproducible"] > 0
-    assert report("--check").returncode == int(bad)
+def test_the_report_counts_what_the_pages_quote(checkout: Checkout):
+    checkout.commit("scripts/stale_figures.py", (ROOT / "scripts/stale_figures.py").read_text())
+    bank = f"{PACKAGE}/memory/bank.py"
+    checkout.commit(bank, CODE)
+    assert report(checkout.root, "--check") == ({"quoted": 0, "stale": 0, "unreproducible": 0}, 0)
+    checkout.commit("README.md", "<!-- figure: memory.n -->")
+    checkout.measure("memory", command=FIGURES["memory"].command, n=3)
+    assert report(checkout.root, "--check") == ({"quoted": 1, "stale": 0, "unreproducible": 0}, 0)
+    checkout.commit("docs/a.md", "<!-- figure: memory.gone --> <!-- figure: language.n -->")
+    assert report(checkout.root, "--check") == ({"quoted": 3, "stale": 0, "unreproducible": 2}, 1)
+    checkout.commit("docs/a.md", "")
+    checkout.commit(bank, CODE.replace("return 1", "return 2"))
+    assert report(checkout.root, "--check") == ({"quoted": 1, "stale": 1, "unreproducible": 0}, 1)
+    assert report(checkout.root)[1] == 0
+
+
+def complaints(name: str, result: dict[str, Any]) -> list[str]:
+    """What a published result does not say of where it comes from."""
+    machine = {"cpu", "cores", "threads", "python", "packages"}
+    # No path of the machine it was measured on.
+    command = result.get("command") or "/"
+    return [
+        what
+        for what, is_wrong in (
+            ("provenance", not set(PROVENANCE) <= set(result)),
+            ("machine", set(result.get("machine", ())) != machine),
+            ("command", re.search(r"(^|[ =])/", command) is not None),
+            ("name", name not in FIGURES),
+        )
+        if is_wrong
+    ]
 
 
 def test_published_results_say_where_they_come_from():
     for path in (ROOT / "benchmarks/results").glob("*.json"):
-        result = json.loads(path.read_text())
-        assert set(PROVENANCE) <= set(result), path
-        assert path.stem in FIGURES
-        assert result["command"], path
-        assert set(result["machine"]) == {"cpu", "cores", "threads", "python"}, path
-        # No path of the machine it was measured on.
-        assert not re.search(r"(^|[ =])/", result["command"]), path
+        assert complaints(path.stem, json.loads(path.read_text())) == [], path
+
+
+@pytest.mark.parametrize(
+    ("name", "changed", "found"),
+    [
+        ("memory", {}, []),
+        ("speed", {}, ["name"]),
+        ("memory", {"command": "openspm bench memory --result=/home/me/memory.json"}, ["command"]),
+        ("memory", {"command": None}, ["command"]),
+        ("memory", {"machine": {"cpu": "Some CPU"}}, ["machine"]),
+    ],
+)
+def test_a_result_that_does_not_say_where_it_comes_from_is_seen(
+    tmp_path: Path, name: str, changed: dict[str, Any], found: list[str]
+):
+    written = write_result(tmp_path / "memory.json", {"seed": None, "n": 3})
+    assert complaints(name, {**written, "command": FIGURES["memory"].command, **changed}) == found
+    del written["date"]
+    assert "provenance" in complaints(name, {**written, **changed})
 
 
 def test_the_code_that_figures_measure_exists():
     for path in {path for figure in FIGURES.values() for path in figure.paths}:
         named = path.replace("exclude,", "").replace(":(exclude)", "")
-        listed = subprocess.run(["git", "ls-files", "--", named], cwd=ROOT, capture_output=True, text=True)
-        assert listed.stdout, f"nothing is called {path}"
+        assert git_files(named), f"nothing is called {path}"
+
+
+def git_files(*paths: str) -> list[str]:
+    """The committed files that git's names stand for."""
+    listed = subprocess.run(
+        ["git", "ls-files", "--", *paths], cwd=ROOT, capture_output=True, text=True, check=True
+    )
+    return listed.stdout.splitlines()
 
 
 def test_every_room_is_measured_by_some_figure():
-    rooms = {path.parent.name for path in (ROOT / "src/lerobot_openspm").glob("*/__init__.py")}
-    measured = {path for figure in FIGURES.values() for path in figure.paths}
-    # No figure is taken with a judge.
-    unmeasured = {room for room in rooms if not any(f"lerobot_openspm/{room}" in path for path in measured)}
-    assert unmeasured <= {"judgement"}
+    rooms = {path.parent.name for path in (ROOT / PACKAGE).glob("*/__init__.py")}
+    assert unmeasured(rooms, FIGURES.values()) == set()
+    without = [figure for name, figure in FIGURES.items() if "calibration" not in name]
+    assert unmeasured(rooms, without) == {"calibration"}
+    excluding = Figure("", (f"{PACKAGE}/flow", f":(exclude){PACKAGE}/flow"))
+    assert unmeasured({"flow"}, [excluding]) == {"flow"}
 
 
-def test_every_quoted_figure_is_in_its_result():
-    missing = [quote for quote in quotes() if quote.key not in (read_result(quote.name) or {})]
-    assert missing == []
+def unmeasured(rooms: set[str], among: Iterable[Figure]) -> set[str]:
+    """Folders of the package of which no figure's paths hold any code."""
+    measured = {
+        Path(name).relative_to(PACKAGE).parts[0]
+        for figure in among
+        for name in git_files(*figure.paths)
+        if name.startswith(f"{PACKAGE}/") and not name.endswith("__init__.py")
+    }
+    return rooms - measured
+
+
+def test_every_quoted_figure_is_in_its_result(checkout: Checkout):
+    assert not_in_their_results(ROOT) == []
+    checkout.commit("README.md", "<!-- figure: speed.success --> <!-- figure: speed.gone -->")
+    assert [quote.key for quote in not_in_their_results(checkout.root)] == ["gone"]
+
+
+def not_in_their_results(root: Path) -> list[Quote]:
+    return [quote for quote in quotes(root) if quote.key not in (read_result(quote.name, root) or {})]
 
 
 @pytest.fixture
@@ -198,7 +289,7 @@ def taking(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     monkeypatch.setattr(figures, "subprocess", SimpleNamespace(run=run))
     monkeypatch.setattr(tables, "write_pages", lambda: None)
     monkeypatch.setattr(figures, "code_version", lambda: ("0123456789ab", False))
-    problems = {"oracle": None, "tracking": "no result file", "execution": "stale by 2 commits"}
+    problems = {"oracle": None, "tracking": "no result file", "execution": "stale by 2 changes"}
     monkeypatch.setattr(figures, "origin", lambda name, _, **__: SimpleNamespace(problem=problems[name]))
     return started
 
@@ -206,7 +297,7 @@ def taking(monkeypatch: pytest.MonkeyPatch) -> list[str]:
 def test_what_is_current_is_not_taken_again_and_one_failure_does_not_stop_the_rest(taking: list[str]):
     told = figures.main(["tracking", "oracle", "execution"])
     assert taking == [FIGURES["tracking"].command, FIGURES["execution"].command]
-    assert told == {"tracking": "no result file", "oracle": "current", "execution": "stale by 2 commits"}
+    assert told == {"tracking": "no result file", "oracle": "current", "execution": "stale by 2 changes"}
 
 
 def test_no_figure_is_taken_of_changes_that_are_not_committed(

@@ -14,7 +14,7 @@ from benchmarks import markdown, tables
 ORIGIN = {
     "commit": "0123456789ab", "dirty": False, "command": "python -m benchmarks.x",
     "date": "2026-11-22T10:00:00",
-    "machine": {"cpu": "Some CPU", "cores": 2, "threads": 1, "python": "3.12.1"},
+    "machine": {"cpu": "Some CPU", "cores": 2, "threads": 1, "python": "3.12.1", "packages": {}},
     "seed": 0,
 }  # fmt: skip
 RATE = {"success": 0.5, "n": 4, "interval": [0.15, 0.85], "mean_steps": 100.0}

@@ -7,15 +7,18 @@ from typing import Any
 import pytest
 
 from benchmarks import common, tabletop
+from lerobot_openspm.bench import results
 from lerobot_openspm.bench.results import PROVENANCE
 from lerobot_openspm.cli import demo
-from lerobot_openspm.cli.pipeline import Episode
+from lerobot_openspm.cli.pipeline import THREADS, Episode
 
 EPISODES = [Episode("a", 1000, 100, True, "done"), Episode("b", 1000, 300, False, "no_progress")]
 
 
 @pytest.fixture(autouse=True)
 def stages(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(results, "_threads", lambda: 7)
+
     def collect(root: Path, demos: int) -> dict[str, Any]:
         root.mkdir(parents=True, exist_ok=True)
         return {"frames": 200, "episodes": 2}
@@ -37,6 +40,7 @@ def test_the_demo_keeps_its_figures(tmp_path: Path, capsys: pytest.CaptureFixtur
     assert (kept["success"], kept["n"], kept["seed"], kept["demonstrations"]) == (0.5, 2, 1000, 4)
     assert kept["per_task"] == {"a": 1.0, "b": 0.0}
     assert json.loads(capsys.readouterr().out.splitlines()[-1])["success"] == 0.5
+    assert kept["machine"]["threads"] == THREADS
     # How long a training took that was resumed is not known; the whole took as long as it took.
     assert kept["train_s"] is None
     assert kept["total_s"] >= 0
@@ -67,4 +71,5 @@ def test_a_comparison_keeps_all_its_runs(
     assert set(PROVENANCE) <= set(kept)
     assert list(kept["runs"]) == runs
     assert (kept["n"], kept["seed"]) == (2, seed)
+    assert kept["machine"]["threads"] == THREADS
     assert kept["runs"][runs[0]]["failed"] == [["b", 1000, "no_progress"]]

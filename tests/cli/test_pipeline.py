@@ -5,6 +5,7 @@ from pathlib import Path
 import pytest
 
 from lerobot_openspm.cli import pipeline
+from lerobot_openspm.cli.collect import SUMMARY_FILE, CollectConfig
 from lerobot_openspm.cli.demo import EVALUATION_SEED
 from lerobot_openspm.cli.pipeline import (
     Episode,
@@ -77,6 +78,69 @@ def test_what_some_code_made_is_kept_until_that_code_changes(tmp_path: Path, mon
     assert [path.name for path in folder().iterdir()] == ["recording"]
     (package / "records.py").write_text("changed")
     assert list(folder().iterdir()) == []
+
+
+@pytest.fixture
+def recorder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """The folder of the one file of code that records, in place of the package; recording notes its text."""
+    package = tmp_path / "package"
+    package.mkdir()
+    (package / "records.py").write_text("first")
+    monkeypatch.setattr(pipeline.lerobot_openspm, "__file__", str(package / "__init__.py"))
+    monkeypatch.setattr(pipeline, "LIBERO_ASSETS", tmp_path / "assets.txt")
+    monkeypatch.setattr(pipeline, "RECORDED_BY", dict.fromkeys(pipeline.RECORDED_BY, ("records.py",)))
+
+    def collect(config: CollectConfig) -> None:
+        summary = Path(config.root or "") / SUMMARY_FILE
+        if not summary.exists():
+            summary.parent.mkdir(parents=True)
+            summary.write_text((package / "records.py").read_text())
+
+    monkeypatch.setattr(pipeline, "collect", collect)
+    return package
+
+
+def test_demonstrations_are_recorded_anew_when_the_code_that_records_changes(recorder: Path, tmp_path: Path):
+    dataset, unfinished = tmp_path / "run/dataset", tmp_path / "run/dataset.partial"
+    pipeline.collect_dataset(dataset, 1)
+    unfinished.mkdir()
+    (dataset / "kept").touch()
+    pipeline.collect_dataset(dataset, 1)
+    assert (dataset / "kept").exists()
+    (recorder / "records.py").write_text("second")
+    pipeline.collect_dataset(dataset, 1)
+    assert not (dataset / "kept").exists()
+    assert not unfinished.exists()
+    assert (dataset / SUMMARY_FILE).read_text() == "second"
+
+
+def test_demonstrations_are_kept_once_it_is_noted_what_recorded_them(recorder: Path, tmp_path: Path):
+    dataset = tmp_path / "dataset"
+    pipeline.collect_dataset(dataset, 1)
+    (dataset / "kept").touch()
+    noted = tmp_path / "dataset.sha256"
+    noted.write_text(pipeline.recorded_by("openspm_tabletop"))
+    pipeline.collect_dataset(dataset, 1)
+    assert (dataset / "kept").exists()
+    noted.unlink()
+    pipeline.collect_dataset(dataset, 1)
+    assert not (dataset / "kept").exists()
+
+
+def test_liberos_assets_count_for_its_demonstrations_alone(recorder: Path, tmp_path: Path):
+    before = {simulator: pipeline.recorded_by(simulator) for simulator in pipeline.RECORDED_BY}
+    (tmp_path / "assets.txt").write_text("other assets")
+    after = {simulator: pipeline.recorded_by(simulator) for simulator in pipeline.RECORDED_BY}
+    assert before["openspm_tabletop"] == after["openspm_tabletop"]
+    assert before["libero"] != after["libero"]
+
+
+def test_a_folder_that_was_not_recorded_is_left_to_be_refused(recorder: Path, tmp_path: Path):
+    (tmp_path / "dataset/meta").mkdir(parents=True)
+    (tmp_path / "dataset/precious.txt").write_text("keep")
+    with pytest.raises(FileExistsError):
+        pipeline.collect_dataset(tmp_path / "dataset", 1)
+    assert (tmp_path / "dataset/precious.txt").exists()
 
 
 def test_what_was_not_measured_here_is_left_alone(tmp_path: Path):

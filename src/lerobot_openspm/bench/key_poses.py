@@ -28,7 +28,7 @@ from lerobot_openspm.mining.signals import Episode, observe_robot
 
 SIMULATORS = ("openspm_tabletop", "libero")
 # The package's files that make a recording what it is.
-RECORDED_BY = ("envs/**/*.py", "bench/recording.py", "bench/contact_sensor.py")
+RECORDED_BY = ("envs/**/*.py", "geometry/se3.py", "bench/recording.py", "bench/contact_sensor.py")
 TOLERANCE_STEPS = 3
 # LIBERO's names of the rotation's numbers are wrong, as in the public dataset.
 ROTATIONS: Mapping[str, RotationKind | None] = {"openspm_tabletop": None, "libero": "axis_angle"}

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import datetime
+import importlib.metadata
 import os
 import platform
 import shlex
@@ -21,7 +22,13 @@ from lerobot_openspm.files import write_json
 # where nothing is drawn.
 PROVENANCE = ("commit", "dirty", "command", "date", "machine", "seed", "n")
 # What can change a figure while it is not committed. Results are left out: they are written in turn.
-MEASURED_CODE = ("src", "configs", "benchmarks", ":(exclude)benchmarks/results")
+MEASURED_CODE = (
+    "src", "configs", "benchmarks", "scripts/libero_assets.txt", "Makefile", "pyproject.toml",
+    ":(exclude)benchmarks/results",
+)  # fmt: skip
+# Whose versions a result tells. Their bounds in pyproject.toml make no figure stale: a bound says what may be
+# installed, not what was.
+PACKAGES = ("lerobot", "mujoco", "numpy", "torch")
 
 
 @dataclass
@@ -31,13 +38,14 @@ class ResultOption:
     result: str | None = None  # JSON file for what is printed, with commit, command and machine
 
 
-def write_result(path: Path, measured: Mapping[str, Any]) -> dict[str, Any]:
+def write_result(path: Path, measured: Mapping[str, Any], threads: int | None = None) -> dict[str, Any]:
     """Write a result with its provenance, and return both.
 
     Args:
         path: The JSON file; it is replaced as a whole.
         measured: The figures, with ``seed`` (None where nothing is drawn) and ``n``, over how many they were
             taken.
+        threads: How many each process computed with that was started to measure; None if this one measured.
 
     Raises:
         OpenSPMError: ``seed`` or ``n`` is missing, or a figure has the name of a piece of provenance.
@@ -55,7 +63,7 @@ def write_result(path: Path, measured: Mapping[str, Any]) -> dict[str, Any]:
         "dirty": dirty,
         "command": command_line(sys.orig_argv, sys.argv),
         "date": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
-        "machine": machine(),
+        "machine": machine(threads),
         "seed": measured["seed"],
         "n": measured["n"],
         **measured,
@@ -91,16 +99,20 @@ def command_line(started: Sequence[str], arguments: Sequence[str]) -> str:
     return shlex.join(words)
 
 
-def machine() -> dict[str, Any]:
-    """What times depend on; ``threads`` is how many this process computes with."""
-    torch = sys.modules.get("torch")
-    threads = torch.get_num_threads() if torch else int(os.environ.get("OMP_NUM_THREADS") or 0) or None
+def machine(threads: int | None = None) -> dict[str, Any]:
+    """What figures depend on beside the code; ``threads`` are this process's if not given."""
     return {
         "cpu": _cpu_model(),
         "cores": os.cpu_count(),
-        "threads": threads or os.cpu_count(),
+        "threads": threads or _threads(),
         "python": platform.python_version(),
+        "packages": {name: importlib.metadata.version(name) for name in PACKAGES},
     }
+
+
+def _threads() -> int | None:
+    torch = sys.modules.get("torch")
+    return torch.get_num_threads() if torch else int(os.environ.get("OMP_NUM_THREADS") or 0) or os.cpu_count()
 
 
 def _cpu_model() -> str:

@@ -189,5 +189,7 @@ def main(args: Sequence[str] | None = None) -> None:
     config = draccus.parse(config_class=options_class, args=options)
     measured = measure(config)
     if config.result:
-        write_result(Path(config.result), {"seed": getattr(config, "seed", None), **measured})
+        # Policies act on one thread, in this process or in others.
+        threads = 1 if what in MEASURES else None
+        write_result(Path(config.result), {"seed": getattr(config, "seed", None), **measured}, threads)
     print(json.dumps(measured))

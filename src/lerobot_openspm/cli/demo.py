@@ -16,7 +16,7 @@ import draccus
 import numpy as np
 
 from lerobot_openspm.bench.results import ResultOption, write_result
-from lerobot_openspm.cli.pipeline import collect_dataset, evaluate, mean_steps, rate, success, train
+from lerobot_openspm.cli.pipeline import THREADS, collect_dataset, evaluate, mean_steps, rate, success, train
 from lerobot_openspm.cli.report import write_report
 
 # lerobot-eval's own default; demonstrations are recorded from seeds far away from it.
@@ -85,5 +85,5 @@ def main(args: list[str]) -> None:
         # A total is only told where nothing was kept from before.
         timing = {"train_s": summary["train_s"], "total_s": summary["total_s"] if is_new else None}
         figure = {"seed": EVALUATION_SEED, **success(episodes), **timing, "demonstrations": config.demos}
-        write_result(Path(config.result), figure)
+        write_result(Path(config.result), figure, THREADS)
     print(json.dumps(summary))

@@ -21,7 +21,7 @@ from scipy.stats import binomtest
 from tqdm import tqdm
 
 import lerobot_openspm
-from lerobot_openspm.cli.collect import SUMMARY_FILE, CollectConfig, collect
+from lerobot_openspm.cli.collect import SUMMARY_FILE, CollectConfig, SimulatorConfig, collect
 from lerobot_openspm.envs.tasks import TASK_NAMES
 from lerobot_openspm.errors import OpenSPMError
 from lerobot_openspm.files import write_beside, write_json
@@ -30,7 +30,22 @@ logger = logging.getLogger(__name__)
 
 REPO_ID = "local/openspm_tabletop"
 TRAIN_CONFIG = Path("configs/openspm_tabletop_train.yaml")
+LIBERO_ASSETS = Path("scripts/libero_assets.txt")
+# Each process computes with one; several run side by side.
+THREADS = 1
 DONE, LOG = "done.json", "output.log"
+# The package's files that make a simulator's demonstrations what they are.
+RECORDED_BY = {
+    "openspm_tabletop": ("cli/collect.py", "envs/*.py"),
+    "libero": (
+        "cli/collect.py",
+        *(
+            f"envs/{name}.py"
+            for name in ("calibration", "gl_backend", "motions", "recording", "seeds", "simulator")
+        ),
+        "envs/libero/*.py",
+    ),
+}
 
 
 @dataclass(frozen=True)
@@ -44,10 +59,23 @@ class Episode:
     status: str
 
 
-def collect_dataset(root: Path, demos: int) -> dict[str, Any]:
-    """Record demonstrations, or keep those that are there."""
+def collect_dataset(
+    root: Path, demos: int, simulator: str = "openspm_tabletop", task: str = "all"
+) -> dict[str, Any]:
+    """Record demonstrations, or keep those that are there, finished or not, if the same code made them."""
     logger.info("recording %d demonstrations a task into %s", demos, root)
-    return collect(CollectConfig(episodes=demos, root=str(root), repo_id=REPO_ID))
+    # What else lies there is refused by `collect`, not removed.
+    if not root.exists() or (root / SUMMARY_FILE).is_file():
+        made_of = recorded_by(simulator)
+        discard_unless(root, made_of)
+        discard_unless(root.with_name(f"{root.name}.partial"), made_of)
+    return collect(CollectConfig(SimulatorConfig(simulator, task), demos, str(root)))
+
+
+def recorded_by(simulator: str) -> str:
+    """The digest of what makes a simulator's demonstrations, to be kept beside them."""
+    assets = [LIBERO_ASSETS] if simulator == "libero" and LIBERO_ASSETS.is_file() else []
+    return digest(assets, [], RECORDED_BY[simulator])
 
 
 def train(
@@ -213,7 +241,7 @@ def _line(command: Sequence[str]) -> list[str]:
 
 
 def _environment() -> dict[str, str]:
-    return {**os.environ, "OMP_NUM_THREADS": "1", "HF_HUB_OFFLINE": "1"}
+    return {**os.environ, "OMP_NUM_THREADS": str(THREADS), "HF_HUB_OFFLINE": "1"}
 
 
 def rate(successes: int, n: int) -> dict[str, Any]:
