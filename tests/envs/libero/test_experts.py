@@ -11,8 +11,8 @@ pytest.importorskip("libero.libero", reason="needs lerobot[libero]")
 pytestmark = pytest.mark.libero
 
 MAX_STEPS = 280
-# Two scenes of each task, which take two minutes in all.
-SEEDS = range(TUNING_SEED_START, TUNING_SEED_START + 2)
+# Five scenes of each task, which take two minutes in all.
+SEEDS = range(TUNING_SEED_START, TUNING_SEED_START + 5)
 
 
 def make_simulator(task: str) -> LiberoSimulator:
