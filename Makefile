@@ -38,7 +38,7 @@ demo: egl ## collect DEMOS demonstrations, train, evaluate EPISODES episodes; RE
 	@$(BIN)/openspm demo --demos=$(DEMOS) --episodes=$(EPISODES) --started_at=$(STARTED_AT) \
 		$(if $(RESULT),--result=$(RESULT))
 
-figures: egl ## take the published figures (FIGURES="NAME ..." some of them) that are missing or stale: hours
+figures: egl ## take the published figures (FIGURES="NAME ..." some of them) that are missing or stale, on LIBERO too if it is installed: hours
 	@$(BIN)/python -m benchmarks.figures $(FIGURES)
 
 # LIBERO and its scenes are hundreds of megabytes that only these figures need.

@@ -1,8 +1,7 @@
-"""Error of cameras that were estimated from ten episodes, against the simulators' own.
+"""Error of cameras that were estimated from ten episodes, against the simulator's own.
 
-``python -m benchmarks.calibration [--tabletop=FOLDER] [--libero=FOLDER]``: the tabletop's demonstrations are
-those of `make demo` if not given; LIBERO's are a dataset that ``openspm collect --env.type=libero
---episodes=10`` recorded, left out if not given. Ten episodes are the k-th of each task, for several k.
+``python -m benchmarks.calibration [--env.type=libero]``: from the demonstrations of `make demo` or of `make
+libero`, recorded if need be. Ten episodes are the k-th of each task, for several k.
 """
 
 import argparse
@@ -15,12 +14,14 @@ from typing import Any
 
 import cv2
 import numpy as np
-from benchmarks.common import dataset, write
+from benchmarks.common import DEMOS, write
 from lerobot.datasets import LeRobotDatasetMetadata
 
 from lerobot_openspm.calibration.estimate import estimate_camera
 from lerobot_openspm.calibration.tracks import track_features
+from lerobot_openspm.cli.bench import DEFAULTS
 from lerobot_openspm.cli.calibrate import errors
+from lerobot_openspm.cli.pipeline import collect_dataset
 from lerobot_openspm.configuration_openspm import OpenSPMConfig
 from lerobot_openspm.errors import CalibrationError
 from lerobot_openspm.geometry.camera import Camera, load_cameras
@@ -41,25 +42,21 @@ class Source:
     cameras: dict[str, Camera]
 
 
-def main() -> dict:
-    parser = argparse.ArgumentParser()
-    parser.add_argument("--tabletop", type=Path, help="folder of the tabletop's demonstrations")
-    parser.add_argument("--libero", type=Path, help="folder of LIBERO demonstrations")
-    arguments = parser.parse_args()
-    folders = {"tabletop": arguments.tabletop or dataset()} | (
-        {"libero": arguments.libero} if arguments.libero else {}
-    )
+def main(simulator: str) -> dict[str, Any]:
+    """Measure, write and return the result."""
+    root = Path(DEFAULTS[simulator][0]) / "dataset"
+    collect_dataset(root, DEMOS, simulator)
     cv2.setNumThreads(1)
+    source = read(root, OpenSPMConfig(device="cpu", push_to_hub=False, state_rotation="axis_angle"))
+    name, suffix = ("tabletop", "") if simulator == "openspm_tabletop" else (simulator, f"_{simulator}")
     rows = {}
-    for name, folder in folders.items():
-        source = read(folder, OpenSPMConfig(device="cpu", push_to_hub=False, state_rotation="axis_angle"))
-        for key, truth in source.cameras.items():
-            runs = [run for k in range(CHOICES) for run in estimate(source, key, truth, k)]
-            rows[f"{name} {key.rsplit('.', 1)[1]}"] = {
-                "field of view given": summary([run for run in runs if run["fov_given"]]),
-                "field of view estimated": summary([run for run in runs if not run["fov_given"]]),
-            }
-    return write("calibration", {"seed": 0, "n": CHOICES, "episodes": 10, "cameras": rows})
+    for key, truth in source.cameras.items():
+        runs = [run for k in range(CHOICES) for run in estimate(source, key, truth, k)]
+        rows[f"{name} {key.rsplit('.', 1)[1]}"] = {
+            "field of view given": summary([run for run in runs if run["fov_given"]]),
+            "field of view estimated": summary([run for run in runs if not run["fov_given"]]),
+        }
+    return write(f"calibration{suffix}", {"seed": 0, "n": CHOICES, "episodes": 10, "cameras": rows})
 
 
 def read(folder: Path, config: OpenSPMConfig) -> Source:
@@ -127,4 +124,6 @@ def summary(runs: list[dict]) -> dict:
 
 
 if __name__ == "__main__":
-    print(json.dumps(main()))
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--env.type", dest="simulator", choices=list(DEFAULTS), default="openspm_tabletop")
+    print(json.dumps(main(parser.parse_args().simulator)))

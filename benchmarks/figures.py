@@ -1,15 +1,16 @@
 """Every published figure: the command that takes it, and the code that it measures.
 
-    python -m benchmarks.figures                     # take all that need no LIBERO, unless current
+    python -m benchmarks.figures                     # take all, unless current
     python -m benchmarks.figures tracking libero_goal   # take these, unless current
 
-A figure `NAME` is kept as ``benchmarks/results/NAME.json``. A command that takes hours goes on where it was
-interrupted.
+Those on LIBERO are left out of all where it is not installed. A figure `NAME` is kept as
+``benchmarks/results/NAME.json``. A command that takes hours goes on where it was interrupted.
 """
 
 from __future__ import annotations
 
 import argparse
+import importlib.util
 import json
 import logging
 import shlex
@@ -171,10 +172,22 @@ FIGURES: dict[str, Figure] = {
         "--env.type=libero --seed=30000",
     ),
     "calibration": Figure(
-        "python -m benchmarks.calibration --libero=outputs/libero/demos_10/dataset",
-        (*CALIBRATION, *RECORDING["openspm_tabletop"], *RECORDING["libero"], str(LIBERO_ASSETS)),
+        "python -m benchmarks.calibration", (*CALIBRATION, *RECORDING["openspm_tabletop"])
+    ),
+    "calibration_libero": Figure(
+        "python -m benchmarks.calibration --env.type=libero",
+        (*CALIBRATION, *RECORDING["libero"], str(LIBERO_ASSETS)),
     ),
 }  # fmt: skip
+
+
+def takeable() -> list[str]:
+    """All figures, but for those on LIBERO where that is not installed; which these are is told."""
+    if importlib.util.find_spec("libero") is not None:
+        return list(FIGURES)
+    left_out = [name for name, figure in FIGURES.items() if needs_libero(figure)]
+    logger.warning("LIBERO is not installed; run: make libero-setup. Left out: %s", ", ".join(left_out))
+    return [name for name in FIGURES if name not in left_out]
 
 
 def needs_libero(figure: Figure) -> bool:
@@ -224,7 +237,7 @@ if __name__ == "__main__":
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("names", nargs="*", metavar="NAME", help=f"of: {', '.join(FIGURES)}")
-    chosen = parser.parse_args().names or [n for n, one in FIGURES.items() if not needs_libero(one)]
+    chosen = parser.parse_args().names or takeable()
     if unknown := sorted(set(chosen) - set(FIGURES)):
         parser.error(f"no figures {', '.join(unknown)}; expected some of {', '.join(FIGURES)}")
     try:

@@ -8,8 +8,15 @@ guard's own: none is an evaluation seed, and nothing is tuned on them.
 
 The episodes are few, so the floors follow from the binomial distribution. A build that succeeds at the
 expected rate falls below one of them with a probability of at most ``FALSE_ALARM``: the floor of all episodes
-may use half of it, the floors of the single tasks together the other half. The verdict also says what the
-guard can see: the success rate, of all tasks and of a single one, that it catches with probability ``POWER``.
+may use half of it, the floors of the single tasks together the other half. That may be much, because on one
+machine the same code always gives the same episodes: only a change of the code draws anew. The verdict also
+says what the guard can see: the success rate, of all tasks and of a single one, that it catches with
+probability ``POWER``.
+
+tabletop: 77 of 80 episodes must succeed, 6 of 8 of each task. A true rate of 0.918 is caught with probability
+0.9, one of 0.935 with 0.77, a single task's of 0.462 with 0.9.
+libero: 18 of 20 episodes must succeed, 1 of 2 of each task. A true rate of 0.755 is caught with probability
+0.9, one of 0.935 with 0.14, a single task's of 0.051 with 0.9.
 """
 
 from __future__ import annotations
@@ -34,7 +41,7 @@ from scipy.stats import binom
 from lerobot_openspm.cli import pipeline
 from lerobot_openspm.envs.seeds import TUNING_SEED_START
 
-FALSE_ALARM, POWER = 0.01, 0.9
+FALSE_ALARM, POWER = 0.1, 0.9
 
 logger = logging.getLogger(__name__)
 
@@ -44,7 +51,7 @@ class Standard:
     """What is run of a suite, and how often a healthy build succeeds.
 
     Attributes:
-        expected: Success rate of a healthy build; the one number to change when the policy gets better.
+        expected: Success rate of a healthy build; the one number to change when more is measured.
         demos: Demonstrations a task.
         episodes: Episodes a task.
         seed: The first episode's seed.
@@ -56,10 +63,13 @@ class Standard:
     seed: int
 
 
+# On tuning seeds 230 of 230 of the tabletop's episodes succeeded; expected is the lower end of the 95 %
+# Wilson interval. On LIBERO 20 of 20 did, whose lower end of 0.839 would let much pass; expected is the rate
+# at which all 20 succeed every other time.
 # Nobody else uses the seeds from 2,800,000 to 2,800,199.
 STANDARDS = {
-    "tabletop": Standard(expected=0.98, demos=10, episodes=8, seed=TUNING_SEED_START + 800_000),
-    "libero": Standard(expected=0.95, demos=1, episodes=2, seed=TUNING_SEED_START + 800_100),
+    "tabletop": Standard(expected=0.983, demos=10, episodes=8, seed=TUNING_SEED_START + 800_000),
+    "libero": Standard(expected=0.966, demos=1, episodes=2, seed=TUNING_SEED_START + 800_100),
 }
 
 

@@ -15,6 +15,7 @@ what the policy follows; "unfiltered" keeps each picture's own estimate until th
 the hand; "one view" is the filter with the first camera alone. Orientation is the whole rotation, up to what
 truly looks the same: of round objects the tilt alone; until it is touched, an object known by patches is
 taken to stand as demonstrated. Failed episodes count to their end."""
+CALIBRATION = ("calibration", "calibration_libero")
 NOISE = ("measurement_noise", "measurement_noise_libero")
 VARIANTS = {"filtered": "filtered", "unfiltered": "unfiltered", "one_view": "one view"}
 
@@ -29,7 +30,7 @@ def perception_sections() -> list[str]:
             section("Covariance of the measured poses", NOISE, _noise),
             section("Objects displaced or dropped", "tracking", _disturbed),
             section("Cameras moved", "cameras", _disturbed),
-            section("Cameras calibrated from demonstrations", "calibration", _calibration),
+            section("Cameras calibrated from demonstrations", CALIBRATION, _calibration),
         ],
     )
 
@@ -107,7 +108,7 @@ def _disturbed(result: Quoted) -> str:
     return table(["", "Success", "95 % interval", "Episodes"], rows)
 
 
-def _calibration(result: Quoted) -> str:
+def _calibration(results: list[Quoted]) -> str:
     rows = [
         [
             camera,
@@ -118,6 +119,7 @@ def _calibration(result: Quoted) -> str:
             one["rotation_deg_max"],
             one["within"],
         ]
+        for result in results
         for camera, ways in result["cameras"].items()
         for way, one in ways.items()
     ]
@@ -131,7 +133,7 @@ def _calibration(result: Quoted) -> str:
         "Within 5 mm, 0.5 degrees",
     ]
     note = (
-        f"From {result['episodes']} episodes, one of each task, {result['n']} choices of them. See "
+        f"From {results[0]['episodes']} episodes, one of each task, {results[0]['n']} choices of them. See "
         "[calibration.md](calibration.md)."
     )
     return f"{table(heads, rows)}\n\n{note}"

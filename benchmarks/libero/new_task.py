@@ -29,7 +29,6 @@ from benchmarks.libero.stages import (
 )
 from lerobot.datasets import LeRobotDatasetMetadata
 
-from lerobot_openspm.cli.pipeline import THREADS
 from lerobot_openspm.modeling_openspm import OpenSPMPolicy
 
 
@@ -54,7 +53,7 @@ def main(config: NewTaskConfig) -> dict[str, Any]:
     episodes = evaluation(folder / "evaluation", folder, config.states, [config.task])
     taught = {"task": config.task, "demonstrations": config.demos, "teach_s": taught_s}
     figures = {"seed": SEED, **taught, **summary(episodes)}
-    return write(f"libero_new_task_{name}", figures, THREADS)
+    return write(f"libero_new_task_{name}", figures)
 
 
 def teach(nine: Path, root: Path, config: NewTaskConfig, folder: Path) -> float:

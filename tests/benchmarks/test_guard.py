@@ -14,6 +14,7 @@ from scipy.stats import binom
 
 from benchmarks import guard
 from lerobot_openspm.cli import pipeline
+from lerobot_openspm.cli.pipeline import rate
 from lerobot_openspm.envs.seeds import TUNING_SEEDS
 
 ROOT = Path(__file__).parents[2]
@@ -53,6 +54,26 @@ def test_healthy_builds_pass_and_the_caught_rate_is_caught():
     assert below(guard.caught(n, least.total))[0].mean() == pytest.approx(POWER, abs=0.01)
     one = rng.binomial(STANDARD.episodes, guard.caught(STANDARD.episodes, least.task), n_builds) < least.task
     assert one.mean() == pytest.approx(POWER, abs=0.01)
+
+
+@pytest.mark.parametrize("suite", STANDARDS)
+def test_what_is_said_of_the_floors_is_so(suite: str):
+    n_task = STANDARDS[suite].episodes
+    n = len(TASKS) * n_task
+    least = guard.floors(len(TASKS), n_task, STANDARDS[suite].expected)
+    assert least.task >= 1
+    rate_of_all, rate_of_one = guard.caught(n, least.total), guard.caught(n_task, least.task)
+    said = (
+        f"{suite}: {least.total} of {n} episodes must succeed, {least.task} of {n_task} of each task. A "
+        f"true rate of {rate_of_all:.3f} is caught with probability {POWER}, one of 0.935 with "
+        f"{binom.cdf(least.total - 1, n, 0.935):.2f}, a single task's of {rate_of_one:.3f} with {POWER}."
+    )
+    assert said in " ".join(str(guard.__doc__).split())
+
+
+def test_what_is_expected_follows_from_what_was_measured():
+    assert STANDARDS["tabletop"].expected == pytest.approx(rate(230, 230)["interval"][0], abs=1e-3)
+    assert STANDARDS["libero"].expected ** 20 == pytest.approx(0.5, abs=1e-2)
 
 
 def test_what_lies_below_a_floor_is_named():

@@ -14,7 +14,7 @@ import pytest
 from benchmarks.figures import FIGURES, PACKAGE, Figure
 from benchmarks.staleness import ROOT, Quote, origin, quotes, read_result
 
-from benchmarks import figures, tables
+from benchmarks import calibration, common, figures, tables
 from lerobot_openspm.bench.results import PROVENANCE, write_result
 from lerobot_openspm.errors import OpenSPMError
 
@@ -145,7 +145,7 @@ def test_comments_of_a_configuration_are_words_and_its_values_are_not(checkout: 
         ({"commit": "0123456789ab"}, "0123456789ab is not in this history"),
     ],
 )
-def test_what_cannot_be_taken_again_says_why(checkout: Checkout, changed: dict[str, object], reason: str):
+def test_what_cannot_be_taken_again_says_why(checkout: Checkout, changed: dict[str, Any], reason: str):
     checkout.measure(**changed)
     assert reason in str(checkout.origin().missing)
 
@@ -307,3 +307,31 @@ def test_no_figure_is_taken_of_changes_that_are_not_committed(
     with pytest.raises(OpenSPMError, match="commit the changes"):
         figures.main(["tracking"])
     assert taking == []
+
+
+@pytest.mark.parametrize("installed", [True, False])
+def test_without_names_all_figures_are_taken_and_those_left_out_are_told(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture, installed: bool
+):
+    monkeypatch.setattr(figures.importlib.util, "find_spec", lambda _: object() if installed else None)
+    names = figures.takeable()
+    assert {"calibration", "tabletop"} <= set(names)
+    left_out = sorted(set(FIGURES) - set(names))
+    assert ("calibration_libero" in left_out) is not installed
+    assert left_out == sorted(name for name in FIGURES if "libero" in name and not installed)
+    assert all(name in caplog.text for name in left_out)
+    assert ("make libero-setup" in caplog.text) is not installed
+
+
+@pytest.mark.parametrize("simulator", ["openspm_tabletop", "libero"])
+def test_cameras_are_estimated_of_one_simulator_at_a_time(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, simulator: str
+):
+    recorded = []
+    monkeypatch.setattr(calibration, "collect_dataset", lambda *given: recorded.append(given))
+    monkeypatch.setattr(calibration, "read", lambda *_: SimpleNamespace(cameras={}))
+    monkeypatch.setattr(common, "RESULTS", tmp_path)
+    calibration.main(simulator)
+    assert [given[1:] for given in recorded] == [(10, simulator)]
+    (name,) = [path.stem for path in tmp_path.iterdir()]
+    assert FIGURES[name].command.endswith("--env.type=libero") is (simulator == "libero")
