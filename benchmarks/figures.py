@@ -113,15 +113,20 @@ class Figure:
     Attributes:
         command: The command line, from the root of the checkout; what it wrote says with what it was run.
         paths: Git's names (pathspecs) of the code whose change makes the figure stale.
+        checkpoint_of: The figure that makes the checkpoint which this one measures; "" if it makes its own.
     """
 
     command: str
     paths: tuple[str, ...]
+    checkpoint_of: str = ""
 
 
-def _bench(what: str, name: str, paths: tuple[str, ...], options: str = "") -> Figure:
+def _bench(
+    what: str, name: str, paths: tuple[str, ...], options: str = "", checkpoint_of: str = ""
+) -> Figure:
     options = f" {options}" if options else ""
-    return Figure(f"openspm bench {what}{options} --result=benchmarks/results/{name}.json", paths)
+    command = f"openspm bench {what}{options} --result=benchmarks/results/{name}.json"
+    return Figure(command, paths, checkpoint_of)
 
 
 def _tabletop(comparison: str) -> Figure:
@@ -139,10 +144,13 @@ FIGURES: dict[str, Figure] = {
         "openspm demo --demos=10 --episodes=20 --result=benchmarks/results/tabletop.json", TABLETOP
     ),
     **{name: _tabletop(name) for name in ("execution", "oracle", "conditioning", "compound", "two_bowls")},
-    "perception_tabletop": _bench("perception", "perception_tabletop", (*TABLETOP, *ALONG)),
-    "tracking": _bench("tracking", "tracking", (*TABLETOP, *TRACKING)),
-    "cameras": _bench("cameras", "cameras", (*TABLETOP, *TRACKING)),
-    "teach": _bench("teach", "teach", (*TABLETOP, f"{PACKAGE}/bench/teach.py", *TRACKING)),
+    "perception_tabletop": _bench(
+        "perception", "perception_tabletop", (*TABLETOP, *ALONG), checkpoint_of="tabletop"
+    ),
+    **{
+        name: _bench(name, name, (*TABLETOP, *own, *TRACKING), checkpoint_of="tabletop")
+        for name, own in {"tracking": (), "cameras": (), "teach": (f"{PACKAGE}/bench/teach.py",)}.items()
+    },
     "keyposes_tabletop": _bench(
         "keyposes", "keyposes_tabletop", (*KEY_POSES, *RECORDING["openspm_tabletop"]),
         "--env.type=openspm_tabletop --seed=30000",
@@ -153,9 +161,9 @@ FIGURES: dict[str, Figure] = {
         (f"{PACKAGE}/memory", f"{PACKAGE}/geometry", f":(glob){PACKAGE}/experience*.py",
          f":(glob){PACKAGE}/bench/synthetic_*.py", f"{PACKAGE}/bench/memory.py"),
     ),
-    "measurement_noise": Figure(f"python -m {NOISE}", (*TABLETOP, *ALONG, *NOISE_PATHS)),
+    "measurement_noise": Figure(f"python -m {NOISE}", (*TABLETOP, *ALONG, *NOISE_PATHS), "tabletop"),
     "measurement_noise_libero": Figure(
-        f"python -m {NOISE} --env.type=libero", (*LIBERO, *ALONG, *NOISE_PATHS)
+        f"python -m {NOISE} --env.type=libero", (*LIBERO, *ALONG, *NOISE_PATHS), "libero_goal"
     ),
     "libero_goal": _libero("run", *ACCURACY, options=LIBERO_GOAL),
     "libero_accuracy": _libero("run", *ACCURACY, options=LIBERO_GOAL),
@@ -166,7 +174,9 @@ FIGURES: dict[str, Figure] = {
     "libero_losses": _libero("losses"),
     "libero_latency": _libero("latency"),
     "libero_equality": _libero("equality"),
-    "perception_libero": _bench("perception", "perception_libero", (*LIBERO, *ALONG), "--env.type=libero"),
+    "perception_libero": _bench(
+        "perception", "perception_libero", (*LIBERO, *ALONG), "--env.type=libero", "libero_goal"
+    ),
     "keyposes_libero": _bench(
         "keyposes", "keyposes_libero", (*KEY_POSES, *RECORDING["libero"], str(LIBERO_ASSETS)),
         "--env.type=libero --seed=30000",
@@ -196,12 +206,17 @@ def needs_libero(figure: Figure) -> bool:
 
 
 def take(name: str) -> None:
-    """Run a figure's command, unless its result is current. One that fails leaves the others to be taken."""
+    """Run a figure's command, unless its result is current. One that fails leaves the others to be taken.
+
+    Whose checkpoint it measures is taken first, so that the checkpoint is of the present code.
+    """
     figure = FIGURES[name]
     problem = origin(name, figure.paths, expected_command=figure.command).problem
     if problem is None:
         logger.info("%s is current", name)
         return
+    if figure.checkpoint_of:
+        take(figure.checkpoint_of)
     logger.info("%s (%s): %s", name, problem, figure.command)
     program, *arguments = shlex.split(figure.command)
     done = subprocess.run([str(Path(sys.executable).with_name(program)), *arguments], check=False)
