@@ -29,11 +29,13 @@ def corners(points: Array, tolerance: Array) -> NDArray[np.int64]:
         first, last = spans.pop()
         if last - first < 2:
             continue
-        excess = _distance_to_chord(points[first : last + 1]) / tolerance[first : last + 1]
-        worst = int(np.argmax(excess))
-        if excess[worst] > 1.0:
-            found.append(first + worst)
-            spans += [(first, first + worst), (first + worst, last)]
+        distance = _distance_to_chord(points[first : last + 1])
+        outside = distance > tolerance[first : last + 1]
+        if outside.any():
+            # It turns where it is furthest off, not where the tolerance is smallest, near the contact.
+            corner = first + int(np.argmax(np.where(outside, distance, 0.0)))
+            found.append(corner)
+            spans += [(first, corner), (corner, last)]
     return np.array(sorted(found), dtype=np.int64)
 
 
