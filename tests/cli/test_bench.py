@@ -64,11 +64,15 @@ def test_tracking_is_measured_and_goes_on_where_it_was(
         "success_displaced", "success_dropped", "success_displaced_untracked", "success_dropped_untracked",
         "n", "conditions",
     }  # fmt: skip
-    assert result["n"] == 1
     log = tmp_path / "out" / "episodes.jsonl"
     lines = log.read_text().splitlines()
-    assert len(lines) == 4
-    assert all(json.loads(line)["disturbed_at"] is not None for line in lines)
+    disturbed = {e["condition"]: e["disturbed_at"] is not None for e in map(json.loads, lines)}
+    assert len(lines) == len(disturbed) == 4
+    assert disturbed["displaced"]
+    assert disturbed["displaced_untracked"]
+    # So small a checkpoint need not grasp what should be dropped: then nothing is measured.
+    assert {name: one["n"] for name, one in result["conditions"].items()} == disturbed
+    assert result["n"] == min(disturbed.values())
     log.write_text("\n".join(lines[:3]) + '\n{"torn')
     assert json.loads(openspm(*arguments)[1].splitlines()[-1]) == result
 

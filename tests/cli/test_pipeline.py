@@ -29,6 +29,7 @@ def line(**changes: object) -> str:
 
 def test_rates_come_with_wilsons_interval():
     # The textbook case: 95 of 100 gives 0.888 to 0.978.
+    assert rate(0, 0) == {"success": None, "n": 0, "interval": [0.0, 1.0]}
     assert rate(95, 100) == {"success": 0.95, "n": 100, "interval": [0.8882, 0.9785]}
 
 

@@ -245,7 +245,9 @@ def _environment() -> dict[str, str]:
 
 
 def rate(successes: int, n: int) -> dict[str, Any]:
-    """A success rate with its 95 % Wilson interval."""
+    """A success rate with its 95 % Wilson interval; of no episodes nothing is known."""
+    if n == 0:
+        return {"success": None, "n": 0, "interval": [0.0, 1.0]}
     interval = binomtest(successes, n).proportion_ci(method="wilson")
     return {
         "success": successes / n,

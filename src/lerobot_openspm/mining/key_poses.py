@@ -48,6 +48,8 @@ PUSH_BAND_M = 0.015
 STANDING_M = 0.003
 # A hand that sinks or rises by less than this in two steps travels level.
 LEVEL_M = 0.001
+# However sharp a corner is, it is less sure than a gripper transition: a judge may name it otherwise.
+MAX_CORNER_CONFIDENCE = 0.9
 # Corners this close to a contact pose are the contact pose.
 MIN_SPACING_M = 0.02
 
@@ -242,7 +244,7 @@ def _corner_marks(
 
 
 def _corner_confidence(points: Array, corner: int, reach: int = 4) -> float:
-    """How sharply the path turns or slows at a corner: 0.5 for a straight fast pass, 1 for a full stop."""
+    """How sharply the path turns or slows at a corner, from 0.5 for a straight fast pass."""
     before = points[corner] - points[max(corner - reach, 0)]
     after = points[min(corner + reach, len(points) - 1)] - points[corner]
     norms = np.linalg.norm(before) * np.linalg.norm(after)
@@ -250,7 +252,7 @@ def _corner_confidence(points: Array, corner: int, reach: int = 4) -> float:
     steps = np.linalg.norm(np.diff(points, axis=0), axis=1)
     usual = float(np.median(steps))
     slowing = 1 - float(steps[max(corner - 1, 0) : corner + 1].mean()) / usual if usual > 1e-9 else 0.0
-    return float(np.clip(0.5 + max(turning, 0.5 * slowing), 0.5, 1.0))
+    return float(np.clip(0.5 + max(turning, 0.5 * slowing), 0.5, MAX_CORNER_CONFIDENCE))
 
 
 def _measure(episode: Episode, marks: list[_Mark], moving: NDArray[np.bool_]) -> list[KeyPose]:
