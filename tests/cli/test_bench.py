@@ -55,7 +55,7 @@ def test_tracking_is_measured_and_goes_on_where_it_was(
 ):
     arguments = (
         "bench", "tracking", f"--policy.path={checkpoint}", "--env.task=bowl_on_plate", "--episodes=1",
-        "--seed=2000000", f"--workers={workers}", f"--output={tmp_path / 'out'}",
+        "--seed=2000008", f"--workers={workers}", f"--output={tmp_path / 'out'}",
     )  # fmt: skip
     code, out, err = openspm(*arguments)
     assert code == 0, err
@@ -64,15 +64,11 @@ def test_tracking_is_measured_and_goes_on_where_it_was(
         "success_displaced", "success_dropped", "success_displaced_untracked", "success_dropped_untracked",
         "n", "conditions",
     }  # fmt: skip
+    assert result["n"] == 1
     log = tmp_path / "out" / "episodes.jsonl"
     lines = log.read_text().splitlines()
-    disturbed = {e["condition"]: e["disturbed_at"] is not None for e in map(json.loads, lines)}
-    assert len(lines) == len(disturbed) == 4
-    assert disturbed["displaced"]
-    assert disturbed["displaced_untracked"]
-    # So small a checkpoint need not grasp what should be dropped: then nothing is measured.
-    assert {name: one["n"] for name, one in result["conditions"].items()} == disturbed
-    assert result["n"] == min(disturbed.values())
+    assert len(lines) == 4
+    assert all(json.loads(line)["disturbed_at"] is not None for line in lines)
     log.write_text("\n".join(lines[:3]) + '\n{"torn')
     assert json.loads(openspm(*arguments)[1].splitlines()[-1]) == result
 
