@@ -42,7 +42,7 @@ figures: egl ## take the published figures (FIGURES="NAME ..." some of them) tha
 	@$(BIN)/python -m benchmarks.figures $(FIGURES)
 
 # LIBERO and its scenes are hundreds of megabytes that only these figures need.
-libero-setup: egl
+libero-setup: egl ## install LIBERO, with its meshes and textures
 	@$(BIN)/python -c 'import importlib.util, sys; sys.exit(importlib.util.find_spec("libero") is None)' || { \
 		$(BIN)/python -m ensurepip >/dev/null; \
 		$(BIN)/python -m pip install --no-input --disable-pip-version-check --editable '.[libero]'; }

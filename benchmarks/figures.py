@@ -113,20 +113,18 @@ class Figure:
     Attributes:
         command: The command line, from the root of the checkout; what it wrote says with what it was run.
         paths: Git's names (pathspecs) of the code whose change makes the figure stale.
-        checkpoint_of: The figure that makes the checkpoint which this one measures; "" if it makes its own.
+        simulator: The one whose default checkpoint it measures; "" if it makes its own.
     """
 
     command: str
     paths: tuple[str, ...]
-    checkpoint_of: str = ""
+    simulator: str = ""
 
 
-def _bench(
-    what: str, name: str, paths: tuple[str, ...], options: str = "", checkpoint_of: str = ""
-) -> Figure:
+def _bench(what: str, name: str, paths: tuple[str, ...], options: str = "", simulator: str = "") -> Figure:
     options = f" {options}" if options else ""
     command = f"openspm bench {what}{options} --result=benchmarks/results/{name}.json"
-    return Figure(command, paths, checkpoint_of)
+    return Figure(command, paths, simulator)
 
 
 def _tabletop(comparison: str) -> Figure:
@@ -145,10 +143,10 @@ FIGURES: dict[str, Figure] = {
     ),
     **{name: _tabletop(name) for name in ("execution", "oracle", "conditioning", "compound", "two_bowls")},
     "perception_tabletop": _bench(
-        "perception", "perception_tabletop", (*TABLETOP, *ALONG), checkpoint_of="tabletop"
+        "perception", "perception_tabletop", (*TABLETOP, *ALONG), simulator="openspm_tabletop"
     ),
     **{
-        name: _bench(name, name, (*TABLETOP, *own, *TRACKING), checkpoint_of="tabletop")
+        name: _bench(name, name, (*TABLETOP, *own, *TRACKING), simulator="openspm_tabletop")
         for name, own in {"tracking": (), "cameras": (), "teach": (f"{PACKAGE}/bench/teach.py",)}.items()
     },
     "keyposes_tabletop": _bench(
@@ -161,9 +159,9 @@ FIGURES: dict[str, Figure] = {
         (f"{PACKAGE}/memory", f"{PACKAGE}/geometry", f":(glob){PACKAGE}/experience*.py",
          f":(glob){PACKAGE}/bench/synthetic_*.py", f"{PACKAGE}/bench/memory.py"),
     ),
-    "measurement_noise": Figure(f"python -m {NOISE}", (*TABLETOP, *ALONG, *NOISE_PATHS), "tabletop"),
+    "measurement_noise": Figure(f"python -m {NOISE}", (*TABLETOP, *ALONG, *NOISE_PATHS), "openspm_tabletop"),
     "measurement_noise_libero": Figure(
-        f"python -m {NOISE} --env.type=libero", (*LIBERO, *ALONG, *NOISE_PATHS), "libero_goal"
+        f"python -m {NOISE} --env.type=libero", (*LIBERO, *ALONG, *NOISE_PATHS), "libero"
     ),
     "libero_goal": _libero("run", *ACCURACY, options=LIBERO_GOAL),
     "libero_accuracy": _libero("run", *ACCURACY, options=LIBERO_GOAL),
@@ -175,7 +173,7 @@ FIGURES: dict[str, Figure] = {
     "libero_latency": _libero("latency"),
     "libero_equality": _libero("equality"),
     "perception_libero": _bench(
-        "perception", "perception_libero", (*LIBERO, *ALONG), "--env.type=libero", "libero_goal"
+        "perception", "perception_libero", (*LIBERO, *ALONG), "--env.type=libero", "libero"
     ),
     "keyposes_libero": _bench(
         "keyposes", "keyposes_libero", (*KEY_POSES, *RECORDING["libero"], str(LIBERO_ASSETS)),
@@ -208,20 +206,33 @@ def needs_libero(figure: Figure) -> bool:
 def take(name: str) -> None:
     """Run a figure's command, unless its result is current. One that fails leaves the others to be taken.
 
-    Whose checkpoint it measures is taken first, so that the checkpoint is of the present code.
+    The default checkpoint that it measures is made first, unless there is one by the present code.
     """
     figure = FIGURES[name]
     problem = origin(name, figure.paths, expected_command=figure.command).problem
     if problem is None:
         logger.info("%s is current", name)
         return
-    if figure.checkpoint_of:
-        take(figure.checkpoint_of)
     logger.info("%s (%s): %s", name, problem, figure.command)
-    program, *arguments = shlex.split(figure.command)
-    done = subprocess.run([str(Path(sys.executable).with_name(program)), *arguments], check=False)
-    if done.returncode:
-        logger.error("%s failed with exit code %d", name, done.returncode)
+    try:
+        if figure.simulator:
+            make_checkpoint(figure.simulator)
+        program, *arguments = shlex.split(figure.command)
+        subprocess.run([str(Path(sys.executable).with_name(program)), *arguments], check=True)
+    except subprocess.CalledProcessError as error:
+        logger.error("%s failed: %s", name, error)
+
+
+def make_checkpoint(simulator: str) -> None:
+    """Record and train as `make demo` and `make libero` do, unless that is done."""
+    if simulator == "libero":
+        from benchmarks.libero.stages import dataset, policy
+
+        policy(dataset(), "train")
+    else:
+        from benchmarks import common
+
+        common.policy()
 
 
 def main(names: list[str]) -> dict[str, str]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
@@ -60,10 +61,10 @@ def chapter(introduction: str, sections: Iterable[str]) -> list[str]:
 
 
 def _origin(result: dict[str, Any]) -> str:
-    machine = result["machine"]
+    machine, command = result["machine"], re.sub(r" --started_at=\S+", "", result["command"])
     changed = ", with changes that are not in it" if result["dirty"] else ""
     return (
-        f"`{result['command']}` on {result['date'][:10]}, commit `{result['commit']}`{changed}; "
+        f"`{command}` on {result['date'][:10]}, commit `{result['commit']}`{changed}; "
         f"{machine['cores']} cores of {machine['cpu']}."
     )
 
@@ -78,13 +79,17 @@ def rates(runs: dict[str, Any]) -> str:
 
 
 def percent(run: dict[str, Any]) -> str:
-    """A success rate."""
-    return f"{100 * run['success']:.1f} %"
+    """A success rate; a dash for none of no episodes."""
+    return "-" if run["success"] is None else f"{100 * run['success']:.1f} %"
 
 
 def interval(run: dict[str, Any]) -> str:
-    """The interval of a success rate."""
-    return f"{100 * run['interval'][0]:.1f} to {100 * run['interval'][1]:.1f} %"
+    """The interval of a success rate; a dash for that of no episodes."""
+    return (
+        "-"
+        if run["interval"] is None
+        else f"{100 * run['interval'][0]:.1f} to {100 * run['interval'][1]:.1f} %"
+    )
 
 
 def table(heads: list[str], rows: list[list[Any]]) -> str:

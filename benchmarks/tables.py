@@ -127,9 +127,10 @@ def _in_s(seconds: float | None, result: Quoted) -> str:
 
 
 def _demo(result: Quoted) -> str:
+    set_up = "set-up, " if "--started_at=" in result["command"] else ""  # as `make demo` starts it
     seconds = {
         "mining and training": result["train_s"],
-        "with set-up, recording and evaluating": result["total_s"],
+        f"with {set_up}recording and evaluating": result["total_s"],
     }
     told = ", ".join(f"{what} {s:.0f} s" for what, s in seconds.items() if s is not None)
     return f"{rates({'all ten tasks': result})}\n\n{told.capitalize()}.\n\n{_per_task({'success': result})}"

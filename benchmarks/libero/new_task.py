@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 import draccus
+import torch
 from benchmarks.common import write
 from benchmarks.libero.evaluate import SEED, summary
 from benchmarks.libero.stages import (
@@ -29,6 +30,7 @@ from benchmarks.libero.stages import (
 )
 from lerobot.datasets import LeRobotDatasetMetadata
 
+from lerobot_openspm.cli.pipeline import THREADS
 from lerobot_openspm.modeling_openspm import OpenSPMPolicy
 
 
@@ -49,11 +51,12 @@ def main(config: NewTaskConfig) -> dict[str, Any]:
     )
     name = f"{config.task}_{config.demos}"
     folder = run_folder() / f"taught_{name}"
+    torch.set_num_threads(THREADS)
     taught_s = teach(nine, root, config, folder)
     episodes = evaluation(folder / "evaluation", folder, config.states, [config.task])
     taught = {"task": config.task, "demonstrations": config.demos, "teach_s": taught_s}
     figures = {"seed": SEED, **taught, **summary(episodes)}
-    return write(f"libero_new_task_{name}", figures)
+    return write(f"libero_new_task_{name}", figures, THREADS)
 
 
 def teach(nine: Path, root: Path, config: NewTaskConfig, folder: Path) -> float:

@@ -7,6 +7,7 @@ import subprocess
 import sys
 from collections.abc import Iterable
 from pathlib import Path
+from subprocess import CalledProcessError
 from types import SimpleNamespace
 from typing import Any
 
@@ -282,16 +283,17 @@ def taking(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     """The programs that taking figures starts, of which `openspm` fails; nothing is written."""
     started: list[str] = []
 
-    def run(command: list[str], check: bool) -> SimpleNamespace:
+    def run(command: list[str], check: bool) -> None:
         started.append(" ".join([Path(command[0]).name, *command[1:]]))
-        return SimpleNamespace(returncode=int("openspm" in started[-1]))
+        if check and "openspm" in started[-1]:
+            raise CalledProcessError(1, command)
 
-    monkeypatch.setattr(figures, "subprocess", SimpleNamespace(run=run))
+    monkeypatch.setattr(figures.subprocess, "run", run)
+    monkeypatch.setattr(figures, "make_checkpoint", lambda simulator: started.append(f"train {simulator}"))
     monkeypatch.setattr(tables, "write_pages", lambda: None)
     monkeypatch.setattr(figures, "code_version", lambda: ("0123456789ab", False))
     problems: dict[str, str | None] = {
-        "oracle": None, "tracking": "no result file", "tabletop": "no result file",
-        "execution": "stale by 2 changes",
+        "oracle": None, "tracking": "no result file", "execution": "stale by 2 changes",
     }  # fmt: skip
     monkeypatch.setattr(figures, "origin", lambda name, _, **__: SimpleNamespace(problem=problems[name]))
     return started
@@ -299,8 +301,18 @@ def taking(monkeypatch: pytest.MonkeyPatch) -> list[str]:
 
 def test_what_is_current_is_not_taken_again_and_one_failure_does_not_stop_the_rest(taking: list[str]):
     told = figures.main(["tracking", "oracle", "execution"])
-    assert taking == [FIGURES[name].command for name in ("tabletop", "tracking", "execution")]
+    commands = [FIGURES[name].command for name in ("tracking", "execution")]
+    assert taking == ["train openspm_tabletop", *commands]
     assert told == {"tracking": "no result file", "oracle": "current", "execution": "stale by 2 changes"}
+
+
+def test_without_its_checkpoint_nothing_is_measured(taking: list[str], monkeypatch: pytest.MonkeyPatch):
+    def fail(simulator: str) -> None:
+        raise CalledProcessError(1, ["lerobot-train"])
+
+    monkeypatch.setattr(figures, "make_checkpoint", fail)
+    assert figures.main(["tracking"]) == {"tracking": "no result file"}
+    assert taking == []
 
 
 def test_no_figure_is_taken_of_changes_that_are_not_committed(

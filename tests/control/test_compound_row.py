@@ -1,5 +1,7 @@
 """Instructions of which only the parts were demonstrated, carried out one after another."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
@@ -9,6 +11,7 @@ from tests.memory.builders import entry, hand_pose, key_pose
 from lerobot_openspm.control.executor import Hand, Status
 from lerobot_openspm.control.row import Row
 from lerobot_openspm.geometry import se3
+from lerobot_openspm.memory.entry import Anchor
 
 PLATE = entry("put the bowl on the plate", source="local/demos#0")
 BOX = entry("put the box in the bowl", source="local/demos#1")
@@ -109,6 +112,24 @@ def test_another_object_of_the_same_name_is_not_taken_to_be_where_the_first_one_
     watch(one, eyes, Hand(one.executor.plan[-1].T_world_ee, HAND.opening), 12)
     assert one._part == 1
     assert one.status is Status.OBJECT_NOT_FOUND
+
+
+def test_the_second_of_two_like_things_is_looked_for_after_the_first_was_opened():
+    poses = [replace(pose, anchor=Anchor("box", "box")) for pose in opening().key_poses]
+    memory = entry("open the box", poses, {"box": np.eye(4)})
+    eyes = Eyes({"box": se3.from_yaw([0.2, 0.1, 0.0], 0.0)})
+    one = row(memory, instruction="open the left box then open the right box")
+    one.observe(HAND, eyes)
+    last = len(one.executor.plan) - 1
+    one.executor.begin(one.executor.plan, HAND, 1)
+    for index in range(1, last + 1):
+        target = one.executor.plan[index]
+        hand = Hand(target.T_world_ee, target.memory.opening)
+        one.executor.begin(one.executor.plan, hand, index)
+        watch(one, eyes, hand, target.memory.n_steps + 2)
+    assert one._part == 1
+    assert "box" in eyes.asked[-1]
+    assert one.status is Status.RUNNING
 
 
 def test_the_whole_is_preferred_where_it_was_demonstrated():

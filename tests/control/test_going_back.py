@@ -100,6 +100,20 @@ def test_what_is_no_more_in_the_hand_is_fetched():
     assert one.tracker.held == frozenset()
 
 
+def test_what_slipped_out_while_it_was_lifted_stands_where_it_stood_and_does_not_hang_in_the_air():
+    eyes, one = Eyes(entry().layout), row()
+    one.observe(HAND, eyes)
+    first = one.executor.plan[0].T_world_ee
+    one.executor.begin(one.executor.plan, HAND, 2)
+    grasp, lift = one.executor.plan[2], one.executor.plan[3]
+    watch(one, eyes, Hand(grasp.T_world_ee, grasp.memory.opening), grasp.memory.n_steps + 1)
+    assert one.tracker.held == {"bowl"}
+    eyes.visible = 0.0  # the hand hides it
+    watch(one, eyes, Hand(lift.T_world_ee, 0.0), 1)
+    assert one.executor.index == 0
+    assert_allclose(one.executor.plan[0].T_world_ee, first, atol=1e-6)
+
+
 ON_PLATE = Outcome(0, "bowl", Anchor("plate", "plate"), np.zeros(3), np.zeros(3), 0.02)
 
 
@@ -157,6 +171,36 @@ def test_of_several_things_to_do_only_the_one_that_is_missed_is_done_again():
     assert one.status is Status.DONE
     assert one.executor.attempts == 1
     assert one.succeeded is True, "the drawer went all the way before"
+
+
+def test_what_is_done_again_ends_with_the_hand_backed_off():
+    pull = [replace(pose, sub_task=1) for pose in handle(KINDS["slide"]).key_poses]
+    layout = {**entry().layout, **CABINET}
+    both = "put the bowl on the plate and open the top drawer"
+    whole = entry(both, (*pick_and_place()[:-1], *pull), layout, outcomes=(ON_PLATE,))
+    eyes, one = Eyes(layout), row(whole, instruction=both)
+    one.observe(HAND, eyes)
+    last = len(one.executor.plan) - 1
+    one.executor.begin(one.executor.plan, HAND, last)
+    eyes.layout["bowl"] = layout["plate"] @ se3.from_yaw([0.06, 0.0, 0.0], 0.0)
+    watch(one, eyes, Hand(one.executor.plan[last].T_world_ee, 0.08), 12)
+    assert [target.memory.phase for target in one.executor.plan[-2:]] == ["release", "retreat"]
+
+
+def test_an_outcome_that_no_key_pose_leads_to_is_not_tried_again():
+    twice = "put the bowl on the plate and put the bowl on the plate"
+    layout = entry().layout
+    memory = entry("put both bowls on the plate", pick_and_place(), layout,
+                   outcomes=(replace(ON_PLATE, sub_task=1),))  # fmt: skip
+    assert len(memory.key.sub_tasks) == 2, twice
+    eyes, one = Eyes(layout), row(memory, instruction="put both bowls on the plate")
+    one.observe(HAND, eyes)
+    one.executor.begin(one.executor.plan, HAND, 7)
+    eyes.layout["bowl"] = layout["plate"] @ se3.from_yaw([0.06, 0.0, 0.0], 0.0)
+    watch(one, eyes, Hand(one.executor.plan[7].T_world_ee, 0.08), 12)
+    assert one.status is Status.DONE
+    assert one.executor.attempts == 0
+    assert one.succeeded is None
 
 
 def test_of_a_whole_of_which_a_part_was_not_seen_nothing_is_said():

@@ -8,7 +8,7 @@ from tests.control.test_row import HAND, Eyes, row, shifted, watch
 from tests.memory.builders import entry, hand_pose, key_pose, robot
 
 from lerobot_openspm.control.executor import ControlSettings, Executor, Hand, Status
-from lerobot_openspm.control.row import LEFT_BEHIND_M
+from lerobot_openspm.control.row import LEFT_BEHIND_M, OUTRUN_M
 from lerobot_openspm.control.transfer import Target, push_ways, transfer
 from lerobot_openspm.geometry import se3
 from lerobot_openspm.memory.entry import Anchor, Outcome
@@ -121,6 +121,45 @@ def test_an_action_that_leads_back_to_the_way_stays_within_bounds(y, z, along, a
     executor.push_chunk(np.array([[along, across, 0.0, 0.0, 0.0, 0.0, 1.0]]))
     action = executor.next_action(Hand(hand_pose(0.2, -0.05 + y, 0.02 + z), 0.0))
     assert np.abs(action[:3]).max() <= 1 + 1e-9
+
+
+def turning_push():
+    """A push that turns on its way, with nothing known of where the plate ends."""
+    approach, contact, end, _ = push().key_poses
+    corner = key_pose("plate", contact.T_obj_ee @ se3.from_yaw([0.0, 0.1, 0.0], 0.0), "push", closed=True)
+    return entry(INSTRUCTION, (approach, contact, corner, end), LAYOUT)
+
+
+def test_where_a_push_turns_the_hand_passes_by():
+    targets = transfer(turning_push(), LAYOUT, {}, HAND.T_world_ee)
+    assert [target.precise for target in targets[:4]] == [False, True, False, True]
+
+
+def test_a_plate_goes_along_around_the_turn_of_a_push_and_is_let_go_at_its_end():
+    eyes, one = Eyes(LAYOUT), row(turning_push(), instruction=INSTRUCTION)
+    one.observe(HAND, eyes)
+    eyes.visible = 0.0
+    ends = [target.T_world_ee for target in one.executor.plan]
+    one.executor.begin(one.executor.plan, HAND, 1)
+    for index, is_held in ((1, True), (2, True), (3, False)):
+        watch(one, eyes, Hand(ends[index], 0.0), 1)
+        assert one.executor.index == index + 1
+        assert (one.tracker.held == {"plate"}) is is_held, index
+        assert_allclose(one.executor.plan[2].T_world_ee, ends[2], atol=1e-9)
+
+
+def test_a_plate_that_the_hand_has_not_reached_yet_is_not_left_behind():
+    for gone, is_fetched in ((0.5 * OUTRUN_M, False), (1.5 * OUTRUN_M, True)):
+        eyes, one = Eyes(LAYOUT), row(turning_push(), instruction=INSTRUCTION)
+        one.observe(HAND, eyes)
+        contact = one.executor.plan[1].T_world_ee
+        one.executor.begin(one.executor.plan, HAND, 1)
+        watch(one, eyes, Hand(contact, 0.0), 1)
+        assert one.tracker.held == {"plate"}
+        ahead = contact.copy()
+        ahead[1, 3] += gone
+        watch(one, eyes, Hand(ahead, 0.0), 12)
+        assert (one.executor.index < 2) is is_fetched, gone
 
 
 def pushing(one, eyes, ahead_m):

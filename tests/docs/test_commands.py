@@ -7,6 +7,7 @@ read by the very parser that would read it.
 import argparse
 import importlib.util
 import os
+import re
 import runpy
 import shutil
 import subprocess
@@ -164,20 +165,25 @@ def test_a_command_that_is_named_exists(line: Line, parse: Callable[[list[str]],
 
 
 @pytest.mark.parametrize("line", of_ours("make"), ids=ids)
-def test_a_target_of_make_exists(line: Line):
+def test_a_target_of_make_exists_and_its_variables_too(line: Line):
+    known = re.findall(r"^(?:export )?([A-Z_]+) *\?=", (REPOSITORY / "Makefile").read_text(), re.M)
+    assert {word.partition("=")[0] for word in line.words[1:] if "=" in word} <= set(known)
     done = subprocess.run(
         ["make", "-n", *line.words[1:]], cwd=REPOSITORY, capture_output=True, text=True, check=False
     )
     assert done.returncode == 0, done.stderr
 
 
-@pytest.mark.parametrize("line", of_ours("pip"), ids=ids)
-def test_what_pip_installs_of_ours_is_offered(line: Line):
-    extras = tomllib.loads((REPOSITORY / "pyproject.toml").read_text())["project"]["optional-dependencies"]
-    for word in line.words[2:]:
-        package, bracket, extra = word.partition("[")
-        if package == "lerobot_policy_openspm" or (package == "." and line.page == "README.md" and bracket):
-            assert extra.removesuffix("]") in extras
+def test_what_pip_installs_of_ours_is_offered():
+    project = tomllib.loads((REPOSITORY / "pyproject.toml").read_text())["project"]
+    ours = {(project["name"], page) for page in {line.page for line in LINES}} | {(".", "README.md")}
+    named = {
+        extra.removesuffix("]")
+        for line in of_ours("pip")
+        for package, bracket, extra in (word.partition("[") for word in line.words[2:])
+        if bracket and (package, line.page) in ours
+    }
+    assert named == {"libero", "perception", "index", "text"} & set(project["optional-dependencies"])
 
 
 def layout_option() -> str:

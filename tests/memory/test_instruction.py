@@ -354,3 +354,30 @@ def test_a_thing_keeps_its_name_unless_the_memory_calls_its_kind_otherwise(
 ):
     (sub_task,) = read_task("put the bowl in the cupboard", names)
     assert sub_task.landmark == landmark
+
+
+@pytest.mark.parametrize(
+    ("things", "target", "count"),
+    [
+        ("10 mm socket", "10 mm socket", 1),
+        ("24 can pack", "24 can pack", 1),
+        ("12 inch rulers", "12 inch ruler", 2),
+        ("1 mug", "mug", 1),
+        ("one mug", "mug", 1),
+        ("3 mugs", "mug", 3),
+        ("24 cans", "can", 24),
+        ("thirteen mugs", "mug", 13),
+    ],
+)
+def test_a_number_counts_things_or_belongs_to_a_name(things, target, count):
+    read = parse_instruction(f"put the {things} in the tray")
+    assert [sub_task.target for sub_task in read] == [target] * count
+
+
+@pytest.mark.parametrize("of", ["", "the top drawer of "])
+def test_left_and_right_things_are_opened_and_switched_one_after_the_other(of):
+    verb, thing = ("open", "cabinet") if of else ("turn on", "stove")
+    read = parse_instruction(f"{verb} {of}the left {thing} and {verb} {of}the right {thing}")
+    assert [sub_task.target_where for sub_task in read] == [Reference("left"), Reference("right")]
+    apart = [parse_instruction(f"{verb} {of}the {side} {thing}")[0] for side in ("left", "right")]
+    assert list(read) == apart

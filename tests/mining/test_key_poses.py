@@ -254,6 +254,21 @@ def test_a_push_goes_on_while_the_hand_goes_further_than_it_rises(way, speed, no
     assert abs(frame_of(key_poses, "push") - end) <= 1
 
 
+@pytest.mark.parametrize("noise", [0.0, NOISE_M])
+@pytest.mark.parametrize(("aside", "turns"), [(0.10, 1), (-0.10, 1), (0.02, 0), (0.0, 0)])
+def test_a_push_is_cut_where_it_turns(aside, turns, noise):
+    d, _ = pushing((0.06, 0.02), leave=False)
+    corner = d.frame
+    d.move([0.1 + aside, 0.14, 0.02])
+    end = d.frame
+    d.move([0.1 + aside, 0.14, 0.2])
+    pushes = [pose for pose in mine(d, noise=noise) if pose.phase == "push"]
+    assert len(pushes) == turns + 1
+    assert abs(pushes[-1].frame - end) <= 1
+    assert all(abs(pose.frame - corner) <= 2 for pose in pushes[:-1])
+    assert all(pose.confidence < 1 for pose in pushes[:-1])
+
+
 def test_a_hand_that_waits_trembling_has_not_ended_its_push():
     drawing, _ = pushing((0.0, 0.02), (0.05, 0.0345), leave=False)
     for k in range(20):

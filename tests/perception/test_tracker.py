@@ -195,6 +195,19 @@ def test_a_held_object_that_slips_is_followed_and_one_that_falls_is_let_go():
     assert_allclose(pose(one, lifted), fallen)
 
 
+def test_what_the_hand_has_lost_lies_below_it_no_higher_than_it_was_taken_from():
+    for to, expected in (((0.1, 0.0, 0.15), (0.1, 0.0, 0.0)), ((0.0, 0.1, -0.02), (0.0, 0.1, -0.02))):
+        one = tracker()
+        one.hold("cup", FAR_HAND)
+        moved = shifted(FAR_HAND, *to)
+        one.drop(["cup", "never seen"], moved)
+        assert one.held == frozenset()
+        assert_allclose(pose(one, FAR_HAND), shifted(CUP, *expected), atol=1e-12)
+        assert look(one, seen(shifted(CUP, *expected))) == frozenset(), "it is expected there"
+        one.drop(["cup"], moved)
+        assert_allclose(pose(one)[:3, 3], shifted(CUP, *expected)[:3, 3], atol=1e-4)
+
+
 def test_objects_do_not_disturb_one_another():
     alone, both = tracker(), tracker()
     plate = shifted(CUP, -0.3, 0.0, 0.0)

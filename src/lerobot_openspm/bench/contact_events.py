@@ -20,7 +20,8 @@ push    The last frame before the hand leaves, after it last moved something alo
 
 A phase that is going on when the demonstration ends, ends there. The other phases (approach, lift, pre-place,
 retreat) end at corners in free space, where nothing is touched and no true event is: they are not judged.
-That includes the approach before a push, which ends before the object is met.
+That includes the approach before a push, which ends before the object is met, and the corners on the way of
+a push, which goes on there.
 """
 
 from __future__ import annotations

@@ -160,7 +160,11 @@ def compare(recordings: Sequence[Recording]) -> list[list[Verdict]]:
         mined = find_key_poses(episode, robot)
         own = []
         for phase in PHASES:
-            poses = [pose for pose in mined if pose.phase == phase]
+            poses = [
+                pose
+                for pose, after in zip(mined, [*mined[1:], None], strict=True)
+                if pose.phase == phase and not (phase == "push" and after and after.phase == phase)
+            ]
             frames = [event.frame for event in true if event.phase == phase]
             pairs = match([pose.frame for pose in poses], frames)
             off = [

@@ -190,6 +190,6 @@ def main(args: Sequence[str] | None = None) -> None:
     measured = measure(config)
     if config.result:
         # Policies act on one thread, in this process or in others.
-        threads = 1 if what in MEASURES else None
+        threads = 1 if what in (*MEASURES, "teach") else None
         write_result(Path(config.result), {"seed": getattr(config, "seed", None), **measured}, threads)
     print(json.dumps(measured))

@@ -166,7 +166,7 @@ class Executor:
         elif self._queue:
             action = self._queue.popleft()
             is_corrected = self._settings.execution == "closed_loop_trc"
-            if is_corrected and self.plan[self.index].push is not None:
+            if is_corrected and self.plan[self.index].memory.phase == "push":
                 action = self._kept_on_way(action, hand)
         elif self._settings.execution == "closed_loop_trc" and self._steps >= self._nominal_steps():
             action = self._correct(hand)

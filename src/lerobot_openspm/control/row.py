@@ -9,7 +9,7 @@ from __future__ import annotations
 import logging
 import zlib
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -41,8 +41,9 @@ BLIND_S, GIVE_UP_S = 0.5, 2.0
 # After the last key pose the policy looks up to three times at what it moved. Then the outcome stays unknown.
 LOOKS_AT_OUTCOME = 3
 
-# A hand that has gone this far beyond what it pushes has lost it.
-LEFT_BEHIND_M = 0.025
+# A hand that has gone this far beyond what it pushes has lost it; or, where it is not known where they
+# meet, this much further than what it pushes.
+LEFT_BEHIND_M, OUTRUN_M = 0.025, 0.06
 
 # An object that is this far from where the key poses took it to be takes them along; less is noise.
 MOVED_M, MOVED_RAD = 0.002, 0.05
@@ -228,6 +229,7 @@ class Row:
         others = self._referents.hear(said)
         self.tracker.forget(others)
         self.layout = {name: T for name, T in self.layout.items() if name not in others}
+        self._altered -= set(others)
 
     def _check_outcomes(self, hand: Hand, look: Look) -> None:
         """Look whether what was to be done is done: go on if so, else go back to what can mend it."""
@@ -244,7 +246,9 @@ class Row:
 
     def _missed(self, hand: Hand, look: Look) -> tuple[Outcome, ...] | None:
         """Look at what was moved: the outcomes that are not met, in order; None where that is not seen."""
-        expected = self.ranked[0].entry.outcomes
+        entry = self.ranked[0].entry
+        served = {pose.sub_task for pose in entry.key_poses}
+        expected = [one for one in entry.outcomes if one.sub_task in served]  # others could not be mended
         self._followed |= self.executor.followed_sub_tasks()
         names = dict.fromkeys(name for one in expected for name in one.objects)
         if not names:
@@ -278,7 +282,7 @@ class Row:
     def _go_back(self, missed: Outcome, hand: Hand) -> None:
         """Do one sub-task again, from where its target is now, if an attempt is left.
 
-        Those after it are not done again: a drawer that was opened is not where it was grasped.
+        Those after it are not done again: their handles are not where they were.
         """
         if not self.executor.try_again(f"the {missed.target} is not where it should be"):
             return
@@ -380,7 +384,10 @@ class Row:
         moved = self._see([*untouched, *(held - set(untouched))], hand, look)
         if self.status is Status.CAMERA_FAULT:
             return
-        if dropped := {name for name in moved & held if self._is_left_behind(name, hand)}:
+        dropped = {name for name in moved & held if self._is_left_behind(name, hand)}
+        for name in (moved & held) - dropped:  # it goes along from where it is
+            self.tracker.hold(name, hand.T_world_ee)
+        if dropped:
             logger.info("%r: dropped: %s", self.instruction, ", ".join(sorted(dropped)))
             # What slips out of the hand is no fault of the plan; a push that loses its object may be.
             if self._is_pushing and not self.executor.try_again("what is pushed was left behind"):
@@ -421,7 +428,7 @@ class Row:
             is_pushed = after.phase == "push" != passed.phase and self.executor.plan[i + 1].push is None
             if is_carried or is_pushed:
                 self.tracker.hold(passed.anchor.place, hand.T_world_ee)
-            elif passed.phase in ("release", "push"):
+            elif passed.phase == "release" or passed.phase == "push" != after.phase:
                 self.tracker.release(self.tracker.held, hand.T_world_ee)
             elif passed.phase in ("open", "turn"):
                 self._altered.add(passed.anchor.place)
@@ -434,19 +441,40 @@ class Row:
     @property
     def _is_pushing(self) -> bool:
         target = self.executor.target
-        return target is not None and target.push is not None
+        return target is not None and target.memory.phase == "push"
 
     def _beyond(self, target: Target, push: PushWays, hand: Hand) -> float:
         """Metres by which the hand has gone beyond where it meets what it pushes."""
         place = self.tracker.poses(hand.T_world_ee)[push.target][:3, 3]
-        return push.beyond(hand.T_world_ee, target.T_world_ee, place)
+        own = [
+            one for one in self.executor.plan if one.push and one.memory.sub_task == target.memory.sub_task
+        ]
+        return push.beyond(hand.T_world_ee, own[-1].T_world_ee, place)
 
     def _is_left_behind(self, name: str, hand: Hand) -> bool:
         """Whether an object that turned out to be elsewhere than in the hand does not go along with it."""
         target = self.executor.target
-        if target is None or target.push is None or target.push.target != name:
+        if target is None or target.memory.phase != "push":
             return True
-        return self._beyond(target, target.push, hand) > LEFT_BEHIND_M
+        if target.push is None:
+            return self._outrun_by(name, hand) > OUTRUN_M
+        return target.push.target != name or self._beyond(target, target.push, hand) > LEFT_BEHIND_M
+
+    def _outrun_by(self, name: str, hand: Hand) -> float:
+        """Metres by which the hand has gone further than an object since the push began."""
+        plan, first = self.executor.plan, self.executor.index
+        while first > 0 and plan[first - 1].memory.phase == "push":
+            first -= 1
+        began = plan[first - 1].T_world_ee if first > 0 else self._planned_from
+        place = self.tracker.poses(hand.T_world_ee)[name]
+        gone = np.linalg.norm(
+            [
+                T[:2, 3] - T_before[:2, 3]
+                for T, T_before in ((hand.T_world_ee, began), (place, self.layout[name]))
+            ],
+            axis=-1,
+        )
+        return float(gone[0] - gone[1])
 
     def _anchors(self, index: int) -> list[str]:
         """Objects of the key poses from one on that look as they did in the demonstrations."""
@@ -458,6 +486,7 @@ class Row:
         """Objects of the key poses to come that still are where they were seen."""
         index = self.executor.index
         touched = {pose.memory.anchor.place for pose in self.executor.plan[:index] if _touches(pose)}
+        touched |= self.tracker.held
         return [name for name in self._anchors(index) if name not in touched]
 
     def _now_needed(self) -> list[str]:
@@ -476,7 +505,7 @@ class Row:
         self._planned_from = hand.T_world_ee
         ahead = self.ranked[0].entry.key_poses[index:]
         regrasped = {pose.anchor.place for pose in ahead if pose.phase in ("approach", "grasp")}
-        self.tracker.release(self.tracker.held & regrasped, hand.T_world_ee)
+        self.tracker.drop(self.tracker.held & regrasped, hand.T_world_ee)
         self.executor.begin(self._transfer(self.ranked[0].entry, self._planned_from), hand, index)
 
     def _update(self, names: Sequence[str], hand: Hand) -> set[str]:
@@ -498,10 +527,16 @@ class Row:
         return changed
 
     def _transfer(self, entry: MemoryEntry, T_world_ee: Array) -> tuple[Target, ...]:
-        targets = self._knowledge.transfer(entry, self.layout, T_world_ee, self._gone)
         if self._repeated is not None:
-            targets = tuple(one for one in targets if one.memory.sub_task <= self._repeated)
+            entry = _until(entry, self._repeated)
+        targets = self._knowledge.transfer(entry, self.layout, T_world_ee, self._gone)
         return targets if self._is_last_part else (*targets, *rise(targets[-1], self._start_height))
+
+
+def _until(entry: MemoryEntry, sub_task: int) -> MemoryEntry:
+    """An entry without the sub-tasks after one."""
+    key = replace(entry.key, sub_tasks=entry.key.sub_tasks[: sub_task + 1])
+    return replace(entry, key=key, key_poses=tuple(p for p in entry.key_poses if p.sub_task <= sub_task))
 
 
 def _touches(target: Target) -> bool:

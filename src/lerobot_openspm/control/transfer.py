@@ -133,9 +133,11 @@ def transfer(
         if ways is not None:
             before = se3.transform(before[:3, :3], ways.position(pose, entry.layout))
         after = entry.key_poses[i + 1] if i + 1 < len(entry.key_poses) else None
-        # The arrival before the fingers move is where a grasp or a release is decided.
-        precise = pose.phase in CONTACT_PHASES or (
-            after is not None and (after.dwell or after.phase == "push")
+        # The arrival before the fingers move, or before a push, is where the contact is decided. Where a push
+        # turns, the hand only passes by.
+        turns = pose.phase == "push" and after is not None and after.phase == "push"
+        precise = not turns and (
+            pose.phase in CONTACT_PHASES or (after is not None and (after.dwell or after.phase == "push"))
         )
         axis = pose.axis
         if axis is not None:

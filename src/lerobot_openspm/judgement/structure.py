@@ -18,7 +18,7 @@ SUCCESSORS: dict[str, tuple[str, ...]] = {
     "open": ("release",),
     "turn": ("release",),
     "release": ("retreat", "approach"),
-    "push": ("retreat",),
+    "push": ("push", "retreat"),
     "retreat": ("retreat", "approach"),
 }
 FIRST = ("approach",)

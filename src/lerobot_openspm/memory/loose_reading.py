@@ -135,7 +135,8 @@ class _Reader:
             )
         part = "" if target.part == "door" else target.part
         self._waiting = [n for n in self._waiting if n.name != target.name]
-        self._steps.append(SubTask(fragment.operation, target.name, part))
+        where = target.where if target.where and not target.where.landmarks else None
+        self._steps.append(SubTask(fragment.operation, target.name, part, target_where=where))
 
     def _place(self, fragment: Fragment, is_told: bool) -> None:
         """Put something somewhere, or remember what is said of it."""

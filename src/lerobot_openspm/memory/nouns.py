@@ -99,9 +99,11 @@ def _split_count(words: Words) -> tuple[Words, int]:
     rest, count = list(words), 1
     while rest:
         one, two = rest[0], " ".join(rest[:2])
-        if one == "one" and len(rest) > 1 and rest[1] not in v.NUMBERS:
+        if one in ("one", "1") and len(rest) > 1 and rest[1] not in v.NUMBERS and not _is_size(tuple(rest)):
             rest = rest[1:]
             continue
+        if _is_size(tuple(rest)):
+            break
         if two in v.NUMBERS or one in v.NUMBERS:
             used = 2 if two in v.NUMBERS else 1
             count, rest = v.NUMBERS[two if used == 2 else one], rest[used:]
@@ -110,12 +112,25 @@ def _split_count(words: Words) -> tuple[Words, int]:
                 return (), count
         elif one in ("the", "a", "of", "all", "each") and len(rest) > 1:
             following = " ".join(rest[1:3]), rest[1]
-            if one != "all" and not set(following) & set(v.NUMBERS) and count == 1 and one != "each":
+            if (
+                one != "all"
+                and not set(following) & {*v.NUMBERS, "one", "1"}
+                and count == 1
+                and one != "each"
+            ):
                 break
             count, rest = max(count, 2 if one in ("all", "each") else 1), rest[1:]
         else:
             break
     return tuple(rest), count
+
+
+def _is_size(words: Words) -> bool:
+    """Whether a number in digits belongs to a name: "the 10 mm socket", "a 24 can pack"."""
+    if len(words) < 2 or not words[0].isdecimal() or words[1] == "of":
+        return False
+    heads = (words[words.index("of") - 1] if "of" in words[1:] else words[-1], words[-1])
+    return v.singular(words[1]) in v.UNITS or (int(words[0]) > 1 and all(v.singular(h) == h for h in heads))
 
 
 def _read_of(before: Words, whole: Words) -> Noun:

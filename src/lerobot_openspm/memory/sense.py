@@ -63,7 +63,7 @@ def _can_be(sub_task: SubTask) -> bool:
     owner = canonical_name(sub_task.landmark or sub_task.target)
     if part and v.PART_OF.get(v.PART_SYNONYMS.get(part[-1], part[-1]), owner) != owner:
         return False
-    if sub_task.operation in MADE and sub_task.target_where is not None:
+    if sub_task.operation in MADE and sub_task.target_where and sub_task.target_where.landmarks:
         return False  # "the drawer on the cabinet" is a part of it
     if sub_task.operation in ("put", "push"):
         is_other = target != canonical_name(sub_task.landmark) or target.endswith("bowl")  # one on another

@@ -257,12 +257,17 @@ DESCRIPTIONS = word_set(
 COLOURS = word_set("black white red yellow green blue brown grey gray orange purple pink golden silver beige")
 DETERMINERS = word_set("the a an some this that these those my your our its")
 FILLERS = word_set("stacked also furthest farthest far other same entire whole single little said very")
-_COUNTS = ("two", "three", "four", "five", "six", "seven", "eight", "nine", "ten", "eleven", "twelve")
+_COUNTS = (
+    "two", "three", "four", "five", "six", "seven", "eight", "nine", "ten", "eleven", "twelve", "thirteen",
+    "fourteen", "fifteen", "sixteen", "seventeen", "eighteen", "nineteen", "twenty",
+)  # fmt: skip
 NUMBERS = {
     "both": 2, "pair of": 2, "couple of": 2,
     **{word: i for i, word in enumerate(_COUNTS, start=2)},
     **{str(i): i for i in range(2, 100)},
 }  # fmt: skip
+# A number before one of these is a size: "the 10 mm socket".
+UNITS = word_set("mm cm m inch g kg oz ml l liter litre cent watt volt")
 PRONOUNS = {
     **dict.fromkeys(("it", "this", "that", "itself"), "it"),
     "there": "there",

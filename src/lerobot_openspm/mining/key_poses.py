@@ -44,6 +44,8 @@ TURNED_RAD = np.deg2rad(35)
 # A push begins and ends within this height of its lowest point. In between the hand may ride up further, on
 # what it pushes or as it turns, but does not lift off.
 PUSH_BAND_M = 0.015
+# A corner of the way of a push must stand out by this much.
+PUSH_TOLERANCE_M = 0.02
 # A hand that trembles stays within this height.
 STANDING_M = 0.003
 # A hand that sinks or rises by less than this in two steps travels level.
@@ -173,7 +175,7 @@ def _carry_marks(episode: Episode, start: int, end: int, let_go: int, contact: i
 
 
 def _push_marks(episode: Episode, start: int, end: int, closed: bool, contact: int) -> list[_Mark]:
-    """Approach, push and retreat of a hand that holds nothing but travels low."""
+    """Approach, push and retreat of a hand that holds nothing but travels low; a push may turn on its way."""
     height = episode.T_world_ee[start : end + 1, 2, 3]
     # The lowest stretch: a hand that dips twice and lifts off in between has pushed nothing on the way.
     lowest = int(np.argmin(height))
@@ -187,10 +189,12 @@ def _push_marks(episode: Episode, start: int, end: int, closed: bool, contact: i
     way = episode.T_world_ee[first : start + between.stop, :3, 3]
     last = first + _push_end(way, start + int(low[-1]) - first)
     approach = _corner_marks(episode, start, first, "approach", closed, contact, [first])
+    turns = _push_turn_marks(episode, first, last, closed, contact)
     retreat = _corner_marks(episode, last, end, "retreat", closed, contact, [last])
     return [
         *approach,
         _Mark(first, "approach", 1.0, closed, None, contact),
+        *turns,
         _Mark(last, "push", 1.0, closed, None, contact),
         *retreat,
         _Mark(end, "retreat", 0.8, closed, None, contact),
@@ -231,15 +235,29 @@ def _corner_marks(
     touch = episode.T_world_ee[contacts][:, :3, 3]
     away = np.linalg.norm(points[:, None, :3] - touch[None], axis=-1).min(axis=1)
     tolerance = np.maximum(CONTACT_TOLERANCE_M, FREE_SPACE_TOLERANCE * away)
-    found = []
-    for corner in corners(points, tolerance):
-        spacing = np.linalg.norm(points[corner] - points[[0, -1]], axis=-1).min()
-        if spacing < MIN_SPACING_M:
-            continue
-        if found and np.linalg.norm(points[corner] - points[found[-1].frame - start]) < MIN_SPACING_M:
-            continue
-        confidence = _corner_confidence(points, int(corner))
-        found.append(_Mark(start + int(corner), phase, confidence, closed, None, contact))
+    return [
+        _Mark(start + corner, phase, _corner_confidence(points, corner), closed, None, contact)
+        for corner in _spaced_corners(points, tolerance)
+    ]
+
+
+def _push_turn_marks(episode: Episode, start: int, end: int, closed: bool, contact: int) -> list[_Mark]:
+    """Where a push turns. A hand that rides up and down on the way goes straight on."""
+    points = path_coordinates(episode.T_world_ee[start : end + 1])
+    points[:, 2] = 0.0
+    return [
+        _Mark(start + corner, "push", _corner_confidence(points, corner), closed, None, contact)
+        for corner in _spaced_corners(points, np.full(len(points), PUSH_TOLERANCE_M))
+    ]
+
+
+def _spaced_corners(points: Array, tolerance: Array) -> list[int]:
+    """Corners of a path that lie apart from its ends and from one another."""
+    found: list[int] = []
+    for corner in corners(points, tolerance).tolist():
+        ends = [0, len(points) - 1, *found[-1:]]
+        if np.linalg.norm(points[corner] - points[ends], axis=-1).min() >= MIN_SPACING_M:
+            found.append(corner)
     return found
 
 

@@ -158,7 +158,7 @@ def hints(item: MinedEpisode) -> tuple[Hint, ...]:
             # What goes into an opened part lies where nothing was to be seen in the first frame.
             found.append(Hint(sub_task.landmark, point, "release", f"{item.episode.task}: {len(found)}"))
     for before, pose in zip(item.key_poses[:-1], item.key_poses[1:], strict=True):
-        if pose.phase == "push":
+        if pose.phase == "push" != before.phase:
             target = sub_task_of(pose, item.sub_tasks).target
             place = f"{item.episode.task}: {len(found)}"
             found.append(Hint(target, before.T_world_ee[:3, 3], "contact", place))

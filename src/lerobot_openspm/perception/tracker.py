@@ -81,6 +81,7 @@ class _Track:
         rivalled: Whether two places explained the last look's pictures.
         doubted: Whether the next sure sight is believed wherever it is.
         placed: Whether the hand has let go of it where it is taken to be, and it was not seen since.
+        stood_m: Height in the world from which the hand took it; infinity before.
     """
 
     belief: kalman.Belief
@@ -92,6 +93,7 @@ class _Track:
     rivalled: bool = False
     doubted: bool = False
     placed: bool = False
+    stood_m: float = np.inf
 
 
 @dataclass
@@ -171,6 +173,7 @@ class Tracker:
         """The hand carries an object from now on."""
         track = self._tracks.get(name)
         if track is not None and not track.held:
+            track.stood_m = float(track.smoothed[2, 3])
             self._carry(track, se3.inverse(T_world_ee), held=True)
 
     def release(self, names: Iterable[str], T_world_ee: Array) -> None:
@@ -181,9 +184,18 @@ class Tracker:
                 self._carry(track, T_world_ee, held=False)
                 track.placed = True
 
+    def drop(self, names: Iterable[str], T_world_ee: Array) -> None:
+        """The hand has lost objects: they lie below it, no higher than where it took them from."""
+        for name in [name for name in names if name in self.held]:
+            track = self._tracks[name]
+            self.release([name], T_world_ee)
+            fallen = np.array([0.0, 0.0, min(0.0, track.stood_m - float(track.smoothed[2, 3]))])
+            track.smoothed = se3.transform(track.smoothed[:3, :3], track.smoothed[:3, 3] + fallen)
+            track.belief = track.belief._replace(position=track.belief.position + fallen)
+
     def doubt(self, names: Iterable[str], T_world_ee: Array) -> None:
         """Objects need not be where they are taken to be; the next sure sight of them is believed at once."""
-        self.release(names, T_world_ee)
+        self.drop(names, T_world_ee)
         for name in names:
             if name in self._tracks:
                 self._tracks[name].doubted = True
