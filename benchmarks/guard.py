@@ -8,10 +8,10 @@ guard's own: none is an evaluation seed, and nothing is tuned on them.
 
 The episodes are few, so the floors follow from the binomial distribution. A build that succeeds at the
 expected rate falls below one of them with a probability of at most ``FALSE_ALARM``: the floor of all episodes
-may use half of it, the floors of the single tasks together the other half. That may be much, because on one
-machine the same code always gives the same episodes: only a change of the code draws anew. The verdict also
-says what the guard can see: the success rate, of all tasks and of a single one, that it catches with
-probability ``POWER``.
+may use half of it, the floors of the single tasks together the other half. So a good change of the code fails
+with a probability of up to ``FALSE_ALARM``, because it draws other episodes; the same code on the same
+machine does not. The verdict also says what the guard can see: the success rate, of all tasks and of a single
+one, that it catches with probability ``POWER``.
 
 tabletop: 77 of 80 episodes must succeed, 6 of 8 of each task. A true rate of 0.918 is caught with probability
 0.9, one of 0.935 with 0.77, a single task's of 0.462 with 0.9.

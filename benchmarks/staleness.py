@@ -131,7 +131,7 @@ def changes(commit: str, paths: Sequence[str], root: Path = ROOT) -> Iterator[st
     changed = [name for name in names if _committed_code(root, commit, name) != _present_code(root, name)]
     if changed:
         commits = _git(root, "log", "--format=%h %s", f"{commit}..HEAD", "--", *changed).splitlines()
-        # None for what is not committed, or was changed in merging.
+        # There is no commit for a change that is uncommitted, or that came in with a merge.
         yield from commits or [f"not in a commit of its own: {', '.join(changed)}"]
 
 

@@ -16,7 +16,7 @@ from lerobot_openspm.perception.types import PoseEstimate
 
 logger = logging.getLogger(__name__)
 
-# What is seen this near to where one that is not meant was seen is that one.
+# Detections within 5 cm of a rejected instance are that instance.
 SAME_PLACE_M = 0.05
 
 

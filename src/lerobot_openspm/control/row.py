@@ -424,7 +424,7 @@ class Row:
         for i in range(index_before, self.executor.index):
             passed, after = self.executor.plan[i].memory, self.executor.plan[i + 1].memory
             is_carried = passed.phase == "grasp" and after.phase not in ("open", "turn")
-            # Where the way of a push is known, the target moves from where the hand meets it; see below.
+            # Where the way of a push is known, the target is held once the hand has met it; see below.
             is_pushed = after.phase == "push" != passed.phase and self.executor.plan[i + 1].push is None
             if is_carried or is_pushed:
                 self.tracker.hold(passed.anchor.place, hand.T_world_ee)

@@ -52,7 +52,7 @@ def merge(kinematic: Sequence[PhaseAnswer], judged: Answers, threshold: float) -
 
 
 def _heard(answer: PhaseAnswer | None, threshold: float) -> PhaseAnswer | None:
-    """An answer as far as it counts."""
+    """The label, if its confidence passes the threshold."""
     if answer is None or answer.confidence < threshold:
         return None
     return PhaseAnswer(answer.phase, min(answer.confidence, MAX_JUDGED))

@@ -37,13 +37,13 @@ COARSE_CUTS_PX = (30.0, 30.0, 20.0, 12.0)
 FINE_CUTS_PX = (6.0, 4.0, 3.0, 3.0)
 BLOBS_PER_VIEW = 3
 MAX_CANDIDATES = 3
-# A place that so much less of the object's colours suggests than another is no candidate.
+# Candidates with under 20 % of the best one's colour evidence are dropped.
 WEAK_SHARE = 0.2
-# A candidate that fits so much worse than another is not worth a finer look.
+# Candidates that fit less than 70 % as well as the best one are not fitted more finely.
 POOR_SHARE = 0.7
 # Corners of a box of unit size that stands on its origin.
 CORNERS = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (0.0, 1.0)])
-# A share of points is told by every so many-th.
+# Visibility is estimated on every 5th point.
 SHARE_STEP = 5
 # An object that is followed: how far from where it is expected it is looked for before everywhere else, and
 # how well it must be seen there for that to be left out.

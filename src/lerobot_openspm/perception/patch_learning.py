@@ -3,10 +3,10 @@
 Which camera shows an object well, where on it a patch finds hold and how large it should be is not known: a
 large one follows the table, one on a bottle's neck slides along it. So patches of all kinds are cut around
 the places that the hand touched, and each is followed through the first frames of many demonstrations, also
-of other tasks. What really follows the object is followed alike by patches of several kinds, a *group*; the
-others each go their own way. Where the hand touched a place of the object more than once, where it went has
-to agree; and two objects do not move alike, so a group belongs to one object alone. One demonstration of each
-of several tasks is enough.
+of other tasks. What really follows the object is followed alike by patches of several kinds, a *group*;
+tracks that belong to other objects disagree. Where the hand touched a place of the object more than once,
+where it went has to agree; and two objects do not move alike, so a group belongs to one object alone. One
+demonstration of each of several tasks is enough.
 
 That an object hardly moves is never taken from a few scenes that happen to agree. The hand's repeated
 touches tell how likely it is, all places and both axes taken together. So do the other objects' touches, and
