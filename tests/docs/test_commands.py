@@ -6,6 +6,7 @@ read by the very parser that would read it.
 
 import argparse
 import importlib.util
+import json
 import os
 import re
 import runpy
@@ -208,10 +209,36 @@ def test_a_layout_is_named_beside_any_command_that_trains(line: Line, parse: Cal
 def test_a_quick_command_does_what_it_says(line: Line):
     if "libero" in line.typed and not HAS_LIBERO:
         pytest.skip("LIBERO is not installed")
-    binaries = Path(sys.executable).parent
+    assert shell(line.typed).strip()
+
+
+def shell(line: str, cwd: Path | None = None) -> str:
+    """Run a command line as it is typed in the project's environment; what it printed."""
+    path = f"{Path(sys.executable).parent}:{os.environ['PATH']}"
     done = subprocess.run(
-        ["bash", "-euc", line.typed], capture_output=True, text=True, timeout=300, check=False,
-        env=os.environ | {"PATH": f"{binaries}:{os.environ['PATH']}", "HF_HUB_OFFLINE": "1"},
+        ["bash", "-euc", line], capture_output=True, text=True, timeout=300, check=False, cwd=cwd,
+        env=os.environ | {"PATH": path, "HF_HUB_OFFLINE": "1"},
     )  # fmt: skip
     assert done.returncode == 0, done.stderr[-3000:]
-    assert done.stdout.strip()
+    return done.stdout
+
+
+# What makes a command short; the last of two equal options counts.
+SHORTER = {
+    "openspm collect": " --env.task=push_plate --episodes=2",
+    "lerobot-train": " --steps=2 --policy.hidden_dim=32",
+    "lerobot-eval": " --env.task=push_plate --eval.n_episodes=1 --eval.batch_size=1",
+    "openspm inspect": "",
+}
+
+
+@pytest.mark.slow
+def test_from_recording_to_evaluation_the_commands_of_the_readme_do_what_they_say(tmp_path: Path):
+    page = [line for line in LINES if line.page == "README.md" and line.in_block]
+    first = next(i for i, line in enumerate(page) if line.typed.startswith("openspm collect"))
+    for line, (program, options) in zip(page[first:], SHORTER.items(), strict=False):
+        assert line.typed.startswith(program)
+        shell(line.typed + options, cwd=tmp_path)
+    assert (tmp_path / "outputs/train/checkpoints/last/pretrained_model/memory.json").is_file()
+    (told,) = (tmp_path / "outputs/eval").rglob("eval_info.json")
+    assert json.loads(told.read_text())["overall"]["n_episodes"] == 1
