@@ -11,6 +11,10 @@ from tests import properties  # noqa: F401 - loads Hypothesis' profile
 from tests.hub.loopback_hub import LoopbackHub
 from tests.policy.lerobot_commands import pretrained, run_command, train_arguments, training_options
 
+from lerobot_openspm.envs.gl_backend import set_default_gl_backend
+
+set_default_gl_backend()  # before any test imports mujoco
+
 
 @pytest.fixture
 def loopback_hub() -> Iterator[LoopbackHub]:
