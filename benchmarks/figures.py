@@ -219,7 +219,7 @@ def take(name: str) -> None:
             make_checkpoint(figure.simulator)
         program, *arguments = shlex.split(figure.command)
         subprocess.run([str(Path(sys.executable).with_name(program)), *arguments], check=True)
-    except subprocess.CalledProcessError as error:
+    except (subprocess.CalledProcessError, OpenSPMError, OSError, RuntimeError, ImportError) as error:
         logger.error("%s failed: %s", name, error)
 
 

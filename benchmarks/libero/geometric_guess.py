@@ -167,7 +167,7 @@ def remembered(
         open_width: Opening of the open fingers.
     """
     found, done = list[MemoryKeyPose](), 0
-    for pose in guessed:
+    for pose, after in zip(guessed, [*guessed[1:], None], strict=True):
         index = min(done - (pose.phase == "retreat" and done > 0), len(sub_tasks) - 1)
         sub_task = sub_tasks[index]
         arriving = pose.phase in ("pre-place", "place", "release", "retreat", "push")
@@ -181,7 +181,8 @@ def remembered(
                 FINGER_STEPS if dwell else TRAVEL_STEPS, dwell, sub_task=index,
             )
         )  # fmt: skip
-        done += pose.phase in ("release", "push")
+        goes_on = pose.phase == "push" and after is not None and after.phase == "push"
+        done += pose.phase in ("release", "push") and not goes_on
     return tuple(found)
 
 

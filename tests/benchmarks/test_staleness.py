@@ -306,9 +306,12 @@ def test_what_is_current_is_not_taken_again_and_one_failure_does_not_stop_the_re
     assert told == {"tracking": "no result file", "oracle": "current", "execution": "stale by 2 changes"}
 
 
-def test_without_its_checkpoint_nothing_is_measured(taking: list[str], monkeypatch: pytest.MonkeyPatch):
+@pytest.mark.parametrize("error", [CalledProcessError(1, ["lerobot-train"]), FileExistsError("a folder")])
+def test_without_its_checkpoint_nothing_is_measured(
+    taking: list[str], monkeypatch: pytest.MonkeyPatch, error: Exception
+):
     def fail(simulator: str) -> None:
-        raise CalledProcessError(1, ["lerobot-train"])
+        raise error
 
     monkeypatch.setattr(figures, "make_checkpoint", fail)
     assert figures.main(["tracking"]) == {"tracking": "no result file"}

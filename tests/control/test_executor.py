@@ -368,3 +368,20 @@ def test_a_correction_that_gets_nowhere_pushes_harder():
     assert len(values) >= 4
     assert values == sorted(values)
     assert values[3] > 2 * values[0] or values[3] == pytest.approx(1.0)
+
+
+def test_closed_fingers_that_push_after_something_was_put_down_hold_nothing_that_could_be_lost():
+    T = hand_pose(0.2, 0.0, 0.05)
+    pushing = [
+        key_pose("plate", T, "approach", closed=True),
+        key_pose("plate", T, "push", closed=True),
+        key_pose("plate", T, "retreat", closed=True),
+    ]
+    executor = make(key_poses=(*entry().key_poses, *pushing))
+    fist = Hand(HOME, 0.0)
+    phases = [target.memory.phase for target in executor.plan]
+    for index in (9, 10):
+        executor.begin(executor.plan, fist, index)
+        assert not executor.has_lost_grip(fist), phases[index]
+    executor.begin(executor.plan, fist, phases.index("lift"))
+    assert executor.has_lost_grip(fist)

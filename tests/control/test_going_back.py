@@ -114,6 +114,24 @@ def test_what_slipped_out_while_it_was_lifted_stands_where_it_stood_and_does_not
     assert_allclose(one.executor.plan[0].T_world_ee, first, atol=1e-6)
 
 
+def test_what_a_later_sub_task_grasps_again_stays_in_the_hand():
+    both = "put the bowl on the plate and put the bowl on the stove"
+    again = [replace(pose, sub_task=1) for pose in pick_and_place("bowl", "stove")]
+    layout = {**entry().layout, "stove": se3.from_yaw([-0.2, -0.1, 0.0], 0.0)}
+    eyes, one = Eyes(layout), row(entry(both, (*pick_and_place(), *again), layout), instruction=both)
+    one.observe(HAND, eyes)
+    one.executor.begin(one.executor.plan, HAND, 2)
+    grasp, lift = one.executor.plan[2], one.executor.plan[3]
+    watch(one, eyes, Hand(grasp.T_world_ee, 0.03), grasp.memory.n_steps + 1)
+    eyes.layout["bowl"] = lift.T_world_ee @ se3.inverse(grasp.T_world_ee) @ layout["bowl"]
+    watch(one, eyes, Hand(lift.T_world_ee, 0.03), 1)
+    assert one.executor.plan[one.executor.index].memory.phase == "pre-place"
+    eyes.layout["plate"] = layout["plate"] @ se3.from_yaw([0.05, 0.05, 0.0], 0.0)
+    watch(one, eyes, Hand(lift.T_world_ee, 0.03), 15)
+    assert one.executor.attempts == 0
+    assert one.tracker.held == {"bowl"}
+
+
 ON_PLATE = Outcome(0, "bowl", Anchor("plate", "plate"), np.zeros(3), np.zeros(3), 0.02)
 
 

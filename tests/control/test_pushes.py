@@ -1,5 +1,7 @@
 """Pushes are carried over along their way: from where the target is to where it should end."""
 
+from dataclasses import replace
+
 import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
@@ -149,7 +151,7 @@ def test_a_plate_goes_along_around_the_turn_of_a_push_and_is_let_go_at_its_end()
 
 
 def test_a_plate_that_the_hand_has_not_reached_yet_is_not_left_behind():
-    for gone, is_fetched in ((0.5 * OUTRUN_M, False), (1.5 * OUTRUN_M, True)):
+    for gone, is_fetched in ((0.5 * OUTRUN_M, False), (3 * OUTRUN_M, True)):
         eyes, one = Eyes(LAYOUT), row(turning_push(), instruction=INSTRUCTION)
         one.observe(HAND, eyes)
         contact = one.executor.plan[1].T_world_ee
@@ -160,6 +162,47 @@ def test_a_plate_that_the_hand_has_not_reached_yet_is_not_left_behind():
         ahead[1, 3] += gone
         watch(one, eyes, Hand(ahead, 0.0), 12)
         assert (one.executor.index < 2) is is_fetched, gone
+
+
+def test_a_hand_that_is_on_its_way_to_the_plate_has_not_outrun_it():
+    approach, contact, corner, end = turning_push().key_poses
+    far = replace(contact, T_obj_ee=hand_pose(0.0, -0.2, 0.02))
+    memory = entry(INSTRUCTION, (approach, far, corner, end), LAYOUT)
+    eyes, one = Eyes(LAYOUT), row(memory, instruction=INSTRUCTION)
+    one.observe(HAND, eyes)
+    met = one.executor.plan[1].T_world_ee
+    one.executor.begin(one.executor.plan, HAND, 1)
+    watch(one, eyes, Hand(met, 0.0), 1)
+    assert one.tracker.held == {"plate"}
+    nearer = met.copy()
+    nearer[1, 3] += 1.5 * OUTRUN_M
+    watch(one, eyes, Hand(nearer, 0.0), 12)
+    assert one.executor.attempts == 0
+
+
+def test_where_a_push_turns_the_place_of_meeting_is_not_told_by_its_end():
+    outcome = push().outcomes[0]
+    straight, turning = push(), replace(turning_push(), outcomes=(outcome,))
+    for memory, known in ((straight, True), (turning, False)):
+        targets = transfer(memory, LAYOUT, {}, HAND.T_world_ee)
+        pushes = [target for target in targets if target.memory.phase == "push"]
+        assert all((target.push is not None) is known for target in pushes)
+
+
+def test_what_a_push_leads_to_is_watched_beyond_a_turn():
+    approach, contact, _, end = turning_push().key_poses
+    corner = replace(end, T_obj_ee=end.T_obj_ee @ se3.from_yaw([0.1, 0.0, 0.0], 0.0))
+    memory = entry(INSTRUCTION, (approach, contact, corner, end), LAYOUT)
+    eyes, one = Eyes(LAYOUT), row(memory, instruction=INSTRUCTION)
+    one.observe(HAND, eyes)
+    here = Hand(one.executor.plan[2].T_world_ee, 0.0)
+    shown = one.executor.plan[3].T_world_ee
+    one.executor.begin(one.executor.plan, here, 3)
+    one.tracker.hold("plate", here.T_world_ee)
+    eyes.layout["stove"] = shifted(LAYOUT["stove"], 0.04)
+    del eyes.layout["plate"]
+    watch(one, eyes, here, 10)
+    assert_allclose(one.executor.plan[3].T_world_ee, shifted(shown, 0.04), atol=2e-3)
 
 
 def pushing(one, eyes, ahead_m):

@@ -365,6 +365,9 @@ def test_a_thing_keeps_its_name_unless_the_memory_calls_its_kind_otherwise(
         ("1 mug", "mug", 1),
         ("one mug", "mug", 1),
         ("3 mugs", "mug", 3),
+        ("2 cream cheese", "cream cheese", 2),
+        ("1 of the mugs", "mug", 1),
+        ("one of the mugs", "mug", 1),
         ("24 cans", "can", 24),
         ("thirteen mugs", "mug", 13),
     ],
@@ -381,3 +384,13 @@ def test_left_and_right_things_are_opened_and_switched_one_after_the_other(of):
     assert [sub_task.target_where for sub_task in read] == [Reference("left"), Reference("right")]
     apart = [parse_instruction(f"{verb} {of}the {side} {thing}")[0] for side in ("left", "right")]
     assert list(read) == apart
+
+
+def test_what_is_said_again_more_vaguely_is_not_done_twice():
+    read = parse_instruction("Turn on the left stove. The stove should be on.")
+    assert [sub_task.target_where for sub_task in read] == [Reference("left")]
+
+
+def test_a_size_counts_nothing_in_a_list():
+    read = parse_instruction("put the cans of soup and the 10 mm socket in the tray")
+    assert [sub_task.target for sub_task in read] == ["soup", "10 mm socket"]

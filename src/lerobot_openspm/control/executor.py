@@ -297,10 +297,11 @@ class Executor:
         if self._settings.execution != "closed_loop_trc" or self.index == 0:
             return False
         before, now = self.plan[self.index - 1].memory, self.plan[self.index].memory
-        grasped = next(
-            (p.memory for p in reversed(self.plan[: self.index]) if p.memory.phase == "grasp"), None
-        )
-        if not (before.closed and now.closed) or now.phase == "push" or grasped is None:
+        passed = [one.memory for one in self.plan[: self.index]]
+        grasped = next((p for p in reversed(passed) if p.phase in ("grasp", "release", "push")), None)
+        if not (before.closed and now.closed) or now.phase == "push":
+            return False
+        if grasped is None or grasped.phase != "grasp":  # an empty hand, closed to push
             return False
         if grasped.opening < HOLDING_SHARE * self._robot.open_width:
             return False

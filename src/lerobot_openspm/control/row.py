@@ -446,10 +446,7 @@ class Row:
     def _beyond(self, target: Target, push: PushWays, hand: Hand) -> float:
         """Metres by which the hand has gone beyond where it meets what it pushes."""
         place = self.tracker.poses(hand.T_world_ee)[push.target][:3, 3]
-        own = [
-            one for one in self.executor.plan if one.push and one.memory.sub_task == target.memory.sub_task
-        ]
-        return push.beyond(hand.T_world_ee, own[-1].T_world_ee, place)
+        return push.beyond(hand.T_world_ee, target.T_world_ee, place)
 
     def _is_left_behind(self, name: str, hand: Hand) -> bool:
         """Whether an object that turned out to be elsewhere than in the hand does not go along with it."""
@@ -466,15 +463,11 @@ class Row:
         while first > 0 and plan[first - 1].memory.phase == "push":
             first -= 1
         began = plan[first - 1].T_world_ee if first > 0 else self._planned_from
-        place = self.tracker.poses(hand.T_world_ee)[name]
-        gone = np.linalg.norm(
-            [
-                T[:2, 3] - T_before[:2, 3]
-                for T, T_before in ((hand.T_world_ee, began), (place, self.layout[name]))
-            ],
-            axis=-1,
-        )
-        return float(gone[0] - gone[1])
+        place, was = self.tracker.poses(hand.T_world_ee)[name][:3, 3], self.layout[name][:3, 3]
+        start, here = began[:3, 3], hand.T_world_ee[:3, 3]
+        further = _beside(here, start) - _beside(place, was)
+        # On its way to the object the hand has not outrun it, however far that is.
+        return min(further, _beside(here, place) - _beside(start, was))
 
     def _anchors(self, index: int) -> list[str]:
         """Objects of the key poses from one on that look as they did in the demonstrations."""
@@ -485,9 +478,15 @@ class Row:
     def _untouched(self) -> list[str]:
         """Objects of the key poses to come that still are where they were seen."""
         index = self.executor.index
-        touched = {pose.memory.anchor.place for pose in self.executor.plan[:index] if _touches(pose)}
-        touched |= self.tracker.held
+        touched = {self._touched(target) for target in self.executor.plan[:index]} | self.tracker.held
         return [name for name in self._anchors(index) if name not in touched]
+
+    def _touched(self, target: Target) -> str | None:
+        """What the hand takes hold of or moves at a key pose, if anything: it is elsewhere from then on."""
+        pose = target.memory
+        if pose.phase == "push":  # its anchor may be where the target goes
+            return self.ranked[0].entry.key.sub_tasks[pose.sub_task].target
+        return pose.anchor.place if pose.phase in ("grasp", "open", "turn") else None
 
     def _now_needed(self) -> list[str]:
         """Objects that the present key pose is relative to, unless the hand has touched them."""
@@ -504,7 +503,8 @@ class Row:
         """Go to a key pose; what is grasped or pushed from there on is not in the hand any more."""
         self._planned_from = hand.T_world_ee
         ahead = self.ranked[0].entry.key_poses[index:]
-        regrasped = {pose.anchor.place for pose in ahead if pose.phase in ("approach", "grasp")}
+        own = [pose for pose in ahead if pose.sub_task == ahead[0].sub_task]
+        regrasped = {pose.anchor.place for pose in own if pose.phase in ("approach", "grasp")}
         self.tracker.drop(self.tracker.held & regrasped, hand.T_world_ee)
         self.executor.begin(self._transfer(self.ranked[0].entry, self._planned_from), hand, index)
 
@@ -533,15 +533,15 @@ class Row:
         return targets if self._is_last_part else (*targets, *rise(targets[-1], self._start_height))
 
 
+def _beside(a: Array, b: Array) -> float:
+    """Horizontal distance of two points, metres."""
+    return float(np.linalg.norm(a[:2] - b[:2]))
+
+
 def _until(entry: MemoryEntry, sub_task: int) -> MemoryEntry:
     """An entry without the sub-tasks after one."""
     key = replace(entry.key, sub_tasks=entry.key.sub_tasks[: sub_task + 1])
     return replace(entry, key=key, key_poses=tuple(p for p in entry.key_poses if p.sub_task <= sub_task))
-
-
-def _touches(target: Target) -> bool:
-    """Whether the hand takes hold of the anchor or moves it; it is not where it was seen from then on."""
-    return target.memory.phase in ("grasp", "push", "open", "turn")
 
 
 def _is_moved(T: Array, other: Array) -> bool:

@@ -85,7 +85,8 @@ class Target:
         memory: The key pose it was carried over from.
         precise: Whether it is met by terminal residual correction, or only passed by.
         axis: The constraint that the way here follows, its direction in the world; None in free space.
-        push: The way of what is pushed on the way here; None where it is not known, or nothing is pushed.
+        push: The way of what is pushed on the way here; None where it is not known or turns, or nothing is
+            pushed.
     """
 
     T_world_ee: Array
@@ -142,7 +143,10 @@ def transfer(
         axis = pose.axis
         if axis is not None:
             axis = replace(axis, direction=T_world_anchor[:3, :3] @ axis.direction)
-        targets.append(Target(before, pose, precise, axis, ways if pose.phase == "push" else None))
+        # Where a push turns, the hand meets its target elsewhere than where the way ends.
+        is_straight = sum(p.phase == "push" and p.sub_task == pose.sub_task for p in entry.key_poses) == 1
+        push = ways if pose.phase == "push" and is_straight else None
+        targets.append(Target(before, pose, precise, axis, push))
     for sub_task, amount in (gone or {}).items():
         targets = _gone_on(targets, sub_task, amount)
     if targets and entry.key.sub_tasks[-1].operation == "put":

@@ -39,7 +39,8 @@ def read_nouns(words: Words) -> list[Noun]:
     """Read one noun phrase or several, joined by "and" or commas."""
     groups = _coordinated(_without(words, ("both",)) if "and" in words else words)
     nouns = [read_noun(group) for group in groups]
-    if len(nouns) > 1 and not any(number in words for number in v.NUMBERS if number != "both"):
+    counts = [word in v.NUMBERS and not _is_size(words[i:]) for i, word in enumerate(words)]
+    if len(nouns) > 1 and not any(counts) and not {"pair", "couple"} & set(words):
         nouns = [replace(noun, count=1) for noun in nouns]  # "the cans of soup and sauce"
     return nouns
 
@@ -74,6 +75,9 @@ def read_noun(words: Words) -> Noun:
     for before, word in pairwise(words):
         if word in v.DETERMINERS and before not in ("of", "'s", "both", "all", "each", ","):
             raise InstructionError(f"has words I cannot read: {' '.join(words)!r}")
+    single = words[1:] if words[:1] == ("the",) else words
+    if len(single) > 2 and single[0] in ("one", "1") and single[1] == "of":
+        return replace(read_noun(single[2:]), count=1)
     words, count = _split_count(words)
     bare = tuple(word for word in words if word not in ("the", "whole"))
     words = bare if " ".join(bare) in v.PRONOUNS else words
@@ -129,8 +133,8 @@ def _is_size(words: Words) -> bool:
     """Whether a number in digits belongs to a name: "the 10 mm socket", "a 24 can pack"."""
     if len(words) < 2 or not words[0].isdecimal() or words[1] == "of":
         return False
-    heads = (words[words.index("of") - 1] if "of" in words[1:] else words[-1], words[-1])
-    return v.singular(words[1]) in v.UNITS or (int(words[0]) > 1 and all(v.singular(h) == h for h in heads))
+    holds = len(words) > 2 and words[1] in v.CONTAINERS and words[2] != "of"
+    return v.singular(words[1]) in v.UNITS or holds
 
 
 def _read_of(before: Words, whole: Words) -> Noun:

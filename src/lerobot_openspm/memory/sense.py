@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Sequence
+from dataclasses import replace
 
 from lerobot_openspm.memory import vocabulary as v
 from lerobot_openspm.memory.entry import SubTask
@@ -39,6 +40,9 @@ def is_said_again(one: SubTask, other: SubTask) -> bool:
     """Whether a step says no more than one before it: "beside it" after "to the right of it"."""
     if one == other:
         return True
+    if one.operation in MADE:
+        same = replace(one, target_where=None) == replace(other, target_where=None)
+        return same and (one.target_where is None or other.target_where is None)
     names = set(one.target.split()), set(other.target.split())
     vaguer = other.relation in ("at", "next to", one.relation)
     return (

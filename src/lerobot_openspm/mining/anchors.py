@@ -52,6 +52,11 @@ def roles(key_poses: Sequence[KeyPose]) -> list[Role]:
     return backwards[::-1]
 
 
+def _is_turn(role: Role) -> bool:
+    """Whether a push goes on there: the hand passes by, in each demonstration somewhere else."""
+    return role[1] == "push" and role[2] > 0
+
+
 def sub_task_of(pose: KeyPose, sub_tasks: Sequence[SubTask]) -> SubTask:
     """The sub-task a key pose serves, see :func:`sub_task_index`."""
     return sub_tasks[sub_task_index(pose.contact, pose.phase, len(sub_tasks))]
@@ -140,7 +145,10 @@ def align_symmetric(
     aligned = []
     for demonstration in demonstrations:
         layout = dict(demonstration.layout)
-        contacts = [p.T_world_ee for p in demonstration.key_poses if p.phase in CONTACT_PHASES]
+        with_roles = zip(demonstration.key_poses, roles(demonstration.key_poses), strict=True)
+        contacts = [
+            p.T_world_ee for p, role in with_roles if p.phase in CONTACT_PHASES and not _is_turn(role)
+        ]
         for name, T_world_obj in layout.items():
             equivalents = se3.yaw_equivalents(T_world_obj, yaw_periods.get(name, 2 * np.pi))
             if len(equivalents) == 1 or not contacts:
@@ -163,6 +171,7 @@ def qualities(demonstrations: Sequence[Demonstration], anchors: Mapping[Role, An
             anchor = anchors.get(role)
             if (
                 pose.phase in CONTACT_PHASES
+                and not _is_turn(role)
                 and anchor
                 and all(n in demonstration.layout for n in anchor.objects)
             ):
