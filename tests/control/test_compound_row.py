@@ -168,6 +168,24 @@ def test_an_opened_drawer_looks_different_and_is_not_looked_for_again():
     assert_allclose(place.T_world_ee, cabinet @ place.memory.T_obj_ee)
 
 
+def test_what_an_opened_drawer_hides_is_not_lost():
+    eyes = Eyes({**LAYOUT, "cabinet": se3.from_yaw([0.2, 0.2, 0.0], 0.3)})
+    one = row(opening(), PLATE, instruction="open the top drawer and put the bowl on the plate")
+    one.observe(HAND, eyes)
+    del eyes.layout["bowl"]  # it should be in sight, and is not recognised
+    finish_part(one, eyes, HAND)
+    assert one._part == 1
+    away = Hand(hand_pose(-0.4, -0.4, 0.5), HAND.opening)
+    watch(one, eyes, away, 100)
+    assert one.status is Status.RUNNING
+    assert not one.is_paused
+    eyes.layout["bowl"] = LAYOUT["bowl"]
+    watch(one, eyes, away, 12)
+    del eyes.layout["bowl"]
+    watch(one, eyes, away, 100)
+    assert one.status is Status.OBJECT_LOST, "it was seen since, so it is gone now"
+
+
 def test_what_was_opened_is_not_looked_for_when_a_later_grasp_is_tried_again():
     cabinet = se3.from_yaw([0.2, 0.2, 0.0], 0.3)
     putting = entry("put the bowl on the cabinet").key_poses

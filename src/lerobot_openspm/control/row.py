@@ -432,6 +432,7 @@ class Row:
                 self.tracker.release(self.tracker.held, hand.T_world_ee)
             elif passed.phase in ("open", "turn"):
                 self._altered.add(passed.anchor.place)
+                self.tracker.cover()
         target = self.executor.target
         if target and target.push and self._beyond(target, target.push, hand) >= 0:
             self.tracker.hold(target.push.target, hand.T_world_ee)

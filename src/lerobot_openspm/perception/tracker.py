@@ -80,7 +80,8 @@ class _Track:
         hidden: Whether the last look could not tell.
         rivalled: Whether two places explained the last look's pictures.
         doubted: Whether the next sure sight is believed wherever it is.
-        placed: Whether the hand has let go of it where it is taken to be, and it was not seen since.
+        covered: Whether something may hide it since it was last seen: the hand has let go of it there, or has
+            opened something.
         stood_m: Height in the world from which the hand took it; infinity before.
     """
 
@@ -92,7 +93,7 @@ class _Track:
     hidden: bool = False
     rivalled: bool = False
     doubted: bool = False
-    placed: bool = False
+    covered: bool = False
     stood_m: float = np.inf
 
 
@@ -182,7 +183,7 @@ class Tracker:
             track = self._tracks.get(name)
             if track is not None and track.held:
                 self._carry(track, T_world_ee, held=False)
-                track.placed = True
+                track.covered = True
 
     def drop(self, names: Iterable[str], T_world_ee: Array) -> None:
         """The hand has lost objects: they lie below it, no higher than where it took them from."""
@@ -192,6 +193,11 @@ class Tracker:
             fallen = np.array([0.0, 0.0, min(0.0, track.stood_m - float(track.smoothed[2, 3]))])
             track.smoothed = se3.transform(track.smoothed[:3, :3], track.smoothed[:3, 3] + fallen)
             track.belief = track.belief._replace(position=track.belief.position + fallen)
+
+    def cover(self) -> None:
+        """Something was opened: what stands behind it is hidden from now on, until it is seen again."""
+        for track in self._tracks.values():
+            track.covered = track.covered or not track.held
 
     def doubt(self, names: Iterable[str], T_world_ee: Array) -> None:
         """Objects need not be where they are taken to be; the next sure sight of them is believed at once."""
@@ -239,7 +245,7 @@ class Tracker:
             )
             if innovation.accepted[0]:
                 track.belief, track.rival, track.missed_s = belief, None, 0.0
-                track.hidden = track.rivalled = track.doubted = track.placed = False
+                track.hidden = track.rivalled = track.doubted = track.covered = False
                 track.smoothed = self._smoothed(track.smoothed, belief.T[0])
                 return False
         rival, track.rival = T_world_obj if track.doubted else track.rival, T_world_obj
@@ -252,7 +258,8 @@ class Tracker:
     def _miss(self, track: _Track, estimate: PoseEstimate, T_world_ee: Array, waited_s: float) -> None:
         """An object that is in sight but not recognised is on its way to being lost; a hidden one is not.
 
-        Nor is one that the hand has put where it looks different, as in a drawer.
+        Nor is one that the hand has put where it looks different, as in a drawer, or has opened a drawer
+        before.
         """
         expected = _in_world(track.belief.T[0], track, T_world_ee)
         near = self.settings.carrying_m if self.held else self.settings.hand_m
@@ -260,7 +267,7 @@ class Tracker:
         track.hidden = (
             estimate.visible < self.settings.visible
             or estimate.status == "found"
-            or (track.placed and not track.doubted)
+            or (track.covered and not track.doubted)
             or float(np.linalg.norm(expected[:3, 3] - T_world_ee[:3, 3])) < near
         )
         track.rivalled = estimate.status == "ambiguous" and not track.hidden
