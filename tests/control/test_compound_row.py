@@ -23,11 +23,11 @@ LAYOUT = {
 }
 
 
-def opening():
+def opening(instruction="open the top drawer", thing="cabinet", phase="open"):
     T = hand_pose(0.1, 0.0, 0.1)
-    phases = (("approach", False), ("grasp", True), ("open", True), ("release", False), ("retreat", False))
-    poses = [key_pose("cabinet", T, phase, closed) for phase, closed in phases]
-    return entry("open the top drawer", poses, {"cabinet": np.eye(4)}, source="local/demos#2")
+    phases = (("approach", False), ("grasp", True), (phase, True), ("release", False), ("retreat", False))
+    poses = [key_pose(thing, T, phase, closed) for phase, closed in phases]
+    return entry(instruction, poses, {thing: np.eye(4)}, source="local/demos#2")
 
 
 def row(*entries, instruction=BOTH, **options):
@@ -184,6 +184,21 @@ def test_what_an_opened_drawer_hides_is_not_lost():
     del eyes.layout["bowl"]
     watch(one, eyes, away, 100)
     assert one.status is Status.OBJECT_LOST, "it was seen since, so it is gone now"
+
+
+@pytest.mark.parametrize(
+    ("instruction", "thing", "phase"),
+    [("close the top drawer", "cabinet", "open"), ("turn on the stove", "stove", "turn")],
+)
+def test_what_closes_or_turns_hides_nothing(instruction: str, thing: str, phase: str):
+    eyes = Eyes({**LAYOUT, thing: se3.from_yaw([0.2, 0.2, 0.0], 0.3)})
+    both = f"{instruction} and put the bowl on the plate"
+    one = row(opening(instruction, thing, phase), PLATE, instruction=both)
+    one.observe(HAND, eyes)
+    del eyes.layout["bowl"]
+    finish_part(one, eyes, HAND)
+    watch(one, eyes, Hand(hand_pose(-0.4, -0.4, 0.5), HAND.opening), 100)
+    assert one.status is Status.OBJECT_LOST
 
 
 def test_what_was_opened_is_not_looked_for_when_a_later_grasp_is_tried_again():

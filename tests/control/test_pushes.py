@@ -150,6 +150,20 @@ def test_a_plate_goes_along_around_the_turn_of_a_push_and_is_let_go_at_its_end()
         assert_allclose(one.executor.plan[2].T_world_ee, ends[2], atol=1e-9)
 
 
+def test_what_is_pushed_goes_along_and_not_what_the_hand_began_relative_to():
+    approach, contact, corner, end = turning_push().key_poses
+    T_plate, T_stove = LAYOUT["plate"], LAYOUT["stove"]
+    of_stove = replace(
+        contact, anchor=Anchor("stove", "stove"), T_obj_ee=se3.inverse(T_stove) @ T_plate @ contact.T_obj_ee
+    )
+    memory = entry(INSTRUCTION, (approach, of_stove, corner, end), LAYOUT)
+    eyes, one = Eyes(LAYOUT), row(memory, instruction=INSTRUCTION)
+    one.observe(HAND, eyes)
+    one.executor.begin(one.executor.plan, HAND, 1)
+    watch(one, eyes, Hand(one.executor.plan[1].T_world_ee, 0.0), 1)
+    assert one.tracker.held == {"plate"}
+
+
 def test_a_plate_that_the_hand_has_not_reached_yet_is_not_left_behind():
     for gone, is_fetched in ((0.5 * OUTRUN_M, False), (3 * OUTRUN_M, True)):
         eyes, one = Eyes(LAYOUT), row(turning_push(), instruction=INSTRUCTION)

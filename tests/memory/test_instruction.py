@@ -361,6 +361,10 @@ def test_a_thing_keeps_its_name_unless_the_memory_calls_its_kind_otherwise(
     [
         ("10 mm socket", "10 mm socket", 1),
         ("24 can pack", "24 can pack", 1),
+        ("8 ball", "8 ball", 1),
+        ("2 button", "2 button", 1),
+        ("4 port hub", "4 port hub", 1),
+        ("2 x 4 block", "2 x 4 block", 1),
         ("12 inch rulers", "12 inch ruler", 2),
         ("1 mug", "mug", 1),
         ("one mug", "mug", 1),
@@ -389,6 +393,30 @@ def test_left_and_right_things_are_opened_and_switched_one_after_the_other(of):
 def test_what_is_said_again_more_vaguely_is_not_done_twice():
     read = parse_instruction("Turn on the left stove. The stove should be on.")
     assert [sub_task.target_where for sub_task in read] == [Reference("left")]
+
+
+@pytest.mark.parametrize(
+    ("told", "said_again"),
+    [
+        ("Open the top drawer.", "The top drawer should be open."),
+        ("Turn on the stove.", "Make sure the stove is on."),
+        ("Put the bowl on the plate.", "The bowl should be on the plate."),
+        ("Put two bowls on the plate.", "The bowls should be on the plate."),
+    ],
+)
+def test_what_is_said_to_be_so_in_the_end_is_not_done_twice(told, said_again):
+    assert parse_instruction(f"{told} {said_again}") == parse_instruction(told)
+
+
+@pytest.mark.parametrize("instruction", ["turn on the {}stove", "open the top drawer of the {}cabinet"])
+def test_what_is_said_more_exactly_is_another_thing(instruction: str):
+    read = parse_instruction(f"{instruction.format('')} and {instruction.format('left ')}")
+    assert [sub_task.target_where for sub_task in read] == [None, Reference("left")]
+
+
+def test_both_counts_no_thing_of_a_list():
+    read = parse_instruction("put both the cans of soup and the butter in the basket")
+    assert [sub_task.target for sub_task in read] == ["soup", "butter"]
 
 
 def test_a_size_counts_nothing_in_a_list():

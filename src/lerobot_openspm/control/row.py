@@ -22,7 +22,7 @@ from lerobot_openspm.flow.condition import Query
 from lerobot_openspm.geometry import se3
 from lerobot_openspm.geometry.se3 import Array
 from lerobot_openspm.memory.compound import Candidate, plan_parts
-from lerobot_openspm.memory.entry import WORLD, MemoryEntry, Outcome
+from lerobot_openspm.memory.entry import WORLD, MemoryEntry, MemoryKeyPose, Outcome, SubTask
 from lerobot_openspm.memory.retrieval import Scored
 from lerobot_openspm.perception.camera_watch import Fault
 from lerobot_openspm.perception.tracker import Tracker, TrackStatus
@@ -41,8 +41,8 @@ BLIND_S, GIVE_UP_S = 0.5, 2.0
 # After the last key pose the policy looks up to three times at what it moved. Then the outcome stays unknown.
 LOOKS_AT_OUTCOME = 3
 
-# A hand that has gone this far beyond what it pushes has lost it; or, where it is not known where they
-# meet, this much further than what it pushes.
+# A hand that has gone this far beyond where it meets what it pushes has lost it; or, where it is not known
+# where they meet, this much further than what it pushes, and this much further away from it than at first.
 LEFT_BEHIND_M, OUTRUN_M = 0.025, 0.06
 
 # An object that is this far from where the key poses took it to be takes them along; less is noise.
@@ -426,13 +426,16 @@ class Row:
             is_carried = passed.phase == "grasp" and after.phase not in ("open", "turn")
             # Where the way of a push is known, the target is held once the hand has met it; see below.
             is_pushed = after.phase == "push" != passed.phase and self.executor.plan[i + 1].push is None
-            if is_carried or is_pushed:
+            if is_carried:
                 self.tracker.hold(passed.anchor.place, hand.T_world_ee)
+            elif is_pushed:
+                self.tracker.hold(self._sub_task(after).target, hand.T_world_ee)
             elif passed.phase == "release" or passed.phase == "push" != after.phase:
                 self.tracker.release(self.tracker.held, hand.T_world_ee)
             elif passed.phase in ("open", "turn"):
                 self._altered.add(passed.anchor.place)
-                self.tracker.cover()
+                if passed.phase == "open" and self._sub_task(passed).operation != "close":
+                    self.tracker.cover()
         target = self.executor.target
         if target and target.push and self._beyond(target, target.push, hand) >= 0:
             self.tracker.hold(target.push.target, hand.T_world_ee)
@@ -459,7 +462,7 @@ class Row:
         return target.push.target != name or self._beyond(target, target.push, hand) > LEFT_BEHIND_M
 
     def _outrun_by(self, name: str, hand: Hand) -> float:
-        """Metres by which the hand has gone further than an object since the push began."""
+        """Metres by which the hand has gone further than an object and away from it since the push began."""
         plan, first = self.executor.plan, self.executor.index
         while first > 0 and plan[first - 1].memory.phase == "push":
             first -= 1
@@ -486,8 +489,11 @@ class Row:
         """What the hand takes hold of or moves at a key pose, if anything: it is elsewhere from then on."""
         pose = target.memory
         if pose.phase == "push":  # its anchor may be where the target goes
-            return self.ranked[0].entry.key.sub_tasks[pose.sub_task].target
+            return self._sub_task(pose).target
         return pose.anchor.place if pose.phase in ("grasp", "open", "turn") else None
+
+    def _sub_task(self, pose: MemoryKeyPose) -> SubTask:
+        return self.ranked[0].entry.key.sub_tasks[pose.sub_task]
 
     def _now_needed(self) -> list[str]:
         """Objects that the present key pose is relative to, unless the hand has touched them."""

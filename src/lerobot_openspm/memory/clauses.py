@@ -28,12 +28,14 @@ class Said:
         targets: What it is done to.
         relation: Where that goes relative to the landmark, or "".
         landmark: Where it goes; None where that is not said.
+        is_state: Whether it says how something is to be: "the bowl should be on the plate".
     """
 
     operation: str
     targets: tuple[Noun, ...]
     relation: str = ""
     landmark: Noun | None = None
+    is_state: bool = False
 
 
 @dataclass(frozen=True)
@@ -190,7 +192,11 @@ def _of_other_place(said: Said, before: Said) -> Said:
 def _state(subject: Words, rest: Words) -> Said | None:
     """What is to be done so that a subject is as said: "open", "on", "placed on it", "on the plate"."""
     at = next((i for i, word in enumerate(rest[:-1]) if word not in v.STANDS | _GOES), len(rest) - 1)
-    rest = rest[at:]
+    said = _made(subject, rest[at:])
+    return None if said is None else replace(said, is_state=True)
+
+
+def _made(subject: Words, rest: Words) -> Said | None:
     if verb := v.match_verb(rest, 0, "participle") or v.match_verb(rest, 0, "gerund"):
         return _read_verb(verb, (*subject, *rest[verb.length :]))
     if rest in (("on",), ("off",)):

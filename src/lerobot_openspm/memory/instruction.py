@@ -39,7 +39,7 @@ class _Meant:
     Attributes:
         sub_tasks: One for each of its targets; of operation "pick" where something is only taken.
         step: Its place.
-        is_done: Whether it only says what is done by then.
+        is_done: Whether it says what is done by then, or how something is to be.
     """
 
     sub_tasks: tuple[SubTask, ...]
@@ -189,7 +189,8 @@ def _resolve_all(clauses: Sequence[Clause], said: Sequence[Said]) -> list[_Meant
                 raise InstructionError(f"states something of {topic.name or 'it'!r}; say what to do")
             continue
         sub_tasks = _Resolver([s for one in meant for s in one.sub_tasks], topic).resolve(said[i])
-        meant.append(_Meant(sub_tasks, clauses[i].step, clauses[i].is_done or _is_there(said[i])))
+        is_done = clauses[i].is_done or said[i].is_state or _is_there(said[i])
+        meant.append(_Meant(sub_tasks, clauses[i].step, is_done))
         topic = None
     return meant
 
@@ -333,8 +334,9 @@ def _merged(meant: Sequence[_Meant]) -> tuple[SubTask, ...]:
     """Join what is taken with where it is put, and leave out what is said twice."""
     found: list[SubTask] = []
     for one in meant:
+        before = tuple(found)
         for sub_task in one.sub_tasks:
-            if one.is_done and sub_task in found:
+            if one.is_done and sub_task in before:
                 continue
             if one.is_done and found and replace(found[-1], operation="push") == sub_task:
                 found.pop()  # "the plate belongs in front of the stove, push it there"

@@ -39,10 +39,14 @@ def read_nouns(words: Words) -> list[Noun]:
     """Read one noun phrase or several, joined by "and" or commas."""
     groups = _coordinated(_without(words, ("both",)) if "and" in words else words)
     nouns = [read_noun(group) for group in groups]
-    counts = [word in v.NUMBERS and not _is_size(words[i:]) for i, word in enumerate(words)]
-    if len(nouns) > 1 and not any(counts) and not {"pair", "couple"} & set(words):
+    if len(nouns) > 1 and not any(map(_has_number, groups)) and not {"pair", "couple"} & set(words):
         nouns = [replace(noun, count=1) for noun in nouns]  # "the cans of soup and sauce"
     return nouns
+
+
+def _has_number(words: Words) -> bool:
+    """Whether a noun phrase says how many there are."""
+    return any(word in v.NUMBERS and not _is_in_name(words[i:]) for i, word in enumerate(words))
 
 
 def _coordinated(words: Words) -> list[Words]:
@@ -103,10 +107,15 @@ def _split_count(words: Words) -> tuple[Words, int]:
     rest, count = list(words), 1
     while rest:
         one, two = rest[0], " ".join(rest[:2])
-        if one in ("one", "1") and len(rest) > 1 and rest[1] not in v.NUMBERS and not _is_size(tuple(rest)):
+        if (
+            one in ("one", "1")
+            and len(rest) > 1
+            and rest[1] not in v.NUMBERS
+            and not _is_in_name(tuple(rest))
+        ):
             rest = rest[1:]
             continue
-        if _is_size(tuple(rest)):
+        if _is_in_name(tuple(rest)):
             break
         if two in v.NUMBERS or one in v.NUMBERS:
             used = 2 if two in v.NUMBERS else 1
@@ -129,12 +138,14 @@ def _split_count(words: Words) -> tuple[Words, int]:
     return tuple(rest), count
 
 
-def _is_size(words: Words) -> bool:
-    """Whether a number in digits belongs to a name: "the 10 mm socket", "a 24 can pack"."""
+def _is_in_name(words: Words) -> bool:
+    """Whether a number in digits belongs to a name: "10 mm sockets", "a 24 can pack", "the 8 ball"."""
     if len(words) < 2 or not words[0].isdecimal() or words[1] == "of":
         return False
     holds = len(words) > 2 and words[1] in v.CONTAINERS and words[2] != "of"
-    return v.singular(words[1]) in v.UNITS or holds
+    counts_one = int(words[0]) == 1 or words[-1] in v.UNCOUNTABLE
+    is_one = not counts_one and all(v.singular(word) == word for word in words)
+    return v.singular(words[1]) in v.UNITS or holds or is_one
 
 
 def _read_of(before: Words, whole: Words) -> Noun:

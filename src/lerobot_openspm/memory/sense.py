@@ -41,8 +41,7 @@ def is_said_again(one: SubTask, other: SubTask) -> bool:
     if one == other:
         return True
     if one.operation in MADE:
-        same = replace(one, target_where=None) == replace(other, target_where=None)
-        return same and (one.target_where is None or other.target_where is None)
+        return replace(one, target_where=None) == other
     names = set(one.target.split()), set(other.target.split())
     vaguer = other.relation in ("at", "next to", one.relation)
     return (

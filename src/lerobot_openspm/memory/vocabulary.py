@@ -268,6 +268,11 @@ NUMBERS = {
 }  # fmt: skip
 # A number before one of these is a size: "the 10 mm socket".
 UNITS = word_set("mm cm m inch g kg oz ml l liter litre cent watt volt")
+# Words without a plural: "2 cream cheese" are two of them, as "the 2 button" is not.
+UNCOUNTABLE = word_set(
+    "cheese butter milk ketchup soup sauce juice pudding dressing coffee tea water wine bread rice pasta "
+    "sugar salt soap popcorn fruit food toothpaste yogurt yoghurt"
+)
 PRONOUNS = {
     **dict.fromkeys(("it", "this", "that", "itself"), "it"),
     "there": "there",
