@@ -62,6 +62,23 @@ def test_a_handle_that_slipped_out_is_taken_again_where_it_is_now_for_the_rest_o
     assert_allclose(one.executor.plan[3].T_world_ee, shown[3], atol=1e-9)
 
 
+def test_a_handle_that_went_back_when_it_slipped_out_is_looked_for_nearer_to_where_it_was():
+    axis = KINDS["slide"]
+    eyes, one = Eyes(CABINET), row(handle(axis), instruction=OPEN)
+    one.observe(HAND, eyes)
+    shown = [target.T_world_ee for target in one.executor.plan]
+    one.executor.begin(one.executor.plan, Hand(shown[2], 0.03), 3)
+    way = Axis(axis.kind, one.executor.plan[3].axis.direction, 0.4 * axis.amount)
+    watch(one, eyes, Hand(way.follow(shown[2]), 0.03), 1)
+    watch(one, eyes, Hand(way.follow(shown[2]), 0.0), 1)
+    for share in (0.2, 0.1):  # it is not where it slipped out
+        there = one.executor.plan[2].T_world_ee
+        one.executor.begin(one.executor.plan, Hand(there, 0.0), 3)
+        watch(one, eyes, Hand(there, 0.0), 1)
+        nearer = Axis(axis.kind, way.direction, share * axis.amount)
+        assert_allclose(one.executor.plan[2].T_world_ee, nearer.follow(shown[2]), atol=1e-9)
+
+
 def stuck(one, eyes, hand, index):
     """The hand, held up short of a key pose until it is given up."""
     one.executor.begin(one.executor.plan, hand, index)

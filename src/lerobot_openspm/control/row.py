@@ -45,6 +45,9 @@ LOOKS_AT_OUTCOME = 3
 # where they meet, this much further than what it pushes, and this much further away from it than at first.
 LEFT_BEHIND_M, OUTRUN_M = 0.025, 0.06
 
+# A handle that has come along for less than this share of its way was not in the fingers.
+LEAST_TRAVEL = 0.05
+
 # An object that is this far from where the key poses took it to be takes them along; less is noise.
 MOVED_M, MOVED_RAD = 0.002, 0.05
 
@@ -325,8 +328,10 @@ class Row:
         """Where to go back to: the approach to what is grasped or, with it in the hand, to its place."""
         target = self.executor.plan[self.executor.index]
         if target.axis is not None and self.executor.feels_handle(self.executor.index):
-            gone = self._gone.get(target.memory.sub_task, 0.0)
-            self._gone[target.memory.sub_task] = gone + max(self.executor.travelled, 0.0)
+            gone, further = self._gone.get(target.memory.sub_task, 0.0), max(self.executor.travelled, 0.0)
+            # Fingers that close on nothing where a handle slipped out: it went back when they let go.
+            came_along = further > LEAST_TRAVEL * target.axis.amount
+            self._gone[target.memory.sub_task] = gone + further if came_along else 0.5 * gone
         is_carrying = bool(self.tracker.held) and target.memory.phase == "place"
         if is_carrying and not self.executor.has_lost_grip(hand):
             return self.executor.entry_index()
