@@ -79,6 +79,25 @@ def test_a_handle_that_went_back_when_it_slipped_out_is_looked_for_nearer_to_whe
         assert_allclose(one.executor.plan[2].T_world_ee, nearer.follow(shown[2]), atol=1e-9)
 
 
+def test_a_handle_that_does_not_move_on_in_the_fingers_is_taken_again_where_it_is():
+    axis = KINDS["slide"]
+    eyes, one = Eyes(CABINET), row(handle(axis), instruction=OPEN)
+    one.observe(HAND, eyes)
+    shown = [target.T_world_ee for target in one.executor.plan]
+    one.executor.begin(one.executor.plan, Hand(shown[2], 0.03), 3)
+    way = Axis(axis.kind, one.executor.plan[3].axis.direction, 0.4 * axis.amount)
+    watch(one, eyes, Hand(way.follow(shown[2]), 0.03), 1)
+    watch(one, eyes, Hand(way.follow(shown[2]), 0.0), 1)
+    held = Hand(one.executor.plan[2].T_world_ee, 0.03)
+    one.executor.begin(one.executor.plan, held, 3)
+    for _ in range(200):
+        watch(one, eyes, held, 1)
+        if one.executor.attempts == 2:
+            break
+    assert one.executor.attempts == 2
+    assert_allclose(one.executor.plan[2].T_world_ee, way.follow(shown[2]), atol=1e-9)
+
+
 def stuck(one, eyes, hand, index):
     """The hand, held up short of a key pose until it is given up."""
     one.executor.begin(one.executor.plan, hand, index)

@@ -330,8 +330,8 @@ class Row:
         if target.axis is not None and self.executor.feels_handle(self.executor.index):
             gone, further = self._gone.get(target.memory.sub_task, 0.0), max(self.executor.travelled, 0.0)
             # Fingers that close on nothing where a handle slipped out: it went back when they let go.
-            came_along = further > LEAST_TRAVEL * target.axis.amount
-            self._gone[target.memory.sub_task] = gone + further if came_along else 0.5 * gone
+            is_empty = self.executor.has_lost_grip(hand) and further < LEAST_TRAVEL * target.axis.amount
+            self._gone[target.memory.sub_task] = 0.5 * gone if is_empty else gone + further
         is_carrying = bool(self.tracker.held) and target.memory.phase == "place"
         if is_carrying and not self.executor.has_lost_grip(hand):
             return self.executor.entry_index()
