@@ -35,6 +35,7 @@ def test_the_list_is_complete():
     assert told == {task.instruction for task in TASKS.values()}
 
 
+@pytest.mark.libero
 @pytest.mark.skipif(importlib.util.find_spec("libero") is None, reason="needs LIBERO's task files")
 def test_the_list_is_that_of_libero():
     (package,) = importlib.util.find_spec("libero").submodule_search_locations

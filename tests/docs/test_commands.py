@@ -139,8 +139,12 @@ def test_the_pages_show_commands_of_every_kind():
 
 @pytest.mark.parametrize(
     "line",
-    [one for one in of_ours("openspm", "lerobot-train", "lerobot-eval", "python", ".venv/bin/python")
-     if not one.is_mention and "-c" not in one.words],
+    [
+        # Those about LIBERO run with the other tests that need it installed.
+        pytest.param(one, marks=pytest.mark.libero if "libero" in one.typed else ())
+        for one in of_ours("openspm", "lerobot-train", "lerobot-eval", "python", ".venv/bin/python")
+        if not one.is_mention and "-c" not in one.words
+    ],
     ids=ids,
 )  # fmt: skip
 @pytest.mark.usefixtures("workplace")

@@ -11,7 +11,7 @@ from lerobot_openspm.cli.collect import CollectConfig, SimulatorConfig, collect
 from lerobot_openspm.configuration_openspm import OpenSPMConfig
 from lerobot_openspm.envs.seeds import TUNING_SEED_START
 
-# What a grasp and what a push need. Nobody is tuned on these seeds.
+# Something carried, and something turned. Nobody is tuned on these seeds.
 TASKS = ("bowl_on_plate", "turn_on_stove")
 EPISODES, SEED = 4, TUNING_SEED_START + 801_000
 
