@@ -79,6 +79,30 @@ def test_a_handle_that_went_back_when_it_slipped_out_is_looked_for_nearer_to_whe
         assert_allclose(one.executor.plan[2].T_world_ee, nearer.follow(shown[2]), atol=1e-9)
 
 
+@pytest.mark.parametrize("share", [0.93, 0.97, 1.1])
+def test_a_handle_that_slipped_out_near_the_end_and_went_back_is_not_looked_for_further_out(share):
+    axis = KINDS["slide"]
+    eyes, one = Eyes(CABINET), row(handle(axis), instruction=OPEN)
+    one.observe(HAND, eyes)
+    shown = [target.T_world_ee for target in one.executor.plan]
+    one.executor.begin(one.executor.plan, Hand(shown[2], 0.03), 3)
+    direction = one.executor.plan[3].axis.direction
+
+    def pulled(metres):
+        return Axis("slide", direction, metres).follow(shown[2])
+
+    watch(one, eyes, Hand(pulled(share * axis.amount), 0.03), 1)
+    watch(one, eyes, Hand(pulled(share * axis.amount), 0.0), 1)
+    slipped = np.linalg.norm(one.executor.plan[2].T_world_ee[:3, 3] - shown[2][:3, 3])
+    assert slipped < axis.amount
+    there = one.executor.plan[2].T_world_ee
+    one.executor.begin(one.executor.plan, Hand(there, 0.0), 3)
+    drifted = there.copy()
+    drifted[:3, 3] += 0.003 * (there[:3, 3] - shown[2][:3, 3]) / slipped  # the hand never stands quite still
+    watch(one, eyes, Hand(drifted, 0.0), 1)
+    assert_allclose(one.executor.plan[2].T_world_ee, pulled(0.5 * slipped), atol=1e-9)
+
+
 def test_a_handle_that_does_not_move_on_in_the_fingers_is_taken_again_where_it_is():
     axis = KINDS["slide"]
     eyes, one = Eyes(CABINET), row(handle(axis), instruction=OPEN)

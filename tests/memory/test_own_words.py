@@ -3,12 +3,15 @@
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from tests.memory.builders import entry
 
 from lerobot_openspm.errors import InstructionError
 from lerobot_openspm.memory.entry import OWN_WORDS
 from lerobot_openspm.memory.instruction import read_task, read_tasks
+from lerobot_openspm.memory.meaning import semantic_score
 from lerobot_openspm.memory.names import TABLE_NAMES
 from lerobot_openspm.memory.own_words import normal_words, unread, words_similarity
+from lerobot_openspm.memory.retrieval import MIN_SEMANTIC, read_instruction
 
 
 @pytest.mark.parametrize(
@@ -129,3 +132,63 @@ def test_just_the_same_words_come_before_the_same_with_other_endings():
     one, several = normal_words("shake the bottle"), normal_words("shake the bottles")
     assert words_similarity(one, one, TABLE_NAMES) == 1.0
     assert 0.9 < words_similarity(one, several, TABLE_NAMES) < 1.0
+
+
+@pytest.mark.parametrize(
+    ("one", "other"),
+    [
+        ("push the lever up", "push the lever down"),
+        ("push the block to the left", "push the block to the right"),
+        ("push the block to the left", "push the left block"),
+        ("push the block left", "push the block right"),
+        ("push the block forward", "push the block backwards"),
+        ("push the plate away from the stove", "push the plate to the stove"),
+        ("push the box towards you", "push the box away from you"),
+        ("open the door to the left", "open the door to the right"),
+        ("open the door a little", "open the door"),
+        ("open the drawer halfway", "open the drawer"),
+        ("turn on the stove to low", "turn on the stove to high"),
+        ("push the button twice", "push the button"),
+        ("put the first mug on the plate", "put the second mug on the plate"),
+        ("put the mug on the first shelf", "put the mug on the second shelf"),
+        ("pick up mug a", "pick up mug b"),
+        ("put plate a behind the mug", "put plate b behind the mug"),
+        ("press the a button", "press the b button"),
+        ("push the mug over", "push the mug"),
+        ("take the mug away", "take the mug"),
+        ("take the lid off", "take the lid"),
+        ("push the blocks together", "push the blocks apart"),
+        ("put the mug upside down on the plate", "put the mug on the plate"),
+        ("pick up the cup with two fingers", "pick up the cup with the left hand"),
+        ("open the drawer and push the lever up", "open the drawer and push the lever down"),
+        ("put the cup in the box and push the lever up", "put the cup in the box and push the lever down"),
+    ],
+)
+def test_words_that_tell_two_tasks_apart_are_kept(one: str, other: str):
+    for asked, known in ((one, other), (other, one)):
+        read = read_instruction(asked, [entry(known)])
+        assert semantic_score(read, read_task(known)) < MIN_SEMANTIC
+
+
+@pytest.mark.parametrize(
+    ("said", "known"),
+    [
+        ("lift the box up", "lift the box"),
+        ("put the bowl back on the plate", "put the bowl on the plate"),
+        ("put the bowl down on the plate", "put the bowl on the plate"),
+        ("push the plate over to the stove", "push the plate to the stove"),
+        ("turn the stove off", "turn off the stove"),
+        ("first put the bowl on the plate", "put the bowl on the plate"),
+        ("put the bowl on the plate first", "put the bowl on the plate"),
+        ("pick up the mug to the left", "pick up the left mug"),
+        ("the drawer needs to be opened", "open the drawer"),
+    ],
+)
+def test_words_that_add_nothing_are_read_over(said: str, known: str):
+    assert read_task(said) == read_task(known)
+    assert not read_task(said)[0].words
+
+
+def test_nouns_of_one_thing_that_end_as_plurals_are_one_thing():
+    (task,) = read_task("put the scissors in the box")
+    assert task.target == "scissors"

@@ -328,10 +328,13 @@ class Row:
         """Where to go back to: the approach to what is grasped or, with it in the hand, to its place."""
         target = self.executor.plan[self.executor.index]
         if target.axis is not None and self.executor.feels_handle(self.executor.index):
+            whole = _whole_way(self.ranked[0].entry, target.memory.sub_task)
             gone, further = self._gone.get(target.memory.sub_task, 0.0), max(self.executor.travelled, 0.0)
             # Fingers that close on nothing where a handle slipped out: it went back when they let go.
-            is_empty = self.executor.has_lost_grip(hand) and further < LEAST_TRAVEL * target.axis.amount
-            self._gone[target.memory.sub_task] = 0.5 * gone if is_empty else gone + further
+            is_empty = self.executor.has_lost_grip(hand) and further < LEAST_TRAVEL * whole
+            # At the end of its way too little would be left to feel whether it is held.
+            furthest = (1 - LEAST_TRAVEL) * whole
+            self._gone[target.memory.sub_task] = 0.5 * gone if is_empty else min(gone + further, furthest)
         is_carrying = bool(self.tracker.held) and target.memory.phase == "place"
         if is_carrying and not self.executor.has_lost_grip(hand):
             return self.executor.entry_index()
@@ -554,6 +557,12 @@ def _until(entry: MemoryEntry, sub_task: int) -> MemoryEntry:
     """An entry without the sub-tasks after one."""
     key = replace(entry.key, sub_tasks=entry.key.sub_tasks[: sub_task + 1])
     return replace(entry, key=key, key_poses=tuple(p for p in entry.key_poses if p.sub_task <= sub_task))
+
+
+def _whole_way(entry: MemoryEntry, sub_task: int) -> float:
+    """How far a drawer or a knob goes in a sub-task as it was shown, metres or radians."""
+    axes = (pose.axis for pose in entry.key_poses if pose.sub_task == sub_task)
+    return max(axis.amount for axis in axes if axis is not None)
 
 
 def _is_moved(T: Array, other: Array) -> bool:

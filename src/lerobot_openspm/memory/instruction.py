@@ -20,16 +20,10 @@ from lerobot_openspm.memory.loose_words import THINGS
 from lerobot_openspm.memory.names import canonical_name
 from lerobot_openspm.memory.nouns import Noun
 from lerobot_openspm.memory.own_words import normal_words, unread
-from lerobot_openspm.memory.sense import makes_sense
+from lerobot_openspm.memory.sense import makes_sense, says_all
 from lerobot_openspm.memory.sentences import MAX_CHARACTERS, Clause, read_clauses
 
 PICK = "pick"
-# Verbs that say all of what is to be done where nothing says where to. Others that mean putting or pushing
-# would be one with them: "move the box", "store the box", "pull the lever".
-_SAY_ALL = (
-    "pick up", "pick", "grab", "grasp", "grab hold of", "take hold of", "get hold of", "take", "lift",
-    "lift up", "get", "fetch", "push", "press",
-)  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -61,7 +55,7 @@ def read_task(instruction: str, names: Collection[str] = frozenset()) -> tuple[S
         found = parse_instruction(instruction, names)
     except InstructionError:
         return (unread(instruction),)
-    return found if _says_all(found, instruction) else (unread(instruction),)
+    return found if says_all(found, instruction) else (unread(instruction),)
 
 
 def read_tasks(
@@ -75,15 +69,6 @@ def read_tasks(
     told = [one for one in dict.fromkeys(instructions) if normal_words(one)]
     named = {name for one in told for sub_task in read_task(one) for name in sub_task.objects}
     return {one: read_task(one, {*names, *named}) for one in told}
-
-
-def _says_all(found: Sequence[SubTask], instruction: str) -> bool:
-    """Whether sub-tasks say as much as their words: a single thing to move needs a place to go to."""
-    if len(found) > 1 or found[0].landmark or found[0].operation not in ("put", "push"):
-        return True
-    words = tuple(normal_words(instruction).split())
-    verb = v.match_verb(words, 0)
-    return verb is not None and " ".join(words[: verb.length]) in _SAY_ALL
 
 
 def parse_instruction(instruction: str, names: Collection[str] | None = None) -> tuple[SubTask, ...]:

@@ -42,10 +42,14 @@ _GOALS = {"on": "on", "in": "in", "under": "under", "over": "on", "at": "at", "b
 _ARTICLES = v.word_set("the an some my your our its this that these those 's , ;")
 _JOINTS = v.word_set("and then")
 # Words that name no thing, where a noun is expected.
-_NO_THINGS = v.word_set(
-    "it them itself everything something half halves quarter circle line row order place way left right "
-    "front back top bottom middle center centre side up down clockwise counterclockwise anticlockwise degree "
-    "time once twice again there here slowly position direction shape ready"
+_NO_THINGS = (
+    v.word_set(
+        "it them itself everything something half halves quarter circle line row order place way left right "
+        "front back top bottom middle center centre side degree "
+        "time once twice again there here slowly position direction shape ready halfway partway little bit "
+        "slightly hand gripper arm finger"
+    )
+    | v.WAYS
 )
 
 
@@ -71,9 +75,11 @@ def normal_words(instruction: str) -> str:
 
 
 def _is_article(words: Sequence[str], i: int) -> bool:
-    """Whether a word adds nothing; "a" does where it is a label: "put block a on block b"."""
+    """Whether a word adds nothing; "a" does where it is a label: "put block a on block b", "the a button"."""
     if words[i] != "a":
         return words[i] in _ARTICLES
+    if i > 0 and words[i - 1] in v.DETERMINERS:
+        return False
     return i + 1 < len(words) and not _role_at(tuple(words), i + 1)[0] and words[i + 1] not in _JOINTS
 
 
@@ -89,7 +95,8 @@ def unread(instruction: str) -> SubTask:
     words = normal_words(instruction)
     if not words:
         raise InstructionError("says nothing, expected one like 'put the bowl on the plate'")
-    phrases = [phrase for clause in _clauses(words) for phrase in clause.phrases if _is_thing(phrase[1])]
+    said = [(role, _thing(noun)) for clause in _clauses(words) for role, noun in clause.phrases]
+    phrases = [phrase for phrase in said if phrase[1]]
     tools = [phrase for phrase in phrases if phrase[0] == _WITH]
     moved = tools or [phrase for phrase in phrases if not phrase[0]] or phrases
     target = moved[0][1] if moved else f"{words[:MAX_NAME].strip()} object"
@@ -99,10 +106,15 @@ def unread(instruction: str) -> SubTask:
     return SubTask(OWN_WORDS, target, "", _GOALS[role] if goals else "", landmark, words=words)
 
 
-def _is_thing(noun: str) -> bool:
-    """Whether a noun names something that is not the table, which no hand takes hold of."""
+def _thing(noun: str) -> str:
+    """The thing that a noun names, without words behind it that name none: "drawer halfway" is the drawer.
+
+    "" where there is none, or just the table, which no hand takes hold of.
+    """
     words = noun.split()
-    return bool(words) and words[-1] not in _NO_THINGS | v.SURFACES | v.PARTICLES and not noun.isdigit()
+    while words and ({words[-1], f"{words[-1]}s"} & (_NO_THINGS | v.PARTICLES) or words[-1] in v.NUMBERS):
+        words.pop()
+    return "" if not words or words[-1] in v.SURFACES else " ".join(words)
 
 
 def words_similarity(asked: str, known: str, names: NameSimilarity) -> float:

@@ -111,6 +111,11 @@ SOURCES = {"from": "", "off of": "on", "off": "on", "out of": "in", "out from": 
 PARTICLES = word_set(
     "forwards across forward over down up back away right just directly straight out along immediately safely"
 )
+# Which way something goes, where nothing says where to.
+WAYS = word_set(
+    "up down forwards backward backwards inward inwards outward outwards upward upwards downward downwards "
+    "sideways around across along apart through together upside clockwise counterclockwise anticlockwise"
+)
 
 # Places in the scene, among several things of one name, and in a thing's part.
 PLACES = {
@@ -359,8 +364,17 @@ def kind(name: str) -> str:
     return replace_ending(replace_ending(name, SYNONYMS), SYNONYMS)
 
 
+# Nouns of one thing that end as plurals do.
+_ENDS_IN_S = word_set(
+    "scissors pliers tongs tweezers goggles sunglasses headphones earphones pants trousers shorts jeans "
+    "pyjamas pajamas tights leggings lens gas bus canvas series sideways"
+)
+
+
 def singular(word: str) -> str:
     """The singular of a noun; the noun itself where it is one already."""
+    if word in _ENDS_IN_S:
+        return word
     if word in ("cookies", "movies"):
         return word[:-1]
     if word.endswith("ies"):
