@@ -157,6 +157,7 @@ def test_just_the_same_words_come_before_the_same_with_other_endings():
         ("push the mug over", "push the mug"),
         ("take the mug away", "take the mug"),
         ("take the lid off", "take the lid"),
+        ("take the soup out", "take the soup"),
         ("push the blocks together", "push the blocks apart"),
         ("put the mug upside down on the plate", "put the mug on the plate"),
         ("pick up the cup with two fingers", "pick up the cup with the left hand"),

@@ -327,13 +327,13 @@ class Row:
     def _retry_index(self, hand: Hand) -> int:
         """Where to go back to: the approach to what is grasped or, with it in the hand, to its place."""
         target = self.executor.plan[self.executor.index]
-        if target.axis is not None and self.executor.feels_handle(self.executor.index):
-            whole = _whole_way(self.ranked[0].entry, target.memory.sub_task)
+        shown = target.memory.axis  # the whole way, of which the target's own axis is what is left
+        if shown is not None and self.executor.feels_handle(self.executor.index):
             gone, further = self._gone.get(target.memory.sub_task, 0.0), max(self.executor.travelled, 0.0)
             # Fingers that close on nothing where a handle slipped out: it went back when they let go.
-            is_empty = self.executor.has_lost_grip(hand) and further < LEAST_TRAVEL * whole
+            is_empty = self.executor.has_lost_grip(hand) and further < LEAST_TRAVEL * shown.amount
             # At the end of its way too little would be left to feel whether it is held.
-            furthest = (1 - LEAST_TRAVEL) * whole
+            furthest = (1 - LEAST_TRAVEL) * shown.amount
             self._gone[target.memory.sub_task] = 0.5 * gone if is_empty else min(gone + further, furthest)
         is_carrying = bool(self.tracker.held) and target.memory.phase == "place"
         if is_carrying and not self.executor.has_lost_grip(hand):
@@ -557,12 +557,6 @@ def _until(entry: MemoryEntry, sub_task: int) -> MemoryEntry:
     """An entry without the sub-tasks after one."""
     key = replace(entry.key, sub_tasks=entry.key.sub_tasks[: sub_task + 1])
     return replace(entry, key=key, key_poses=tuple(p for p in entry.key_poses if p.sub_task <= sub_task))
-
-
-def _whole_way(entry: MemoryEntry, sub_task: int) -> float:
-    """How far a drawer or a knob goes in a sub-task as it was shown, metres or radians."""
-    axes = (pose.axis for pose in entry.key_poses if pose.sub_task == sub_task)
-    return max(axis.amount for axis in axes if axis is not None)
 
 
 def _is_moved(T: Array, other: Array) -> bool:

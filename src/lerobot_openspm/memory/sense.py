@@ -162,8 +162,7 @@ def _has(found: Preposition, words: Words, i: int, moves: set[str], goes: bool) 
 def _tells(words: Words, i: int, moves: set[str]) -> bool:
     """Whether a word tells which, how far or which way; "left" does not before a noun, "first" not alone."""
     word, before, after = words[i], words[i - 1] if i else "", words[i + 1] if i + 1 < len(words) else ""
-    verb, split = v.match_verb(words, 0), v.match_verb((words[0], word), 0)
-    if verb and split and split.length == 2 and split.operation == verb.operation:
+    if f"{words[0]} {word}" in _SAY_ALL:
         return False  # "lift the box up"
     has_noun = bool(after) and match_preposition(words, i + 1) is None
     if word in _SIDES:

@@ -367,7 +367,7 @@ def kind(name: str) -> str:
 # Nouns of one thing that end as plurals do.
 _ENDS_IN_S = word_set(
     "scissors pliers tongs tweezers goggles sunglasses headphones earphones pants trousers shorts jeans "
-    "pyjamas pajamas tights leggings lens gas bus canvas series sideways"
+    "pyjamas pajamas tights leggings lens gas bus canvas series"
 )
 
 
