@@ -19,11 +19,11 @@ from tests.memory.old_format import save_version_4
 from lerobot_openspm import files
 from lerobot_openspm.errors import MemoryFormatError, OpenSPMError
 from lerobot_openspm.experience import load_experience, save_experience
-from lerobot_openspm.experience_files import LOCK, changing
+from lerobot_openspm.experience_files import CAMERAS, CAMERAS_JSON, LOCK, changing
 
 OLD = experience()
-CAMERAS = {key: replace(camera, fx=77.5) for key, camera in OLD.cameras.items()}
-NEWER = replace(OLD, entries=(entry(quality=0.1, source="new#1"),), cameras=CAMERAS)
+NEWER_CAMERAS = {key: replace(camera, fx=77.5) for key, camera in OLD.cameras.items()}
+NEWER = replace(OLD, entries=(entry(quality=0.1, source="new#1"),), cameras=NEWER_CAMERAS)
 SOURCES = [e.source for e in OLD.entries]
 # What a save asks the system for.
 CALLS = {"os": ("replace", "fsync", "open"), "pathlib.Path": ("open", "unlink", "mkdir")}
@@ -204,6 +204,60 @@ def test_a_memory_can_be_read_while_another_process_saves(tmp_path):
         assert same(loaded, numbered(loaded.entries[-1].version - 1))
     os.kill(pid, signal.SIGKILL)
     os.waitpid(pid, 0)
+
+
+def test_a_save_that_renames_its_cameras_between_two_reads_is_read_whole(tmp_path):
+    replacing, reading = os.replace, Path.read_bytes
+
+    def all_but_the_cameras(source, target):
+        if Path(target).name == CAMERAS_JSON:
+            no_space_left()
+        replacing(source, target)
+
+    def load_while_renaming(folder, after):
+        """Load, and finish the save after so many reads; returns how many there were."""
+        n_reads = 0
+
+        def read(path):
+            nonlocal n_reads
+            try:
+                return reading(path)
+            finally:
+                n_reads += 1
+                if n_reads == after:
+                    (pending,) = folder.glob(CAMERAS.format("*"))
+                    replacing(pending, folder / CAMERAS_JSON)
+
+        with pytest.MonkeyPatch.context() as patched:
+            patched.setattr(Path, "read_bytes", read)
+            assert same(load_experience(folder), NEWER)
+        return n_reads
+
+    for after in count(1):
+        folder = tmp_path / str(after)
+        save_experience(OLD, folder)
+        with pytest.MonkeyPatch.context() as patched:
+            patched.setattr(os, "replace", all_but_the_cameras)
+            with pytest.raises(OSError, match="no space"):
+                save_experience(NEWER, folder)
+        if load_while_renaming(folder, after) <= after:
+            break
+    assert after > 2  # there were reads to rename between
+
+
+def test_a_memory_whose_arrays_are_removed_while_it_is_read_is_read_anew(tmp_path, monkeypatch):
+    save_experience(OLD, tmp_path)
+    stat = Path.stat
+
+    def save_a_newer_one(path, **options):
+        found = stat(path, **options)
+        if path.name.endswith(".safetensors"):
+            monkeypatch.undo()
+            save_experience(NEWER, tmp_path)
+        return found
+
+    monkeypatch.setattr(Path, "stat", save_a_newer_one)
+    assert same(load_experience(tmp_path), NEWER)
 
 
 def test_who_waits_too_long_for_another_process_is_told(tmp_path, monkeypatch):

@@ -200,9 +200,10 @@ def read_cameras(directory: Path, header: Mapping[str, Any]) -> dict[str, Camera
     if header["version"] < 5:
         return load_cameras(path)
     sha256 = file_field(header, "cameras", directory).get("sha256")
-    # An interrupted save left it here, after the header was renamed into place.
+    # A save that has just renamed the header has yet to rename this one, or was interrupted before it did.
+    # It is looked for under both names in the order of that renaming: so it is not missed in between.
     pending = directory / CAMERAS.format(str(sha256)[:16])
-    for file in (path, pending):
+    for file in (pending, path):
         if (blob := _read_if_there(file)) is not None and _sha256(blob) == sha256:
             return cameras_from_dict(loads(blob, str(file)), str(file))
     cameras = load_cameras(path)
@@ -249,17 +250,17 @@ def _named(
 
 def read_bytes(path: Path, limit: int) -> bytes:
     """Read a file of a memory, of a bounded size. Raises MemoryFormatError."""
-    if not path.is_file():
+    try:
+        size = path.stat().st_size
+        if size > limit:
+            raise MemoryFormatError(f"{path}: {size} bytes, more than the {limit} this release reads")
+        return path.read_bytes()
+    except (FileNotFoundError, NotADirectoryError, IsADirectoryError) as error:
         raise MemoryFormatError(
             f"no memory at {path}: a checkpoint of this policy holds {MEMORY_JSON} and the files that it "
             "names; train with lerobot-train --policy.type=openspm, or pull the whole checkpoint. In a "
             "training's folder it is checkpoints/last/pretrained_model"
-        )
-    if path.stat().st_size > limit:
-        raise MemoryFormatError(
-            f"{path}: {path.stat().st_size} bytes, more than the {limit} this release reads"
-        )
-    return path.read_bytes()
+        ) from error
 
 
 def _contiguous(arrays: Mapping[str, NDArray[Any]]) -> Arrays:
