@@ -90,7 +90,8 @@ def answer(done: subprocess.CompletedProcess[str]) -> Any:
     return json.loads(done.stdout.splitlines()[-1])
 
 
-def test_what_is_pulled_acts_as_what_was_pushed(
+@pytest.mark.slow
+def test_what_is_pulled_acts_as_what_was_pushed_and_a_deleted_memory_is_told(
     run: Run, loopback_hub: LoopbackHub, checkpoint: Path, tiny_dataset: Path
 ):
     actions = answer(run(ACT + PUSH, checkpoint, tiny_dataset, REPO, home="home_a"))
@@ -102,16 +103,6 @@ def test_what_is_pulled_acts_as_what_was_pushed(
     for name in names(checkpoint):
         assert files[name] == (checkpoint / name).read_bytes(), name
 
-    pulled = run(ACT + PULL, tiny_dataset, REPO, home="home_b")
-    assert answer(pulled) == [actions, 6]
-
-
-@pytest.mark.slow
-def test_what_was_pulled_needs_no_connection_and_a_deleted_memory_is_told(
-    run: Run, loopback_hub: LoopbackHub, checkpoint: Path, tiny_dataset: Path
-):
-    actions = answer(run(ACT + PUSH, checkpoint, tiny_dataset, REPO, home="home_a"))
-    files = loopback_hub.files(REPO)
     assert answer(run(ACT + PULL, tiny_dataset, REPO, home="home_b")) == [actions, 6]
     # Everything is in the cache now, and nothing is asked for without a connection.
     requests = len(loopback_hub.requests)
