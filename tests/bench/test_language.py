@@ -72,6 +72,7 @@ def measured() -> dict[str, Any]:
     return language.measure(language.Options(failures=True))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("split", SPLITS)
 def test_the_rates_asked_for_are_reached(split: str, measured: dict[str, Any]):
     rates, failures = measured["splits"][split], measured["failures"]
@@ -84,6 +85,7 @@ def test_the_rates_asked_for_are_reached(split: str, measured: dict[str, Any]):
     assert rates["retrieved_first"] >= asked, failures[f"{split}_retrieved_first"]
 
 
+@pytest.mark.slow
 def test_any_wording_is_learned_and_the_entry_that_is_meant_acts(measured: dict[str, Any]):
     failures = measured["failures"]
     assert (measured["any_wording_learned"], measured["n_wordings"]) == (1.0, 100), failures[

@@ -52,6 +52,7 @@ def turning_dataset(make_once: Callable[..., Path]) -> Path:
     return make_once("turning_dataset", lambda root: collect(config(root=str(root))))
 
 
+@pytest.mark.slow
 def test_the_hand_camera_is_found_and_other_cameras_are_kept(
     calibrate: Callable[..., tuple], turning_dataset: Path, tmp_path: Path
 ):

@@ -49,7 +49,8 @@ def test_a_folder_of_somebody_else_is_left_alone(openspm: Openspm, checkpoint: P
     assert (tmp_path / "mine" / "precious.txt").read_text() == "do not remove"
 
 
-@pytest.mark.parametrize("workers", [1, pytest.param(2, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("workers", [1, 2])
 def test_tracking_is_measured_and_goes_on_where_it_was(
     openspm: Openspm, checkpoint: Path, tmp_path: Path, workers: int
 ):
@@ -73,6 +74,7 @@ def test_tracking_is_measured_and_goes_on_where_it_was(
     assert json.loads(openspm(*arguments)[1].splitlines()[-1]) == result
 
 
+@pytest.mark.slow
 def test_perception_is_measured(openspm: Openspm, checkpoint: Path, tiny_dataset: Path, tmp_path: Path):
     arguments = (
         "bench", "perception", f"--policy.path={checkpoint}", f"--dataset.root={tiny_dataset}",

@@ -31,6 +31,7 @@ def test_too_few_demonstrations_are_refused(openspm: Openspm, tiny_dataset: Path
     assert not (tmp_path / "out").exists()
 
 
+@pytest.mark.slow
 def test_teaching_is_measured_and_goes_on_where_it_was(openspm: Openspm, tiny_dataset: Path, tmp_path: Path):
     output = tmp_path / "out"
     arguments = (

@@ -243,9 +243,8 @@ def test_wrong_options_are_one_line_and_change_nothing(
     assert contents(into) == before
 
 
-@pytest.mark.parametrize(
-    "moment", ["Finding objects", pytest.param("Reading images", marks=pytest.mark.slow)]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("moment", ["Finding objects", "Reading images"])
 def test_a_kill_leaves_the_checkpoint_as_it_was(
     openspm: Openspm, into: Path, other_dataset: Path, moment: str
 ):

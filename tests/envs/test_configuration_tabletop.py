@@ -38,7 +38,13 @@ def test_unknown_tasks_are_refused_with_the_valid_ones(task):
 
 
 # Each of its processes imports LeRobot first, so the tests below share them.
-@pytest.fixture(scope="module", params=[False, True], ids=["in this process", "in processes of their own"])
+@pytest.fixture(
+    scope="module",
+    params=[
+        pytest.param(False, id="in this process"),
+        pytest.param(True, id="in processes of their own", marks=pytest.mark.slow),
+    ],
+)
 def vector_env(request: pytest.FixtureRequest) -> Iterator[gym.vector.VectorEnv]:
     """Two rows of a short episode, with everything that can be observed."""
     env = RICH.create_envs(2, use_async_envs=request.param)["openspm_tabletop"][9]

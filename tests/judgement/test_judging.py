@@ -286,6 +286,7 @@ def test_a_dataset_without_annotations_is_an_error_with_the_command(mined: Mined
         mined.judged(phase_judge="annotations")
 
 
+@pytest.mark.slow
 def test_a_checkpoint_holds_what_was_judged_and_not_where_it_was_asked(mined: Mined, tmp_path: Path):
     """From the options to the memory on disk, through everything in between."""
     chosen = {"memory_episodes": [0], "pretrained_path": None}

@@ -12,6 +12,8 @@ from zipfile import ZipFile
 
 import pytest
 
+pytestmark = pytest.mark.slow  # what builds and installs it is slow, and seldom changes
+
 ROOT = Path(__file__).parents[2]
 NAME = "lerobot_policy_openspm"
 

@@ -105,6 +105,7 @@ def home(visit: Visit, tmp_path: Path) -> Path:
     return Path(shutil.copytree(visit.home, tmp_path / "home", symlinks=True))
 
 
+@pytest.mark.slow
 def test_weights_come_from_the_hub_or_say_why_not(visit: Visit):
     told = visit.told
     assert told["tester/sam3"][0] == told["tester/half"][0] == "loaded"
@@ -118,6 +119,7 @@ def test_weights_come_from_the_hub_or_say_why_not(visit: Visit):
     assert not [request for request in visit.requests if request.endswith("pytorch_model.bin")]
 
 
+@pytest.mark.slow
 def test_offline_what_is_in_the_cache_is_loaded(loopback_hub: LoopbackHub, home: Path):
     (half,) = home.glob("hub/models--tester--half/snapshots/*/model.safetensors")
     half.unlink()
@@ -130,6 +132,7 @@ def test_offline_what_is_in_the_cache_is_loaded(loopback_hub: LoopbackHub, home:
         assert "OfflineModeIsEnabled" in causes
 
 
+@pytest.mark.slow
 def test_no_network_ends_within_seconds(loopback_hub: LoopbackHub, home: Path):
     with socket.socket() as closed:
         closed.bind(("127.0.0.1", 0))
