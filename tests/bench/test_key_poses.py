@@ -5,7 +5,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from lerobot_openspm.bench.key_poses import GOALS, Options, Verdict, compare, goal_things, match, summary
+from lerobot_openspm.bench import key_poses
+from lerobot_openspm.bench.key_poses import (
+    GOALS,
+    Options,
+    SimulatorOption,
+    Verdict,
+    compare,
+    goal_things,
+    match,
+    summary,
+)
 from lerobot_openspm.bench.recording import Job, Recording, record
 from lerobot_openspm.envs.tasks import TASK_NAMES
 
@@ -75,6 +85,13 @@ def test_recordings_survive_being_written_and_hold_the_truth(tmp_path: Path):
 def test_mistakes_are_told(options, message):
     with pytest.raises(ValueError, match=message):
         Options(**options)
+
+
+def test_without_libero_the_tabletop_is_measured_alone(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(key_poses, "find_spec", lambda name: None)
+    assert Options().simulators == ("openspm_tabletop",)
+    with pytest.raises(ValueError, match=r"env.type=libero needs LIBERO.*pip install 'lerobot\[libero\]'"):
+        Options(env=SimulatorOption(type="libero"))
 
 
 @pytest.mark.libero

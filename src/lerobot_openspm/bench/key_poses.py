@@ -12,6 +12,7 @@ from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import dataclass, field
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -50,7 +51,7 @@ GOALS: Mapping[tuple[str, ...], tuple[str, ...]] = {
 class SimulatorOption:
     """Where to measure."""
 
-    type: str = "all"  # openspm_tabletop, libero (its suite libero_goal), or all
+    type: str = "all"  # openspm_tabletop, libero (its suite libero_goal), or all that are installed
     task: str = "all"  # a task name, a comma list of them, or "all"
 
 
@@ -68,6 +69,8 @@ class Options(ResultOption):
     def __post_init__(self) -> None:
         if self.env.type not in (*SIMULATORS, "all"):
             raise ValueError(f"env.type is {self.env.type!r}, expected one of {', '.join(SIMULATORS)}, all")
+        if "libero" in self.simulators and find_spec("libero") is None:
+            raise ValueError("env.type=libero needs LIBERO; install it with: pip install 'lerobot[libero]'")
         if self.operator not in OPERATORS:
             raise ValueError(f"operator is {self.operator!r}, expected one of {', '.join(OPERATORS)}")
         if self.episodes < 1 or self.workers < 1:
@@ -79,8 +82,10 @@ class Options(ResultOption):
 
     @property
     def simulators(self) -> tuple[str, ...]:
-        """The simulators that are asked for."""
-        return SIMULATORS if self.env.type == "all" else (self.env.type,)
+        """The simulators that are asked for; of all, LIBERO only where it is installed."""
+        if self.env.type != "all":
+            return (self.env.type,)
+        return SIMULATORS if find_spec("libero") else ("openspm_tabletop",)
 
     def jobs(self, simulator: str) -> list[Job]:
         """The demonstrations of one simulator."""
