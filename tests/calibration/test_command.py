@@ -52,6 +52,10 @@ def turning_dataset(make_once: Callable[..., Path]) -> Path:
     return make_once("turning_dataset", lambda root: collect(config(root=str(root))))
 
 
+def test_a_dataset_that_is_not_there_is_one_line(calibrate: Callable[..., tuple], tmp_path: Path):
+    assert "no dataset in" in reason(calibrate(f"--root={tmp_path / 'nowhere'}"))
+
+
 @pytest.mark.slow
 def test_the_hand_camera_is_found_and_other_cameras_are_kept(
     calibrate: Callable[..., tuple], turning_dataset: Path, tmp_path: Path

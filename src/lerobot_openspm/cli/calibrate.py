@@ -22,7 +22,7 @@ from lerobot_openspm.errors import CalibrationError
 from lerobot_openspm.files import write_json
 from lerobot_openspm.geometry import se3
 from lerobot_openspm.geometry.camera import Camera, cameras_to_dict, load_cameras
-from lerobot_openspm.mining.dataset import Demonstrations
+from lerobot_openspm.mining.dataset import Demonstrations, dataset_metadata
 from lerobot_openspm.mining.signals import Episode
 from lerobot_openspm.training import open_demonstrations
 
@@ -73,12 +73,10 @@ class CalibrateConfig:
 
 def main(args: list[str]) -> None:
     """Estimate, save, and print one JSON object."""
-    from lerobot.datasets import LeRobotDatasetMetadata
-
     config = draccus.parse(CalibrateConfig, args=args)
     known = load_cameras(Path(config.output)) if Path(config.output).exists() else {}
     truth = _truth(config)
-    meta = LeRobotDatasetMetadata(config.repo_id, root=config.root)
+    meta = dataset_metadata(config.repo_id, config.root)
     demonstrations = open_demonstrations(meta, config.policy)
     episodes = demonstrations.episodes(config.episodes)
     chosen = episodes if config.episodes is not None else choose_episodes(episodes, EPISODES)
