@@ -44,8 +44,8 @@ def _language(result: Quoted) -> str:
     note = (
         "Any wording: everyday instructions, written with the grammar in sight, more than half of which it "
         "cannot read, each taught from one drawn demonstration and found by its own words and by a light "
-        "rewording, but not by another's. Acting: over these, the known instructions and the paraphrases, of which "
-        f"{result['n_refused']} were refused. "
+        "rewording, but not by another's. Acting: over these, the known instructions and the paraphrases, "
+        f"of which {result['n_refused']} were refused. "
         "Reading: entries are those of the tabletop's ten tasks and of the forty of libero_spatial, "
         "libero_object, libero_goal and libero_10; paraphrases of other tasks have none among them."
     )
