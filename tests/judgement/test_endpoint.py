@@ -128,10 +128,10 @@ def test_what_is_no_answer_is_one_error(reply: Reply, words: str, requests: int)
 @pytest.mark.parametrize(
     "reply",
     [
-        Reply(say(["lift"] * N), wait_s=30),
-        Reply(say(["lift"] * N), drip_s=0.2),
-        Reply(say(["lift"] * N), drip_s=0.2, has_length=False),
-        Reply(say(["lift"] * N), head_drip_s=0.2),
+        Reply(say(["lift"] * N), wait_s=3),
+        Reply(say(["lift"] * N), drip_s=0.05),
+        Reply(say(["lift"] * N), drip_s=0.05, has_length=False),
+        Reply(say(["lift"] * N), head_drip_s=0.05),
     ],
 )
 def test_a_slow_server_is_waited_for_once_and_no_longer_than_asked(reply: Reply):
@@ -139,9 +139,8 @@ def test_a_slow_server_is_waited_for_once_and_no_longer_than_asked(reply: Reply)
     begin = time.monotonic()
     with chat.running(), pytest.raises(JudgementError, match=r"took longer than 0.5 s"):
         judge(chat.api_base, 0.5).judge(pick_and_place())
-    # On a busy machine half a second may be over before the server has read the request.
-    assert time.monotonic() - begin < 10
-    assert len(chat.requests) <= 1
+    assert time.monotonic() - begin < 2.5
+    assert len(chat.requests) == 1
 
 
 def test_a_redirect_is_not_followed(monkeypatch: pytest.MonkeyPatch):
