@@ -156,7 +156,7 @@ FIGURES: dict[str, Figure] = {
     "language": _bench("language", "language", LANGUAGE),
     "memory": _bench(
         "memory", "memory",
-        (f"{PACKAGE}/memory", f"{PACKAGE}/geometry", f":(glob){PACKAGE}/experience*.py",
+        (f"{PACKAGE}/memory", f"{PACKAGE}/geometry", f":(glob){PACKAGE}/memory*.py",
          f":(glob){PACKAGE}/bench/synthetic_*.py", f"{PACKAGE}/bench/memory.py"),
     ),
     "measurement_noise": Figure(f"python -m {NOISE}", (*TABLETOP, *ALONG, *NOISE_PATHS), "openspm_tabletop"),

@@ -4,7 +4,8 @@
 
 Errors are those of the estimates that the policy gets along episodes from tuning seeds, the hand in the way
 and all. Weights are fitted on all seeds but the last and judged on that, beside those in use. Fitted ones go
-by hand into `perception/measurement.py`. Takes the options of `openspm bench`; episodes are counted per task.
+by hand into `perception/tracking/measurement.py`. Takes the options of `openspm bench`; episodes are
+counted per task.
 """
 
 from __future__ import annotations
@@ -28,13 +29,13 @@ from lerobot_openspm.bench.object_frames import offset
 from lerobot_openspm.bench.perception import tasks, world
 from lerobot_openspm.bench.truth import Truth, true_period
 from lerobot_openspm.cli.bench import DEFAULTS, BenchConfig
-from lerobot_openspm.control.row import Row
+from lerobot_openspm.control.controller import EpisodeController
 from lerobot_openspm.envs.gl_backend import set_default_gl_backend
 from lerobot_openspm.envs.seeds import TUNING_SEED_START
 from lerobot_openspm.geometry import se3
 from lerobot_openspm.modeling_openspm import OpenSPMPolicy
-from lerobot_openspm.observation import Observation
-from lerobot_openspm.perception.measurement import (
+from lerobot_openspm.perception.observation import Observation
+from lerobot_openspm.perception.tracking.measurement import (
     FLOOR_M,
     FLOOR_RAD,
     POSITION_WEIGHTS,
@@ -70,21 +71,23 @@ def collect(config: BenchConfig) -> list[Sample]:
     meta = LeRobotDatasetMetadata(
         config.dataset.repo_id or repo_id, root=config.dataset.root or f"{root}/dataset"
     )
-    experience, demonstrations = policy.require_experience(), open_demonstrations(meta, policy.config)
-    offsets = {name: offset(experience, name, demonstrations) for name in experience.objects}
+    memory, demonstrations = policy.require_memory(), open_demonstrations(meta, policy.config)
+    offsets = {name: offset(memory, name, demonstrations) for name in memory.objects}
     samples: list[Sample] = []
     for task in tasks(config.env.type, config.env.task):
         for seed in range(FIRST_SEED, FIRST_SEED + EPISODES):
             with world(config.env.type, task, seed) as scene:
                 truth = Truth(scene.object_poses(), offsets)
 
-                def note(_: int, __: Observation, row: Row, truth=truth, scene=scene, seed=seed) -> None:
+                def note(
+                    _: int, __: Observation, row: EpisodeController, truth=truth, scene=scene, seed=seed
+                ) -> None:
                     if row.has_just_looked and row.seen is not None:
                         true = truth.now(scene.object_poses())
                         for name, estimate in row.seen.estimates.items():
                             if name in true and name not in row.tracker.held and estimate.support is not None:
                                 round_ = 0 in (
-                                    true_period(name, config.env.type), experience.yaw_periods[name]
+                                    true_period(name, config.env.type), memory.yaw_periods[name]
                                 )  # fmt: skip
                                 found = _sample(estimate, true[name], seed, round_, name, config.env.type)
                                 samples.extend(found)

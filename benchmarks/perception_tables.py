@@ -94,8 +94,8 @@ def _noise(results: list[Quoted]) -> str:
         "Mean square per dimension",
     ]
     note = (
-        "Of single estimates while the policy acts, under the covariance that the filter is given, by the "
-        "weights in `perception/measurement.py`: a calibrated one has 0.95 inside and a mean square of 1."
+        "Of single estimates while the policy acts, under the covariance that the filter is given, by "
+        "the weights in `tracking/measurement.py`: a calibrated one has 0.95 inside and a mean square of 1."
     )
     return f"{table(heads, rows)}\n\n{note}"
 

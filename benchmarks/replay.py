@@ -127,8 +127,8 @@ def _run_one(policy: OpenSPMPolicy, world: Any, interfere: Any) -> dict[str, Any
 def _tabletop_worlds() -> Iterator[tuple[str, Any, Any]]:
     """Every task once, the tasks that grasp once more with the object moved or dropped on the way."""
     from lerobot_openspm.bench.tabletop import GRASPED, Disturbance, TabletopWorld
-    from lerobot_openspm.envs.tabletop_env import TabletopEnv
-    from lerobot_openspm.envs.tasks import TASK_NAMES
+    from lerobot_openspm.envs.tabletop.env import TabletopEnv
+    from lerobot_openspm.envs.tabletop.tasks import TASK_NAMES
 
     for number, task in enumerate(TASK_NAMES):
         env = TabletopEnv(task=task)

@@ -21,7 +21,7 @@ from benchmarks.common import DEMOS, EPISODES, RUN, dataset, policy, write
 
 from lerobot_openspm.cli.demo import EVALUATION_SEED
 from lerobot_openspm.cli.pipeline import THREADS, collect_dataset, evaluate, success
-from lerobot_openspm.envs.tasks import ANY_TASK, SELECTIONS
+from lerobot_openspm.envs.tabletop.tasks import ANY_TASK, SELECTIONS
 
 # Seeds of evaluation that nothing else was measured on; the code was tuned on 2,600,000 and more.
 SELECTION_SEEDS = {"compound": 8000, "two_bowls": 11_000}

@@ -15,8 +15,8 @@ from lerobot.datasets import LeRobotDatasetMetadata
 
 from lerobot_openspm.cli.collect import CollectConfig, SimulatorConfig, collect
 from lerobot_openspm.configuration_openspm import OpenSPMConfig
-from lerobot_openspm.experience import save_experience
-from lerobot_openspm.training import dataset_processor, experience_of
+from lerobot_openspm.memory.memory import write_memory
+from lerobot_openspm.training import dataset_processor, memory_of
 
 NAME = "local/openspm_tabletop"
 CALIBRATION = Path(__file__).parents[1] / "configs/cameras/openspm_tabletop.json"
@@ -44,13 +44,13 @@ def main() -> None:
     meta = LeRobotDatasetMetadata(NAME, root=root)
     config = OpenSPMConfig(cameras=str(CALIBRATION), device="cpu", push_to_hub=False)
     mined = dataset_processor(meta, config).mine()
-    experience = experience_of(mined, config)
+    memory = memory_of(mined, config)
 
     # 3. Look. Demonstrations of one task should agree: a small spread means that the anchor is the right one.
     by_task = defaultdict(list)
-    for entry in experience.entries:
+    for entry in memory.entries:
         by_task[entry.language].append(entry)
-    names = ", ".join(experience.objects)
+    names = ", ".join(memory.objects)
     print(f"{meta.total_episodes} demonstrations, {meta.total_frames} frames; objects: {names}")
     for instruction, entries in by_task.items():
         print(f"\n{instruction!r}, remembered {len(entries)} times")
@@ -65,7 +65,7 @@ def main() -> None:
 
     # 4. Keep. The memory is JSON that a person can read, and arrays beside it.
     memory = options.output / "memory"
-    save_experience(experience, memory)
+    write_memory(memory, memory)
     print(f"\nsaved to {memory}; `openspm inspect --path={memory}` shows it")
 
 

@@ -15,12 +15,12 @@ import torch
 
 from lerobot_openspm.cli.drawing import draw_key_poses, save_png
 from lerobot_openspm.configuration_openspm import OpenSPMConfig
-from lerobot_openspm.control.row import Knowledge, Row
+from lerobot_openspm.control.controller import EpisodeController, PlanningContext
 from lerobot_openspm.control.transfer import transfer
-from lerobot_openspm.envs.tabletop_env import ACTION_NAMES, STATE_NAMES, TabletopEnv
-from lerobot_openspm.experience import load_experience
-from lerobot_openspm.observation import split_batch
-from lerobot_openspm.perceive import Eyes
+from lerobot_openspm.envs.tabletop.env import ACTION_NAMES, STATE_NAMES, TabletopEnv
+from lerobot_openspm.memory.memory import read_memory
+from lerobot_openspm.perception.observation import split_batch
+from lerobot_openspm.perception.pipeline import Perception
 
 CAMERA = "observation.images.front"
 
@@ -44,13 +44,13 @@ def main() -> None:
     (observation,) = split_batch(batch, config.layouts()[0])
 
     # 2. Observing plans: find the objects in the images, rank the entries, carry the best one over.
-    experience = load_experience(options.memory)
-    knowledge = Knowledge(
-        experience.entries, experience.yaw_periods, experience.robot, config.score_weights,
+    memory = read_memory(options.memory)
+    knowledge = PlanningContext(
+        memory.entries, memory.yaw_periods, memory.robot, config.score_weights,
         config.transfer_limits, config.control_settings,
     )  # fmt: skip
-    row = Row(knowledge, options.instruction, observation.fingerprint(), noise_seed=0)
-    row.observe(observation.hand, partial(Eyes(experience, config.hand_radius_m).look, observation))
+    row = EpisodeController(knowledge, options.instruction, observation.fingerprint(), noise_seed=0)
+    row.observe(observation.hand, partial(Perception(memory, config.hand_radius_m).look, observation))
 
     print(f"{options.instruction!r}: {row.status.name.lower()}")
     for name, T_world_obj in row.layout.items():
@@ -66,9 +66,9 @@ def main() -> None:
     best = row.ranked[0].entry
     if any(name not in row.layout for name in best.objects):
         raise SystemExit("not all of its objects were found in this scene; try another --seed")
-    targets = transfer(best, row.layout, experience.yaw_periods, observation.hand.T_world_ee)
-    view = observation.views(experience.cameras)[CAMERA]
-    picture = draw_key_poses(view, [t.T_world_ee for t in targets], [t.memory.phase for t in targets])
+    targets = transfer(best, row.layout, memory.yaw_periods, observation.hand.T_world_ee)
+    view = observation.views(memory.cameras)[CAMERA]
+    picture = draw_key_poses(view, [t.T_world_ee for t in targets], [t.key_pose.phase for t in targets])
     save_png(picture, options.output / "key_poses.png")
     print(f"  drawn into {options.output / 'key_poses.png'}")
 

@@ -12,16 +12,16 @@ from pathlib import Path
 
 import pytest
 from tests.memory.builders import entry
-from tests.memory.experiences import experience, same
+from tests.memory.memories import a_memory, same
 from tests.memory.memory_files import names
 from tests.memory.old_format import save_version_4
 
 from lerobot_openspm import files
 from lerobot_openspm.errors import MemoryFormatError, OpenSPMError
-from lerobot_openspm.experience import load_experience, save_experience
-from lerobot_openspm.experience_files import CAMERAS, CAMERAS_JSON, LOCK, changing
+from lerobot_openspm.memory.files import CAMERAS, CAMERAS_JSON, LOCK, changing
+from lerobot_openspm.memory.memory import read_memory, write_memory
 
-OLD = experience()
+OLD = a_memory()
 NEWER_CAMERAS = {key: replace(camera, fx=77.5) for key, camera in OLD.cameras.items()}
 NEWER = replace(OLD, entries=(entry(quality=0.1, source="new#1"),), cameras=NEWER_CAMERAS)
 SOURCES = [e.source for e in OLD.entries]
@@ -64,11 +64,11 @@ def n_calls(tmp_path, make):
     make(OLD, tmp_path / "counted")
     with pytest.MonkeyPatch.context() as patched:
         fault = Fault(patched)
-        save_experience(NEWER, tmp_path / "counted")
+        write_memory(NEWER, tmp_path / "counted")
     return fault.count
 
 
-@pytest.mark.parametrize("make", [save_experience, save_version_4])
+@pytest.mark.parametrize("make", [write_memory, save_version_4])
 def test_a_save_that_fails_at_any_call_leaves_the_old_memory_or_the_new_one(tmp_path, make):
     outcomes = []
     for at in range(1, n_calls(tmp_path, make) + 1):
@@ -77,15 +77,15 @@ def test_a_save_that_fails_at_any_call_leaves_the_old_memory_or_the_new_one(tmp_
         with pytest.MonkeyPatch.context() as patched:
             Fault(patched, at)
             try:
-                save_experience(NEWER, folder)
+                write_memory(NEWER, folder)
             except OSError as error:
                 outcomes.append(error.errno)
-        loaded = load_experience(folder)
+        loaded = read_memory(folder)
         assert same(loaded, OLD) or same(loaded, NEWER)
         outcomes.append("old" if same(loaded, OLD) else "new")
         # The next save is not disturbed by what is left, and leaves nothing of it.
-        save_experience(NEWER, folder)
-        assert same(load_experience(folder), NEWER)
+        write_memory(NEWER, folder)
+        assert same(read_memory(folder), NEWER)
         assert visible(folder) == sorted(names(folder))
     assert {"old", "new", errno.ENOSPC} <= set(outcomes)
     assert len(outcomes) > 20
@@ -95,9 +95,9 @@ def test_a_first_save_that_fails_is_no_memory(tmp_path):
     with pytest.MonkeyPatch.context() as patched:
         Fault(patched, 6)
         with pytest.raises(OSError, match="no space"):
-            save_experience(OLD, tmp_path)
+            write_memory(OLD, tmp_path)
     with pytest.raises(MemoryFormatError, match=r"no memory at .*memory\.json"):
-        load_experience(tmp_path)
+        read_memory(tmp_path)
 
 
 def in_another_process(function):
@@ -113,21 +113,21 @@ def in_another_process(function):
 
 def test_the_memory_survives_kill_9_at_any_call(tmp_path):
     seen = set()
-    for at in range(1, n_calls(tmp_path, save_experience) + 1):
+    for at in range(1, n_calls(tmp_path, write_memory) + 1):
         folder = tmp_path / str(at)
-        save_experience(OLD, folder)
+        write_memory(OLD, folder)
 
         def save_and_die(at=at, folder=folder):
             Fault(pytest.MonkeyPatch(), at, kill_9)
-            save_experience(NEWER, folder)
+            write_memory(NEWER, folder)
 
         _, status = os.waitpid(in_another_process(save_and_die), 0)
         assert os.WTERMSIG(status) == signal.SIGKILL
-        loaded = load_experience(folder)
+        loaded = read_memory(folder)
         is_old = same(loaded, OLD)
         assert is_old or same(loaded, NEWER)
         seen.add((is_old, len(visible(folder))))
-        save_experience(NEWER, folder)
+        write_memory(NEWER, folder)
         assert visible(folder) == sorted(names(folder))
     # It was cut off before and after the one moment that counts, and some files were left over.
     assert {is_old for is_old, _ in seen} == {True, False}
@@ -138,7 +138,7 @@ def test_the_memory_survives_kill_9_at_any_call(tmp_path):
 def test_the_memory_survives_kill_9_at_any_moment(tmp_path):
     """Also in the middle of a call, which is a matter of chance."""
     rng = random.Random(0)
-    save_experience(OLD, tmp_path)
+    write_memory(OLD, tmp_path)
 
     read, write = os.pipe()
 
@@ -147,7 +147,7 @@ def test_the_memory_survives_kill_9_at_any_moment(tmp_path):
         os.fsync = lambda fd: None
         while True:
             for one in (NEWER, OLD):
-                save_experience(one, tmp_path)
+                write_memory(one, tmp_path)
                 os.write(write, b".")
 
     for _ in range(100):
@@ -160,30 +160,30 @@ def test_the_memory_survives_kill_9_at_any_moment(tmp_path):
         while select.select([read], [], [], 0)[0]:
             os.read(read, 100)
         os.waitpid(pid, 0)
-        loaded = load_experience(tmp_path)
+        loaded = read_memory(tmp_path)
         assert same(loaded, OLD) or same(loaded, NEWER)
-    save_experience(NEWER, tmp_path)
+    write_memory(NEWER, tmp_path)
     assert visible(tmp_path) == sorted(names(tmp_path))
 
 
 def test_two_processes_that_add_at_once_lose_nothing_of_each_other(tmp_path):
-    save_experience(OLD, tmp_path)
+    write_memory(OLD, tmp_path)
 
     def add(name):
         for i in range(10):
             with changing(tmp_path):
-                experience = load_experience(tmp_path)
-                added = replace(experience, entries=(entry(source=f"{name}#{i}"),))
-                save_experience(experience.appended(added), tmp_path)
+                memory = read_memory(tmp_path)
+                added = replace(memory, entries=(entry(source=f"{name}#{i}"),))
+                write_memory(memory.appended(added), tmp_path)
 
     for pid in [in_another_process(lambda name=name: add(name)) for name in ("one", "two")]:
         os.waitpid(pid, 0)
-    found = [e.source for e in load_experience(tmp_path).entries]
+    found = [e.source for e in read_memory(tmp_path).entries]
     assert sorted(found) == sorted([f"{n}#{i}" for n in ("one", "two") for i in range(10)] + SOURCES)
 
 
 def test_a_memory_can_be_read_while_another_process_saves(tmp_path):
-    save_experience(OLD, tmp_path)
+    write_memory(OLD, tmp_path)
 
     def numbered(i):
         cameras = {key: replace(camera, fx=50.1 + i) for key, camera in OLD.cameras.items()}
@@ -191,15 +191,15 @@ def test_a_memory_can_be_read_while_another_process_saves(tmp_path):
 
     def save_for_ever():
         for i in count(1):
-            save_experience(numbered(i), tmp_path)
+            write_memory(numbered(i), tmp_path)
 
-    save_experience(numbered(0), tmp_path)
+    write_memory(numbered(0), tmp_path)
     pid = in_another_process(save_for_ever)
     seen = set()
     # As many reads as it takes: on a busy machine, the other process may not run between two of them.
     while len(seen) < 10:
         assert os.waitpid(pid, os.WNOHANG) == (0, 0), "the other process came to an end"
-        loaded = load_experience(tmp_path)
+        loaded = read_memory(tmp_path)
         seen.add(loaded.entries[-1].version)
         assert same(loaded, numbered(loaded.entries[-1].version - 1))
     os.kill(pid, signal.SIGKILL)
@@ -230,38 +230,38 @@ def test_a_save_that_renames_its_cameras_between_two_reads_is_read_whole(tmp_pat
 
         with pytest.MonkeyPatch.context() as patched:
             patched.setattr(Path, "read_bytes", read)
-            assert same(load_experience(folder), NEWER)
+            assert same(read_memory(folder), NEWER)
         return n_reads
 
     for after in count(1):
         folder = tmp_path / str(after)
-        save_experience(OLD, folder)
+        write_memory(OLD, folder)
         with pytest.MonkeyPatch.context() as patched:
             patched.setattr(os, "replace", all_but_the_cameras)
             with pytest.raises(OSError, match="no space"):
-                save_experience(NEWER, folder)
+                write_memory(NEWER, folder)
         if load_while_renaming(folder, after) <= after:
             break
     assert after > 2  # there were reads to rename between
 
 
 def test_a_memory_whose_arrays_are_removed_while_it_is_read_is_read_anew(tmp_path, monkeypatch):
-    save_experience(OLD, tmp_path)
+    write_memory(OLD, tmp_path)
     stat = Path.stat
 
     def save_a_newer_one(path, **options):
         found = stat(path, **options)
         if path.name.endswith(".safetensors"):
             monkeypatch.undo()
-            save_experience(NEWER, tmp_path)
+            write_memory(NEWER, tmp_path)
         return found
 
     monkeypatch.setattr(Path, "stat", save_a_newer_one)
-    assert same(load_experience(tmp_path), NEWER)
+    assert same(read_memory(tmp_path), NEWER)
 
 
 def test_who_waits_too_long_for_another_process_is_told(tmp_path, monkeypatch):
-    save_experience(OLD, tmp_path)
+    write_memory(OLD, tmp_path)
     read, write = os.pipe()
 
     def hold():
@@ -273,9 +273,9 @@ def test_who_waits_too_long_for_another_process_is_told(tmp_path, monkeypatch):
     assert os.read(read, 4) == b"held"
     monkeypatch.setattr(files, "LOCK_WAIT_S", 0.1)
     with pytest.raises(OpenSPMError, match="another process has been changing this"):
-        save_experience(NEWER, tmp_path)
+        write_memory(NEWER, tmp_path)
     os.kill(pid, signal.SIGKILL)
     os.waitpid(pid, 0)
     # Whoever holds it and is killed holds it no more.
-    save_experience(NEWER, tmp_path)
-    assert same(load_experience(tmp_path), NEWER)
+    write_memory(NEWER, tmp_path)
+    assert same(read_memory(tmp_path), NEWER)

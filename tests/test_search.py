@@ -1,10 +1,10 @@
 import pytest
+from tests.language.text_model import make_model
 from tests.memory.builders import entry
 from tests.memory.test_compound import drawer_entry
-from tests.memory.text_model import make_model
 
 from lerobot_openspm.errors import InstructionError
-from lerobot_openspm.memory.names import names_from
+from lerobot_openspm.language.names import names_from
 from lerobot_openspm.memory.retrieval import ScoreWeights
 from lerobot_openspm.search import search_memory
 
@@ -40,7 +40,7 @@ def test_then_comes_the_best_entry_of_each_other_task_the_nearest_first():
 def test_where_nothing_is_considered_the_reason_and_the_nearest_are_named():
     found = search_memory("put the mug on the plate", BANK, ScoreWeights())
     assert found.parts == ()
-    assert "the memory holds no experience for the instruction 'put the mug on the plate'" in found.refusal
+    assert "the memory holds no memory for the instruction 'put the mug on the plate'" in found.refusal
     assert sources(found.others) == ["good", "rack", "stove"]
     assert all(hit.semantic == 0 for hit in found.others)
 

@@ -13,9 +13,9 @@ from lerobot.datasets import LeRobotDatasetMetadata
 from lerobot_openspm.bench.object_frames import error, offset, summary
 from lerobot_openspm.configuration_openspm import OpenSPMConfig
 from lerobot_openspm.envs.libero.simulator import tasks
-from lerobot_openspm.experience import load_experience
 from lerobot_openspm.geometry import se3
-from lerobot_openspm.perception.model import PatchModel
+from lerobot_openspm.memory.memory import read_memory
+from lerobot_openspm.perception.objects.model import PatchModel
 from lerobot_openspm.training import open_demonstrations
 
 # By which angle each object truly turns into itself.
@@ -37,16 +37,16 @@ def accuracy(checkpoint: Path, dataset: Path, episodes: list[dict[str, Any]]) ->
     ``off_mm`` holds the largest position error of every episode, in their order; None if an object was not
     found.
     """
-    experience = load_experience(checkpoint)
+    memory = read_memory(checkpoint)
     config = OpenSPMConfig(
         device="cpu", push_to_hub=False, state_rotation="axis_angle", action_rotation="axis_angle"
     )
     demonstrations = open_demonstrations(LeRobotDatasetMetadata(REPO_ID, root=dataset), config)
-    offsets = {name: offset(experience, name, demonstrations) for name in experience.objects}
+    offsets = {name: offset(memory, name, demonstrations) for name in memory.objects}
     # Patches do not measure a yaw: such an object is taken to stand as demonstrated.
     periods = {
         name: 0.0 if isinstance(model, PatchModel) else TRUE_PERIODS[name]
-        for name, model in experience.objects.items()
+        for name, model in memory.objects.items()
     }
     by_object, by_task = defaultdict(list), defaultdict(list)
     off_mm = []

@@ -9,11 +9,11 @@ import numpy as np
 
 from lerobot_openspm.bench.episode import run_episode as run_in_world
 from lerobot_openspm.bench.libero import LiberoWorld
-from lerobot_openspm.control.row import Row
+from lerobot_openspm.control.controller import EpisodeController
 from lerobot_openspm.envs.libero.simulator import SUITE, LiberoSimulator
-from lerobot_openspm.memory.instruction import parse_instruction
+from lerobot_openspm.language.instruction import parse_instruction
 from lerobot_openspm.modeling_openspm import OpenSPMPolicy
-from lerobot_openspm.observation import Observation
+from lerobot_openspm.perception.observation import Observation
 from lerobot_openspm.perception.oracle import name_simulator_poses
 
 
@@ -31,19 +31,19 @@ class Episode:
 
     success: bool
     actions: np.ndarray
-    row: Row
+    row: EpisodeController
     seen: dict[str, np.ndarray]
     true: dict[str, np.ndarray]
 
 
 def run_episode(policy: OpenSPMPolicy, simulator: LiberoSimulator) -> Episode:
     """Act from the simulator's present state until success or the cap."""
-    models = policy.experience.objects if policy.experience else {}
+    models = policy.memory.objects if policy.memory else {}
     named = [name for one in parse_instruction(simulator.instruction) for name in one.objects]
     seen: dict[str, np.ndarray] = {}
     true: dict[str, np.ndarray] = {}
 
-    def note(step: int, observation: Observation, row: Row) -> None:
+    def note(step: int, observation: Observation, row: EpisodeController) -> None:
         if step == 0:
             seen.update(row.layout)
             true.update(name_simulator_poses(simulator.object_poses(), list(dict.fromkeys(named)), models))

@@ -191,7 +191,7 @@ def _told(episode: Episode) -> dict[str, Any]:
         "success": episode.success,
         "status": str(episode.row.status),
         "key_pose": executor.index,
-        "phase": executor.plan[executor.index].memory.phase if executor.plan else None,
+        "phase": executor.plan[executor.index].key_pose.phase if executor.plan else None,
         "attempts": executor.attempts,
         "entry": ranked[0].entry.source if ranked else None,
         "seen": {name: _place(T) for name, T in episode.seen.items()},

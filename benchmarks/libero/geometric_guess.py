@@ -25,12 +25,14 @@ import numpy as np
 
 from lerobot_openspm.envs.libero.simulator import OBJECTS, LiberoSimulator, tasks
 from lerobot_openspm.errors import JudgementError, OpenSPMError
-from lerobot_openspm.experience import Experience, load_experience
 from lerobot_openspm.geometry import se3
 from lerobot_openspm.geometry.se3 import Array
-from lerobot_openspm.judgement.endpoint import API_BASE, ChatEndpoint
-from lerobot_openspm.judgement.qwen3vl import WEIGHTS, Qwen3VL
-from lerobot_openspm.judgement.zero_shot import (
+from lerobot_openspm.language.instruction import parse_instruction
+from lerobot_openspm.memory.entry import WORLD, Anchor, MemoryEntry, MemoryKeyPose, RetrievalKey, SubTask
+from lerobot_openspm.memory.memory import Memory, read_memory
+from lerobot_openspm.mining.phase_labels.endpoint import API_BASE, ChatEndpoint
+from lerobot_openspm.mining.phase_labels.qwen3vl import WEIGHTS, Qwen3VL
+from lerobot_openspm.mining.phase_labels.zero_shot import (
     EndpointKeyPoses,
     GuessedKeyPose,
     KeyPoseSource,
@@ -38,8 +40,6 @@ from lerobot_openspm.judgement.zero_shot import (
     SceneQuestion,
     SeenObject,
 )
-from lerobot_openspm.memory.entry import WORLD, Anchor, MemoryEntry, MemoryKeyPose, RetrievalKey, SubTask
-from lerobot_openspm.memory.instruction import parse_instruction
 from lerobot_openspm.modeling_openspm import OpenSPMPolicy
 from lerobot_openspm.perception.oracle import name_simulator_poses
 
@@ -89,17 +89,17 @@ def guessing_policy(oracle: Path, folder: Path, source: KeyPoseSource | None = N
         JudgementError: Nothing that the model said can be followed, for any task.
     """
     policy = OpenSPMPolicy.from_pretrained(oracle)
-    experience = load_experience(oracle)
+    memory = read_memory(oracle)
     entries, refused = list[MemoryEntry](), dict[str, str]()
     for task, instruction in tasks().items():
         try:
-            entries.append(_guess(task, instruction, experience, source))
+            entries.append(_guess(task, instruction, memory, source))
         except JudgementError as error:
             logger.warning("no key poses for %r: %s", instruction, error)
             refused[task] = str(error)
     if not entries:
         raise JudgementError(f"no task has key poses that can be followed; the last: {refused.popitem()[1]}")
-    policy.experience = replace(experience, entries=tuple(entries))
+    policy.memory = replace(memory, entries=tuple(entries))
     # A guess may well lie outside what the demonstrations reached.
     policy.config.reach_margin_m = policy.config.min_clearance_m = 1.0
     policy.config.max_jump_m = 2.0
@@ -123,15 +123,15 @@ def source_of(config: GuessConfig) -> KeyPoseSource | None:
     return EndpointKeyPoses(ChatEndpoint(config.api_base or API_BASE, config.model_id))
 
 
-def _guess(task: str, instruction: str, experience: Experience, source: KeyPoseSource | None) -> MemoryEntry:
+def _guess(task: str, instruction: str, memory: Memory, source: KeyPoseSource | None) -> MemoryEntry:
     """One task's entry, in the frames of the simulator's objects with the world's axes."""
     simulator = LiberoSimulator(task, PICTURE_PX if source else None)
     simulator.reset(0)
     sub_tasks = parse_instruction(instruction)
     names = list(dict.fromkeys(name for sub_task in sub_tasks for name in sub_task.objects))
-    layout = name_simulator_poses(simulator.object_poses(), names, experience.objects)
+    layout = name_simulator_poses(simulator.object_poses(), names, memory.objects)
     boxes = {name: _box(simulator, name) for name in names}
-    down, open_width = simulator.ee_pose()[:3, :3], experience.robot.open_width
+    down, open_width = simulator.ee_pose()[:3, :3], memory.robot.open_width
     if source is None:
         hand = _Guesser({name: middle for name, (middle, _) in boxes.items()}, down, open_width)
         poses = tuple(pose for sub_task in sub_tasks for pose in hand.follow(sub_task))
@@ -263,7 +263,7 @@ def _corners(aabb: Array) -> Array:
 def main(config: GuessConfig) -> dict[str, object]:
     """Write the checkpoint; says for which tasks there are key poses."""
     folder = guessing_policy(Path(config.oracle), Path(config.output), source_of(config))
-    guessed = [entry.language for entry in load_experience(folder).entries]
+    guessed = [entry.language for entry in read_memory(folder).entries]
     missing = [instruction for instruction in tasks().values() if instruction not in guessed]
     return {"source": config.source, "guessed": guessed, "refused": missing, "output": config.output}
 

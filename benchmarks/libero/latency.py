@@ -19,7 +19,7 @@ from lerobot_openspm.control.executor import Hand
 from lerobot_openspm.envs.libero.simulator import LiberoSimulator
 from lerobot_openspm.envs.seeds import TUNING_SEED_START
 from lerobot_openspm.modeling_openspm import OpenSPMPolicy
-from lerobot_openspm.observation import Observation
+from lerobot_openspm.perception.observation import Observation
 
 TASK = "put_the_bowl_on_the_plate"
 CHUNKS, LOOKS, WARM_UP = 1000, 100, 20

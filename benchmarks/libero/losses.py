@@ -43,7 +43,7 @@ def main() -> dict[str, Any]:
         acting = OpenSPMPolicy.from_pretrained(last.parents[1] / f"{step:06d}" / last.name)
         if samples is None:
             mined = dataset_processor(_meta(root), config).key_poses(held_out=True)
-            samples = training_set(mined, acting.require_experience().robot, config)
+            samples = training_set(mined, acting.require_memory().robot, config)
         for name, index in frames.items():
             losses[name].append(_loss(acting, samples, index))
     epochs = [round(step * config.samples_per_frame / len(frames["training"]), 2) for step in steps]

@@ -12,17 +12,17 @@ from huggingface_hub.errors import HFValidationError
 
 from lerobot_openspm.configuration_openspm import OpenSPMConfig
 from lerobot_openspm.errors import MemoryFormatError
-from lerobot_openspm.experience import (
+from lerobot_openspm.geometry.camera import check_sizes
+from lerobot_openspm.memory.files import data_files
+from lerobot_openspm.memory.header import check_layouts
+from lerobot_openspm.memory.memory import (
     CAMERAS_JSON,
     MEMORY_JSON,
-    Experience,
+    Memory,
     check_anchors,
     check_labels,
-    load_experience,
+    read_memory,
 )  # fmt: skip
-from lerobot_openspm.experience_files import data_files
-from lerobot_openspm.experience_header import check_layouts
-from lerobot_openspm.geometry.camera import check_sizes
 
 
 def checkpoint_folder(name: str | Path, revision: str | None = None, **options: Any) -> Path:
@@ -52,7 +52,7 @@ def checkpoint_folder(name: str | Path, revision: str | None = None, **options: 
     return directory
 
 
-def load_memory(directory: Path, config: OpenSPMConfig, is_kept: bool) -> Experience:
+def load_memory(directory: Path, config: OpenSPMConfig, is_kept: bool) -> Memory:
     """Read a checkpoint's memory.
 
     Args:
@@ -65,13 +65,13 @@ def load_memory(directory: Path, config: OpenSPMConfig, is_kept: bool) -> Experi
         MemoryFormatError: It is damaged or empty, or made for another configuration.
         CalibrationError: Its cameras are not those of the configuration.
     """
-    experience = load_experience(directory, None if config.cameras is None else Path(config.cameras))
-    if not experience.entries:
+    memory = read_memory(directory, None if config.cameras is None else Path(config.cameras))
+    if not memory.entries:
         raise MemoryFormatError(
             f"the memory in {directory} holds no entries, so nothing can be done with it; train again"
         )
     for name in ("perception", "segmentation", "shape"):
-        made, asked = getattr(experience, name), getattr(config, name)
+        made, asked = getattr(memory, name), getattr(config, name)
         if made != asked:
             raise MemoryFormatError(
                 f"the memory in {directory} holds key poses in the frames of {name}={made}, got "
@@ -79,8 +79,8 @@ def load_memory(directory: Path, config: OpenSPMConfig, is_kept: bool) -> Experi
             )
     if is_kept:
         where = str(directory / MEMORY_JSON)
-        check_layouts(experience.layouts, config.layouts(), "the configuration's", where)
-        check_anchors(experience, where)
-        check_labels(experience, config.mask_labels, str(directory / CONFIG_NAME))
-    check_sizes(experience.cameras, config.image_sizes, config.cameras or str(directory / CAMERAS_JSON))
-    return experience
+        check_layouts(memory.layouts, config.layouts(), "the configuration's", where)
+        check_anchors(memory, where)
+        check_labels(memory, config.mask_labels, str(directory / CONFIG_NAME))
+    check_sizes(memory.cameras, config.image_sizes, config.cameras or str(directory / CAMERAS_JSON))
+    return memory

@@ -14,9 +14,9 @@ from lerobot.utils.constants import ACTION, OBS_STATE
 from lerobot_openspm.control.executor import ControlSettings, Execution
 from lerobot_openspm.control.transfer import TransferLimits
 from lerobot_openspm.flow.condition import Conditioning
-from lerobot_openspm.geometry.layout import ROTATION_KINDS, VectorLayout, parse_layout
+from lerobot_openspm.geometry.vector_layout import ROTATION_KINDS, VectorLayout, parse_layout
 from lerobot_openspm.memory.retrieval import ScoreWeights
-from lerobot_openspm.perception.learning import Shape
+from lerobot_openspm.perception.objects.learning import Shape
 
 PerceptionSource = Literal["demonstrations", "oracle"]
 Segmentation = Literal["demonstrations", "sam3", "grounded_sam2", "given"]
@@ -37,7 +37,7 @@ class OpenSPMConfig(PreTrainedConfig):
         cameras: Calibration file of the cameras to look through (see ``configs/cameras``). Needed for
             training; a checkpoint carries its own, which this replaces when given.
         state_layout: Name of every number of ``observation.state``; read from the dataset if not given. See
-            `lerobot_openspm.geometry.layout` for the names.
+            `lerobot_openspm.geometry.vector_layout` for the names.
         action_layout: Name of every number of ``action``; read from the dataset if not given.
         state_rotation: How the state writes the rotation, where its names are wrong about it: "axis_angle",
             "quat", "euler" or "none".

@@ -19,22 +19,22 @@ from torch import Tensor
 
 from lerobot_openspm.checkpoint import checkpoint_folder, load_memory
 from lerobot_openspm.configuration_openspm import OpenSPMConfig
-from lerobot_openspm.control.knowledge import Knowledge
-from lerobot_openspm.control.row import Row
+from lerobot_openspm.control.controller import EpisodeController
+from lerobot_openspm.control.planning_context import PlanningContext
 from lerobot_openspm.errors import DatasetError, MemoryFormatError, OpenSPMError
-from lerobot_openspm.experience import Experience, save_experience
 from lerobot_openspm.flow.condition import CONDITION_DIM, Query, encode, to_world_frame
 from lerobot_openspm.flow.network import VelocityField
 from lerobot_openspm.flow.training_set import TrainingSet
+from lerobot_openspm.language.names import NameSimilarity, names_from
 from lerobot_openspm.memory.entry import MemoryEntry
 from lerobot_openspm.memory.indexed_entries import indexed
-from lerobot_openspm.memory.names import NameSimilarity, names_from
-from lerobot_openspm.observation import Observation, split_batch
-from lerobot_openspm.perceive import Eyes
-from lerobot_openspm.perception.tracker import TrackerSettings
-from lerobot_openspm.perception.types import Segmenter
+from lerobot_openspm.memory.memory import Memory, write_memory
+from lerobot_openspm.perception.observation import Observation, split_batch
+from lerobot_openspm.perception.pipeline import Perception
+from lerobot_openspm.perception.tracking.tracker import TrackerSettings
 from lerobot_openspm.teaching import Lesson, teach
-from lerobot_openspm.training import dataset_processor, experience_of, segmenter_of, training_set
+from lerobot_openspm.training import dataset_processor, memory_of, segmenter_of, training_set
+from lerobot_openspm.types import Segmenter
 
 logger = logging.getLogger(__name__)
 
@@ -73,14 +73,14 @@ class OpenSPMPolicy(PreTrainedPolicy):
         config.validate_features()
         self.config: OpenSPMConfig = config
         self.flow = VelocityField(CONDITION_DIM[config.conditioning], config.chunk_size, 7, config.hidden_dim)
-        self.experience: Experience | None = None
+        self.memory: Memory | None = None
         self._training_set: TrainingSet | None = None
         self._entries: tuple[Sequence[MemoryEntry], Sequence[MemoryEntry]] | None = None
         if dataset_meta is not None:
             _ = self.names  # what cannot be used is an error now, not at the first observation
             config.control_hz = config.control_hz or float(dataset_meta.fps)
             mined = dataset_processor(dataset_meta, config, segmenter=self.segmenter).mine(held_out=True)
-            self.experience = experience_of(mined, config)
+            self.memory = memory_of(mined, config)
             self._training_set = training_set(mined, mined.robot, config)
             self.flow.action_scale.copy_(self._training_set.action_scale)
         self.reset()
@@ -89,9 +89,9 @@ class OpenSPMPolicy(PreTrainedPolicy):
 
     def reset(self) -> None:
         """Forget the running episodes."""
-        self.rows: list[Row] = []
-        self._eyes: list[Eyes] = []
-        self._rated: list[Row] = []
+        self.rows: list[EpisodeController] = []
+        self._eyes: list[Perception] = []
+        self._rated: list[EpisodeController] = []
 
     @property
     def outcomes(self) -> list[bool | None]:
@@ -124,7 +124,7 @@ class OpenSPMPolicy(PreTrainedPolicy):
                 self._rated.append(row)
                 outcomes += [(entry, success) for entry in row.used_entries]
         if outcomes:
-            self.experience = self.require_experience().with_outcomes(outcomes)
+            self.memory = self.require_memory().with_outcomes(outcomes)
 
     @torch.no_grad()
     def select_action(self, batch: dict[str, Tensor], **kwargs: Any) -> Tensor:
@@ -170,7 +170,7 @@ class OpenSPMPolicy(PreTrainedPolicy):
         """Act on copies of the running episodes; at the end those that were running are back."""
         rows, eyes, is_training = self.rows, self._eyes, self.training
         # Entries, models and a segmenter's weights are large and never change: the copies share them.
-        shared = [self.experience, self.segmenter, *(one.experience for one in eyes)]
+        shared = [self.memory, self.segmenter, *(one.memory for one in eyes)]
         for row in rows:
             shared += [row.candidates, *row.used_entries, *(one.entry for one in row.ranked)]
         try:
@@ -181,7 +181,7 @@ class OpenSPMPolicy(PreTrainedPolicy):
             self.rows, self._eyes = rows, eyes
             self.train(is_training)
 
-    def _observe(self, observations: Sequence[Observation]) -> list[tuple[Row, Observation]]:
+    def _observe(self, observations: Sequence[Observation]) -> list[tuple[EpisodeController, Observation]]:
         """Each environment's state, brought up to its observation."""
         rows = self._rows_of(observations)
         for row, eyes, observation in zip(rows, self._eyes, observations, strict=True):
@@ -193,7 +193,7 @@ class OpenSPMPolicy(PreTrainedPolicy):
         vectors = self.config.layouts()[1].encode_actions(actions)
         return torch.as_tensor(vectors, dtype=torch.float32, device=self.config.device)
 
-    def _rows_of(self, observations: Sequence[Observation]) -> list[Row]:
+    def _rows_of(self, observations: Sequence[Observation]) -> list[EpisodeController]:
         """The state of each environment; a new one where the episode or its instruction is new."""
         if len(self.rows) != len(observations):
             self.rows = [self._new_row(observation) for observation in observations]
@@ -203,26 +203,28 @@ class OpenSPMPolicy(PreTrainedPolicy):
                 self.rows[i], self._eyes[i] = self._new_row(observation), self._new_eyes()
         return self.rows
 
-    def _new_row(self, observation: Observation) -> Row:
-        experience = self.require_experience()
+    def _new_row(self, observation: Observation) -> EpisodeController:
+        memory = self.require_memory()
         config = self.config
         # Rows share the index, which is made anew when the memory was replaced.
-        if self._entries is None or self._entries[0] is not experience.entries:
-            self._entries = experience.entries, indexed(experience.entries)
-        knowledge = Knowledge(
-            self._entries[1], experience.yaw_periods, experience.robot, config.score_weights,
+        if self._entries is None or self._entries[0] is not memory.entries:
+            self._entries = memory.entries, indexed(memory.entries)
+        knowledge = PlanningContext(
+            self._entries[1], memory.yaw_periods, memory.robot, config.score_weights,
             config.transfer_limits, config.control_settings, TrackerSettings(), config.tracking,
             self.step_s, self.names,
         )  # fmt: skip
-        return Row(knowledge, observation.instruction, observation.fingerprint(), config.noise_seed)
+        return EpisodeController(
+            knowledge, observation.instruction, observation.fingerprint(), config.noise_seed
+        )
 
     @property
     def step_s(self) -> float:
         """Seconds that a control step takes."""
         return 1 / (self.config.control_hz or DEFAULT_CONTROL_HZ)
 
-    def _new_eyes(self) -> Eyes:
-        return Eyes(self.require_experience(), self.config.hand_radius_m, self.segmenter)
+    def _new_eyes(self) -> Perception:
+        return Perception(self.require_memory(), self.config.hand_radius_m, self.segmenter)
 
     @cached_property
     def segmenter(self) -> Segmenter | None:
@@ -234,7 +236,7 @@ class OpenSPMPolicy(PreTrainedPolicy):
         """What says which names mean the same thing: the table of words, or with embeddings beside it."""
         return names_from(self.config.name_embeddings)
 
-    def _chunk(self, row: Row, query: Query) -> np.ndarray:
+    def _chunk(self, row: EpisodeController, query: Query) -> np.ndarray:
         """Generate one chunk ``(chunk_size, 7)`` in the world. Rows go one by one, so batches act alike."""
         condition = encode(query, self.config.conditioning)
         noise = row.noise((1, self.config.chunk_size, 7))
@@ -248,7 +250,7 @@ class OpenSPMPolicy(PreTrainedPolicy):
             chunk[0].cpu().numpy().astype(float), query.T_world_target, self.config.conditioning
         )
         # The fingers do what the key pose says; the flow model's last number only says it less surely.
-        actions[:, 6] = self.require_experience().robot.command(bool(query.closed))
+        actions[:, 6] = self.require_memory().robot.command(bool(query.closed))
         return actions
 
     # Learning.
@@ -283,21 +285,21 @@ class OpenSPMPolicy(PreTrainedPolicy):
 
         Args and errors are those of :func:`lerobot_openspm.teaching.teach`; after one nothing has changed.
         """
-        known = self.require_experience()
-        self.experience, lesson = teach(known, self.config, dataset_meta, episodes, self.segmenter)
+        known = self.require_memory()
+        self.memory, lesson = teach(known, self.config, dataset_meta, episodes, self.segmenter)
         return lesson
 
     # Persistence: the memory travels with the weights.
 
     def _save_pretrained(self, save_directory: Path, state_dict: dict[str, Tensor] | None = None) -> None:
-        experience = self.require_experience()  # before anything is written
+        memory = self.require_memory()  # before anything is written
         super()._save_pretrained(save_directory, state_dict=state_dict)
         # What exists on one machine alone stays there; the calibration travels as a file of the checkpoint.
         here: dict[str, None] = dict.fromkeys(ON_ONE_MACHINE)
         if self.config.name_embeddings and Path(self.config.name_embeddings).is_dir():
             here["name_embeddings"] = None
         replace(self.config, **here)._save_pretrained(Path(save_directory))
-        save_experience(experience, Path(save_directory))
+        write_memory(memory, Path(save_directory))
 
     @classmethod
     def from_pretrained(
@@ -334,30 +336,30 @@ class OpenSPMPolicy(PreTrainedPolicy):
     def _attach(self, directory: Path, dataset_meta: Any | None) -> None:
         """Give a freshly loaded policy its memory, and its training set when training goes on."""
         is_kept = self.config.memory_update == "keep" or dataset_meta is None
-        self.experience = load_memory(directory, self.config, is_kept)
+        self.memory = load_memory(directory, self.config, is_kept)
         _ = self.segmenter, self.names  # what cannot be used is an error now, not at the first observation
         if dataset_meta is not None:
-            self.experience = self._learn_on(self.experience, dataset_meta)
+            self.memory = self._learn_on(self.memory, dataset_meta)
 
-    def _learn_on(self, experience: Experience, dataset_meta: Any) -> Experience:
+    def _learn_on(self, memory: Memory, dataset_meta: Any) -> Memory:
         """Take up a dataset to train on, and update what is known by it as ``config.memory_update`` says."""
-        known = None if self.config.memory_update == "rebuild" else experience
-        processor = dataset_processor(dataset_meta, self.config, known, experience.cameras, self.segmenter)
+        known = None if self.config.memory_update == "rebuild" else memory
+        processor = dataset_processor(dataset_meta, self.config, known, memory.cameras, self.segmenter)
         if self.config.memory_update == "keep":
             mined = processor.key_poses(held_out=True)
         else:
             mined = processor.mine(held_out=True)
-            newer = experience_of(mined, self.config)
-            experience = newer if known is None else known.appended(newer)
-        logger.info("memory_update=%s: %d entries", self.config.memory_update, len(experience.entries))
-        self._training_set = training_set(mined, experience.robot, self.config)
-        return experience
+            newer = memory_of(mined, self.config)
+            memory = newer if known is None else known.appended(newer)
+        logger.info("memory_update=%s: %d entries", self.config.memory_update, len(memory.entries))
+        self._training_set = training_set(mined, memory.robot, self.config)
+        return memory
 
-    def require_experience(self) -> Experience:
+    def require_memory(self) -> Memory:
         """What was mined. Raises MemoryFormatError when nothing was."""
-        if self.experience is None:
+        if self.memory is None:
             raise MemoryFormatError(
                 "this policy has no memory; train it with lerobot-train --policy.type=openspm, or load a "
                 "checkpoint with --policy.path"
             )
-        return self.experience
+        return self.memory

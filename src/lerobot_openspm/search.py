@@ -10,13 +10,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from lerobot_openspm.errors import DatasetError, InstructionError
-from lerobot_openspm.memory.compound import Candidate, plan_parts
+from lerobot_openspm.language.names import TABLE_NAMES, NameSimilarity
+from lerobot_openspm.memory.compose import Candidate, plan_parts
 from lerobot_openspm.memory.entry import MemoryEntry, SubTask
 from lerobot_openspm.memory.indexed_entries import indexed, near
 from lerobot_openspm.memory.key_vector import key_vector, key_vectors
-from lerobot_openspm.memory.names import TABLE_NAMES, NameSimilarity
 from lerobot_openspm.memory.retrieval import ScoreWeights, read_instruction, retrieve, semantic_score
-from lerobot_openspm.observation import Observation, split_batch
+from lerobot_openspm.perception.observation import Observation, split_batch
 
 if TYPE_CHECKING:
     from lerobot_openspm.modeling_openspm import OpenSPMPolicy
@@ -136,7 +136,7 @@ def search_scene(policy: OpenSPMPolicy, observation: Observation) -> Found:
     """
     in_words = search_memory(
         observation.instruction,
-        policy.require_experience().entries,
+        policy.require_memory().entries,
         policy.config.score_weights,
         policy.names,
     )

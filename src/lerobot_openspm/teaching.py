@@ -10,14 +10,14 @@ from typing import Any
 
 from lerobot_openspm.configuration_openspm import OpenSPMConfig, feature_names
 from lerobot_openspm.errors import DatasetError, LayoutError
-from lerobot_openspm.experience import Experience, check_labels
 from lerobot_openspm.geometry.camera import load_cameras
+from lerobot_openspm.language.instruction import read_tasks
+from lerobot_openspm.language.own_words import normal_words
 from lerobot_openspm.memory.entry import MemoryEntry
 from lerobot_openspm.memory.indexed_entries import known_names
-from lerobot_openspm.memory.instruction import read_tasks
-from lerobot_openspm.memory.own_words import normal_words
-from lerobot_openspm.perception.types import Segmenter
-from lerobot_openspm.training import dataset_processor, experience_of
+from lerobot_openspm.memory.memory import Memory, check_labels
+from lerobot_openspm.training import dataset_processor, memory_of
+from lerobot_openspm.types import Segmenter
 
 # Beside a dataset's own metadata, where `openspm collect` writes the cameras that recorded it.
 DATASET_CAMERAS = "openspm_cameras.json"
@@ -28,14 +28,14 @@ class Lesson:
     """What a memory was taught.
 
     Attributes:
-        learned: The new entries, and the models of their objects: what is appended to an experience.
+        learned: The new entries, and the models of their objects: what is appended to an memory.
         known_before: How many entries each taught instruction had in the memory before.
         skipped: Episodes that gave no entry.
         objects_learned: Objects that were not known before.
         objects_recognised: Objects of the taught tasks that were.
     """
 
-    learned: Experience
+    learned: Memory
     known_before: dict[str, int]
     skipped: tuple[int, ...]
     objects_learned: tuple[str, ...]
@@ -53,26 +53,26 @@ class Lesson:
 
 
 def teach(
-    experience: Experience,
+    memory: Memory,
     config: OpenSPMConfig,
     dataset_meta: Any,
     episodes: Sequence[int] | None = None,
     segmenter: Segmenter | None = None,
-) -> tuple[Experience, Lesson]:
-    """Append a dataset's demonstrations to an experience.
+) -> tuple[Memory, Lesson]:
+    """Append a dataset's demonstrations to an memory.
 
     Objects that are known are recognised by what is known of them; others are learned from these episodes.
-    Where the configuration names no calibration, the dataset's own is used, else the experience's.
+    Where the configuration names no calibration, the dataset's own is used, else the memory's.
 
     Args:
-        experience: What is known. It stays as it is.
+        memory: What is known. It stays as it is.
         config: The configuration of the policy that knows it.
         dataset_meta: LeRobot's metadata of the dataset.
         episodes: The episodes to teach; all if not given.
         segmenter: Finds the objects' masks, where the configuration's segmentation is not "demonstrations".
 
     Returns:
-        The experience with the new entries and objects, and what is new in it.
+        The memory with the new entries and objects, and what is new in it.
 
     Raises:
         DatasetError: There is no such episode, or its instruction says nothing, or an instruction's episodes
@@ -85,30 +85,30 @@ def teach(
     tasks = _tasks(dataset_meta, wanted)
     settings = replace(config, memory_episodes=wanted)
     own = Path(dataset_meta.root) / "meta" / DATASET_CAMERAS
-    cameras = load_cameras(own) if own.is_file() else experience.cameras
-    processor = dataset_processor(dataset_meta, settings, experience, cameras, segmenter)
-    mined = experience_of(processor.mine(), settings)
+    cameras = load_cameras(own) if own.is_file() else memory.cameras
+    processor = dataset_processor(dataset_meta, settings, memory, cameras, segmenter)
+    mined = memory_of(processor.mine(), settings)
     # An object that was not found cannot be an anchor, and with few demonstrations nothing shows that the one
     # taken instead is wrong.
     added = tuple(entry for entry in mined.entries if not _unseen(entry))
     taught = {entry.language for entry in added}
     for task in dict.fromkeys(tasks.values()):
         if task not in taught:
-            known = known_names(experience.entries)
+            known = known_names(memory.entries)
             raise DatasetError(_nothing_learned(dataset_meta.repo_id, task, tasks, mined, known))
     named = dict.fromkeys(name for entry in added for name in entry.layout)
     objects = {name: mined.objects[name] for name in named if name in mined.objects}
     learned = replace(mined, entries=added, objects=objects)
-    result = experience.appended(learned)
+    result = memory.appended(learned)
     check_labels(result, config.mask_labels, f"the checkpoint of {config.type}")
-    before = Counter(entry.language for entry in experience.entries)
+    before = Counter(entry.language for entry in memory.entries)
     used = {entry.source for entry in added}
     lesson = Lesson(
         learned=learned,
         known_before={task: before[task] for task in dict.fromkeys(entry.language for entry in added)},
         skipped=tuple(i for i in wanted if f"{dataset_meta.repo_id}#{i}" not in used),
-        objects_learned=tuple(name for name in named if name not in experience.objects),
-        objects_recognised=tuple(name for name in named if name in experience.objects),
+        objects_learned=tuple(name for name in named if name not in memory.objects),
+        objects_recognised=tuple(name for name in named if name in memory.objects),
     )
     return result, lesson
 
@@ -174,7 +174,7 @@ def _unseen(entry: MemoryEntry) -> list[str]:
 
 
 def _nothing_learned(
-    name: str, task: str, tasks: dict[int, str], mined: Experience, known: Collection[str]
+    name: str, task: str, tasks: dict[int, str], mined: Memory, known: Collection[str]
 ) -> str:
     """Why an instruction has no entry; it was read with the known names."""
     episodes = [index for index, told in tasks.items() if told == task]

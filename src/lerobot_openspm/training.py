@@ -1,6 +1,6 @@
 """What a policy's configuration makes of a dataset: what was mined, the memory, and the flow samples.
 
-dataset -> dataset_processor(...).mine() -> MinedDataset -> experience_of(...)
+dataset -> dataset_processor(...).mine() -> MinedDataset -> memory_of(...)
 -> training_set(...)
 """
 
@@ -17,23 +17,23 @@ from lerobot.utils.constants import HF_LEROBOT_HOME
 
 from lerobot_openspm.configuration_openspm import OpenSPMConfig
 from lerobot_openspm.errors import PerceptionError
-from lerobot_openspm.experience import Experience
 from lerobot_openspm.flow.samples import perturbed, segment_frames
 from lerobot_openspm.flow.training_set import TrainingSet
 from lerobot_openspm.geometry.camera import Camera, load_cameras
-from lerobot_openspm.judgement.cache import AnswerCache
-from lerobot_openspm.judgement.judging import judge_episodes
-from lerobot_openspm.judgement.make import make_judge
 from lerobot_openspm.memory.indexed_entries import known_names
+from lerobot_openspm.memory.memory import Memory
 from lerobot_openspm.memory.robot import RobotModel
 from lerobot_openspm.mining.dataset import Demonstrations, open_dataset
 from lerobot_openspm.mining.entries import build_entries
 from lerobot_openspm.mining.mined import MinedDataset, MinedEpisode, MinedKeyPoses
+from lerobot_openspm.mining.phase_labels.cache import AnswerCache
+from lerobot_openspm.mining.phase_labels.judging import judge_episodes
+from lerobot_openspm.mining.phase_labels.make import make_judge
 from lerobot_openspm.mining.processor import DatasetProcessor, MiningOptions
-from lerobot_openspm.perception.object_shape import ShapeBackend
-from lerobot_openspm.perception.sam3d import Sam3dShape, worker_command
+from lerobot_openspm.perception.objects.object_shape import ShapeBackend
+from lerobot_openspm.perception.objects.sam3d.size import Sam3dShape, worker_command
 from lerobot_openspm.perception.segmentation.make import make_segmenter
-from lerobot_openspm.perception.types import Segmenter
+from lerobot_openspm.types import Segmenter
 
 logger = logging.getLogger(__name__)
 
@@ -44,7 +44,7 @@ PERTURBED_COPIES = 3
 def dataset_processor(
     dataset: Any,
     config: OpenSPMConfig,
-    known: Experience | None = None,
+    known: Memory | None = None,
     cameras: dict[str, Camera] | None = None,
     segmenter: Segmenter | None = None,
 ) -> DatasetProcessor:
@@ -54,7 +54,7 @@ def dataset_processor(
         dataset: A LeRobotDataset, or LeRobot's metadata of one.
         config: The policy's configuration; learns from the dataset how state and action are laid out, where
             it does not say.
-        known: An experience whose objects are recognised by what is known of them.
+        known: An memory whose objects are recognised by what is known of them.
         cameras: Calibration to use where the configuration names no file.
         segmenter: Finds the objects' masks; made as the configuration says if not given.
 
@@ -86,7 +86,7 @@ def dataset_processor(
     return DatasetProcessor(dataset, options)
 
 
-def experience_of(mined: MinedDataset, config: OpenSPMConfig) -> Experience:
+def memory_of(mined: MinedDataset, config: OpenSPMConfig) -> Memory:
     """The memory that a policy acts by.
 
     Raises:
@@ -97,7 +97,7 @@ def experience_of(mined: MinedDataset, config: OpenSPMConfig) -> Experience:
         "mined %d entries from %d episodes (%d skipped); objects: %s",
         len(entries), len(mined.episodes), len(mined.skipped), ", ".join(sorted(mined.objects)),
     )  # fmt: skip
-    return Experience(
+    return Memory(
         entries, dict(mined.objects), mined.robot, dict(mined.cameras), config.perception,
         mined.simulator_objects, config.segmentation, config.shape, config.layouts(),
     )  # fmt: skip

@@ -17,7 +17,7 @@ from lerobot_openspm.bench.key_poses import (
     summary,
 )
 from lerobot_openspm.bench.recording import Job, Recording, record
-from lerobot_openspm.envs.tasks import TASK_NAMES
+from lerobot_openspm.envs.tabletop.tasks import TASK_NAMES
 
 SEED = 2_900_500
 

@@ -12,9 +12,9 @@ import pytest
 from lerobot_openspm.bench import language
 from lerobot_openspm.bench.taught_words import acted_entries, teach_each
 from lerobot_openspm.cli import bench
-from lerobot_openspm.envs.tasks import TASKS
+from lerobot_openspm.envs.tabletop.tasks import TASKS
 from lerobot_openspm.errors import OpenSPMError
-from lerobot_openspm.memory.instruction import parse_instruction, read_task
+from lerobot_openspm.language.instruction import parse_instruction, read_task
 
 KNOWN = language.known_instructions()
 PARAPHRASES = language.read_rows(language.PARAPHRASES)

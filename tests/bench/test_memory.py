@@ -71,11 +71,11 @@ def test_what_is_said_otherwise_is_near_but_not_always_the_same():
 
 
 def test_made_up_entries_are_like_mined_ones():
-    experience = synthetic_experience(250, np.random.default_rng(0))
-    assert len(experience.entries) == 250
-    assert len({entry.key.sub_tasks for entry in experience.entries}) == 3
-    assert len({entry.source for entry in experience.entries}) == 250
-    for entry in experience.entries:
+    memory = synthetic_experience(250, np.random.default_rng(0))
+    assert len(memory.entries) == 250
+    assert len({entry.key.sub_tasks for entry in memory.entries}) == 3
+    assert len({entry.source for entry in memory.entries}) == 250
+    for entry in memory.entries:
         assert set(entry.objects) == set(entry.layout)
         assert len(entry.key_poses) == 8
         assert entry.key_poses[0].T_obj_ee[3].tolist() == pytest.approx([0, 0, 0, 1])

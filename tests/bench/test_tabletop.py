@@ -3,10 +3,10 @@ import pytest
 from tests.policy.lerobot_commands import CALIBRATION
 
 from lerobot_openspm.bench.tabletop import GRASPED, Disturbance, TabletopWorld, move_cameras
-from lerobot_openspm.envs import layout
-from lerobot_openspm.envs.experts import expert_actions
-from lerobot_openspm.envs.simulator import TabletopSimulator
-from lerobot_openspm.envs.tabletop_env import TabletopEnv
+from lerobot_openspm.envs.tabletop import placement as layout
+from lerobot_openspm.envs.tabletop.env import TabletopEnv
+from lerobot_openspm.envs.tabletop.experts import expert_actions
+from lerobot_openspm.envs.tabletop.simulator import TabletopSimulator
 from lerobot_openspm.geometry import se3
 from lerobot_openspm.geometry.camera import load_cameras, project
 

@@ -6,9 +6,9 @@ from benchmarks.libero.geometric_guess import ABOVE_M, PULL_M, GuessConfig, _Gue
 
 from lerobot_openspm.errors import JudgementError
 from lerobot_openspm.geometry import se3
-from lerobot_openspm.judgement.structure import HOLDING
-from lerobot_openspm.judgement.zero_shot import GuessedKeyPose
-from lerobot_openspm.memory.instruction import parse_instruction
+from lerobot_openspm.language.instruction import parse_instruction
+from lerobot_openspm.mining.phase_labels.structure import HOLDING
+from lerobot_openspm.mining.phase_labels.zero_shot import GuessedKeyPose
 
 DOWN = np.diag([1.0, -1.0, -1.0])
 MIDDLES = {name: np.array([0.0, 0.0, z]) for name, z in (("bowl", 0.03), ("plate", 0.01), ("cabinet", 0.2))}

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 from tests.cli.conftest import Openspm
 
-from lerobot_openspm.experience import load_experience
+from lerobot_openspm.memory.memory import read_memory
 
 
 @pytest.mark.parametrize(
@@ -46,10 +46,10 @@ def test_teaching_is_measured_and_goes_on_where_it_was(openspm: Openspm, tiny_da
     assert 0 < result["teach_s"] < 60
     # The policy that is taught has never seen the task. In its first demonstration no stove is found, because
     # the images are small, so one is not enough; three are.
-    nine = load_experience(output / "without_turn_on_stove")
+    nine = read_memory(output / "without_turn_on_stove")
     assert {entry.language for entry in nine.entries} == {"put the bowl on the plate"}
     assert set(nine.objects) == {"bowl", "plate"}
-    taught = [load_experience(output / f"taught_turn_on_stove_{n}").entries for n in (1, 3)]
+    taught = [read_memory(output / f"taught_turn_on_stove_{n}").entries for n in (1, 3)]
     assert [len(entries) for entries in taught] == [3, 6]
     failed, learned = result["lessons"]
     assert "the objects they belong to were found in none" in failed["error"]

@@ -11,7 +11,7 @@ from tests.memory.memory_files import names
 from tests.policy.lerobot_commands import CALIBRATION, run_command
 
 from lerobot_openspm.cli.main import COMMANDS
-from lerobot_openspm.envs.tasks import ANY_TASK
+from lerobot_openspm.envs.tabletop.tasks import ANY_TASK
 
 BOWL, STOVE = "put the bowl on the plate", "turn on the stove"
 

@@ -9,21 +9,21 @@ import numpy as np
 import pytest
 from tests.cli.conftest import Openspm
 from tests.memory.builders import entry, robot
-from tests.memory.experiences import LAYOUTS, experience, merged_entry, same
+from tests.memory.memories import LAYOUTS, a_memory, merged_entry, same
 from tests.perception.builders import model
 
-from lerobot_openspm import experience as module
 from lerobot_openspm.cli.memory import COMMANDS
-from lerobot_openspm.experience import Experience, load_experience, save_experience
+from lerobot_openspm.memory import memory as module
 from lerobot_openspm.memory.bank import EntryBank
 from lerobot_openspm.memory.entry import Anchor, Outcome
+from lerobot_openspm.memory.memory import Memory, read_memory, write_memory
 
 BOWL, DRAWER, STOVE = "put the bowl on the plate", "open the top drawer", "put the bowl on the stove"
 OBJECTS = {"bowl": model("bowl", 1), "plate": model("plate", 2), "cabinet": model("cabinet", 3)}
 
 
-def made() -> Experience:
-    base = experience(objects=OBJECTS, layouts=LAYOUTS)
+def made() -> Memory:
+    base = a_memory(objects=OBJECTS, layouts=LAYOUTS)
     return replace(base, entries=(*base.entries, entry(BOWL, source="local/demos#2", quality=0.6)))
 
 
@@ -32,13 +32,13 @@ def memory(request: pytest.FixtureRequest, tmp_path: Path, monkeypatch: pytest.M
     """A memory that is read as a small or as a large one is."""
     if request.param == "read when asked for":
         monkeypatch.setattr(module, "READ_AT_LOAD", 0)
-    save_experience(made(), tmp_path / "memory")
+    write_memory(made(), tmp_path / "memory")
     return tmp_path / "memory"
 
 
-def load(memory: Path) -> Experience:
+def load(memory: Path) -> Memory:
     """A memory with every entry read."""
-    loaded = load_experience(memory)
+    loaded = read_memory(memory)
     assert isinstance(loaded.entries, EntryBank) == (module.READ_AT_LOAD == 0)
     return replace(loaded, entries=tuple(loaded.entries), superseded=tuple(loaded.superseded))
 
@@ -92,7 +92,7 @@ def test_list(openspm: Openspm, memory: Path):
 def test_show(openspm: Openspm, memory: Path):
     outcome = Outcome(0, "bowl", Anchor("plate", "plate"), np.array([0.0, 0.0, 0.01]), np.zeros(3), 0.02)
     shown = merged_entry(source="local/demos#0, local/demos#1", outcomes=(outcome,))
-    save_experience(replace(made(), entries=(shown,)), memory)
+    write_memory(replace(made(), entries=(shown,)), memory)
     code, out, _ = openspm("memory", "show", f"--path={memory}", "--source=local/demos#0, local/demos#1")
     assert code == 0
     assert out.count(" mm, ") == len(merged_entry().key_poses) == out.count("  spread ")
@@ -124,7 +124,7 @@ def test_removing_nothing_or_everything_is_refused(openspm: Openspm, memory: Pat
 def test_add_takes_entries_and_objects_of_another_memory_once(openspm: Openspm, memory: Path, tmp_path: Path):
     objects = {**OBJECTS, "stove": model("stove", 4)}
     other = replace(made(), objects=objects, entries=(made().entries[0], entry(STOVE, source="local/new#0")))
-    save_experience(other, tmp_path / "other")
+    write_memory(other, tmp_path / "other")
     added = run(openspm, memory, "add", f"--other={tmp_path / 'other'}")
     assert added == {"entries": 4, "superseded": 0, "added": 1, "unchanged": 1}
     assert sources(memory) == [*(f"local/demos#{i}" for i in range(3)), "local/new#0"]
@@ -146,11 +146,11 @@ ELSEWHERE = {
 @pytest.mark.parametrize("what", ELSEWHERE)
 def test_entries_from_elsewhere_are_refused(openspm: Openspm, memory: Path, tmp_path: Path, what: str):
     changes, message = ELSEWHERE[what]
-    save_experience(replace(made(), **changes), tmp_path / "other")
+    write_memory(replace(made(), **changes), tmp_path / "other")
     assert message in refused(openspm, memory, "add", f"--other={tmp_path / 'other'}") or what == "gripper"
     if what == "gripper":
         new = replace(made(), entries=(entry(BOWL, source="local/new#0"),), **changes)
-        save_experience(new, tmp_path / "other")
+        write_memory(new, tmp_path / "other")
         assert message in refused(openspm, memory, "add", f"--other={tmp_path / 'other'}")
 
 
@@ -207,7 +207,7 @@ def test_a_file_with_two_entries_of_one_source_and_instruction_is_refused(
 def test_what_was_merged_or_removed_is_not_added_again(openspm: Openspm, memory: Path, tmp_path: Path):
     other, file, merged = tmp_path / "other", tmp_path / "entries.json", tmp_path / "merged"
     run(openspm, memory, "rate", "--source=local/demos#0", "--success=true")
-    save_experience(made(), other)  # its entries have no outcomes, so are not quite what was merged
+    write_memory(made(), other)  # its entries have no outcomes, so are not quite what was merged
     run(openspm, memory, "export", f"--output={file}")
     run(openspm, memory, "merge")
     for parcel in (other, file):
@@ -275,7 +275,7 @@ def test_an_exported_folder_is_a_memory(openspm: Openspm, memory: Path, tmp_path
 
 def test_what_was_removed_or_edited_is_restored(openspm: Openspm, memory: Path):
     edited = replace(entry(BOWL, source="local/demos#2", quality=0.1), version=2)
-    save_experience(
+    write_memory(
         replace(made(), entries=(*made().entries[:2], edited), superseded=made().entries[2:]), memory
     )
     restored = run(openspm, memory, "restore", "--source=local/demos#2")
@@ -308,7 +308,7 @@ def test_rate(openspm: Openspm, memory: Path):
     assert [e.trials for e in load(memory).entries] == [0, 0, 2]
     assert "pass --success=true or" in refused(openspm, memory, "rate", "--source=local/demos#2")
     same_source = entry(STOVE, source="local/demos#2")
-    save_experience(replace(made(), entries=(*made().entries, same_source)), memory)
+    write_memory(replace(made(), entries=(*made().entries, same_source)), memory)
     error = refused(openspm, memory, "rate", "--source=local/demos#2", "--success=true")
     assert (
         f"2 entries come from 'local/demos#2'; pass --instruction=TEXT with one of: {BOWL}; {STOVE}" in error
@@ -317,13 +317,13 @@ def test_rate(openspm: Openspm, memory: Path):
 
 def test_of_entries_of_one_source_and_instruction_one_is_rated_by_its_number(openspm: Openspm, memory: Path):
     twin = entry(BOWL, source="local/demos#2", quality=0.3)
-    save_experience(replace(made(), entries=(*made().entries, twin)), memory)
+    write_memory(replace(made(), entries=(*made().entries, twin)), memory)
     which = ("rate", "--source=local/demos#2", f"--instruction={BOWL}", "--success=true")
     error = refused(openspm, memory, *which)
     assert "2 entries come from 'local/demos#2'; pass --entry=NUMBER with one of: 2 (" in error
     assert f"; 3 ({BOWL!r}, version 1, 8 key poses, quality 0.30, succeeded 0 of 0)" in error
     assert run(openspm, memory, *which, "--entry=3")["trials"] == 1
-    assert [e.trials for e in load_experience(memory).entries] == [0, 0, 0, 1]
+    assert [e.trials for e in read_memory(memory).entries] == [0, 0, 0, 1]
     assert "entry 0 is none of those that come from" in refused(openspm, memory, *which, "--entry=0")
 
 

@@ -17,9 +17,9 @@ from tests.cli.conftest import Openspm
 from tests.conftest import record
 from tests.memory.memory_files import names
 
-from lerobot_openspm.experience import Experience, load_experience, save_experience
-from lerobot_openspm.experience_files import LOCK
 from lerobot_openspm.files import LOCK_WAIT_S
+from lerobot_openspm.memory.files import LOCK
+from lerobot_openspm.memory.memory import Memory, read_memory, write_memory
 from lerobot_openspm.modeling_openspm import OpenSPMPolicy
 
 PUSH = "push the plate to the front of the stove"
@@ -53,7 +53,7 @@ def last_line(out: str) -> dict:
 
 
 def test_a_task_is_appended_and_the_weights_stay(openspm: Openspm, into: Path, other_dataset: Path):
-    before, known = contents(into), load_experience(into)
+    before, known = contents(into), read_memory(into)
     code, out, err = openspm(
         "teach", f"--dataset.root={other_dataset}", "--dataset.episodes=[1]", f"--into={into}"
     )
@@ -70,7 +70,7 @@ def test_a_task_is_appended_and_the_weights_stay(openspm: Openspm, into: Path, o
     same = {name for name in before if before[name] == after.get(name)}
     assert {"config.json", "model.safetensors", "cameras.json"} <= same
     assert set(after) == {*same, *names(into), LOCK}
-    taught = load_experience(into)
+    taught = read_memory(into)
     assert [entry.language for entry in taught.entries] == [e.language for e in known.entries] + [PUSH]
     assert taught.entries[-1].source.endswith("#1")
 
@@ -86,7 +86,7 @@ def test_an_unknown_object_is_learned_from_one_demonstration(
     assert last_line(out)["objects_recognised"] == ["bowl"]
     assert contents(into) == before
     assert contents(output)["model.safetensors"] == before["model.safetensors"]
-    assert "cream cheese box" in load_experience(output).objects
+    assert "cream cheese box" in read_memory(output).objects
     code, _, err = openspm(*arguments)
     assert code == 2
     assert f"{output} exists already; choose another --output" in err
@@ -102,37 +102,37 @@ def test_what_the_memory_knows_already_is_said(openspm: Openspm, into: Path, oth
     # The same episode again takes the place of its entry.
     code, out, _ = openspm(*arguments[:-1], "--dataset.episodes=[1]")
     assert last_line(out)["entries_in_memory"] == 8
-    assert load_experience(into).entries[-1].version == 2
+    assert read_memory(into).entries[-1].version == 2
 
 
 class Meanwhile:
     """Another process that changes the memory at the end of the first lesson."""
 
-    def __init__(self, monkeypatch: pytest.MonkeyPatch, folder: Path, change: Callable[..., Experience]):
-        self.lessons, teach, load = 0, OpenSPMPolicy.teach, load_experience
+    def __init__(self, monkeypatch: pytest.MonkeyPatch, folder: Path, change: Callable[..., Memory]):
+        self.lessons, teach, load = 0, OpenSPMPolicy.teach, read_memory
         self.locked: list[bool] = []
 
         def teach_slowly(policy: OpenSPMPolicy, *arguments):
             lesson = teach(policy, *arguments)
             self.lessons += 1
             if self.lessons == 1:
-                save_experience(change(load(folder), policy.require_experience()), folder)
+                write_memory(change(load(folder), policy.require_memory()), folder)
             return lesson
 
-        def load_and_look(directory: Path) -> Experience:
+        def load_and_look(directory: Path) -> Memory:
             self.locked.append(FileLock(directory / LOCK, LOCK_WAIT_S, is_singleton=True).is_locked)
             return load(directory)
 
         monkeypatch.setattr(OpenSPMPolicy, "teach", teach_slowly)
-        monkeypatch.setattr("lerobot_openspm.cli.teach.load_experience", load_and_look)
+        monkeypatch.setattr("lerobot_openspm.cli.teach.read_memory", load_and_look)
 
 
 def test_what_others_changed_during_the_lesson_is_kept(
     openspm: Openspm, into: Path, other_dataset: Path, monkeypatch: pytest.MonkeyPatch
 ):
-    known = load_experience(into)
+    known = read_memory(into)
 
-    def without_the_first(now: Experience, _: Experience) -> Experience:
+    def without_the_first(now: Memory, _: Memory) -> Memory:
         return replace(now, entries=now.entries[1:], superseded=now.entries[:1])
 
     meanwhile = Meanwhile(monkeypatch, into, without_the_first)
@@ -140,7 +140,7 @@ def test_what_others_changed_during_the_lesson_is_kept(
         "teach", f"--dataset.root={other_dataset}", "--dataset.episodes=[1]", f"--into={into}"
     )
     assert code == 0, err
-    taught = load_experience(into)
+    taught = read_memory(into)
     assert [e.source for e in taught.entries[:-1]] == [e.source for e in known.entries[1:]]
     assert [e.source for e in taught.superseded] == [known.entries[0].source]
     assert taught.entries[-1].language == PUSH
@@ -151,7 +151,7 @@ def test_what_others_changed_during_the_lesson_is_kept(
 def test_an_object_that_others_learned_during_the_lesson_is_theirs(
     openspm: Openspm, into: Path, box_dataset: Path, monkeypatch: pytest.MonkeyPatch
 ):
-    def with_another_box(now: Experience, taught: Experience) -> Experience:
+    def with_another_box(now: Memory, taught: Memory) -> Memory:
         model = taught.objects["cream cheese box"]
         return replace(now, objects={**now.objects, model.name: replace(model, yaw_period=math.pi / 2)})
 
@@ -161,7 +161,7 @@ def test_an_object_that_others_learned_during_the_lesson_is_theirs(
     assert meanwhile.lessons == 2
     assert last_line(out)["objects_learned"] == []
     assert "cream cheese box" in last_line(out)["objects_recognised"]
-    taught = load_experience(into)
+    taught = read_memory(into)
     assert taught.objects["cream cheese box"].yaw_period == math.pi / 2
     assert taught.entries[-1].language == BOX
 
@@ -276,9 +276,9 @@ def test_a_copy_that_was_interrupted_is_made_anew(
         def stop(*_: object) -> None:
             raise KeyboardInterrupt
 
-        patch.setattr("lerobot_openspm.cli.teach.save_experience", stop)
+        patch.setattr("lerobot_openspm.cli.teach.write_memory", stop)
         assert openspm(*arguments)[0] == 130
     assert not output.exists()
     assert openspm(*arguments)[0] == 0
-    assert len(load_experience(output).entries) == 8
+    assert len(read_memory(output).entries) == 8
     assert [path.name for path in tmp_path.iterdir() if path.name.startswith(".")] == []

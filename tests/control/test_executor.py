@@ -87,7 +87,7 @@ def test_the_closed_loop_meets_every_key_pose_as_exactly_as_it_must():
     settings = ControlSettings()
     for i, target in enumerate(executor.plan):
         metres, radians = se3.distances(left[i], target.T_world_ee)
-        if target.memory.dwell:
+        if target.key_pose.dwell:
             continue
         limits = (
             (settings.residual_m, settings.residual_rad)
@@ -102,28 +102,28 @@ def test_waiting_for_the_fingers_takes_the_demonstrated_steps():
     executor, world = make(), World()
     _, _, steps_at = run(executor, world)
     for i, target in enumerate(executor.plan):
-        if target.memory.dwell:
-            assert steps_at[i] == target.memory.n_steps
+        if target.key_pose.dwell:
+            assert steps_at[i] == target.key_pose.n_steps
 
 
 @pytest.mark.parametrize("settings", [ControlSettings(), ControlSettings(execution="open_loop")])
 def test_a_hand_that_drifts_while_the_fingers_close_is_brought_back(settings):
     executor, world = make(settings), World()
-    run(executor, world, until=lambda e: e.plan[e.index].memory.dwell)
+    run(executor, world, until=lambda e: e.plan[e.index].key_pose.dwell)
     target = executor.plan[executor.index]
     drift = np.array([0.012, -0.008, 0.005, 0.0, 0.0, 0.05])
     world.T = se3.apply_increment(target.T_world_ee, drift)
     actions = []
-    for _ in range(target.memory.n_steps):
+    for _ in range(target.key_pose.n_steps):
         actions.append(executor.next_action(world.hand))
         world.step(actions[-1])
-    assert_allclose(np.array(actions)[:, 6], ROBOT.command(target.memory.closed))
+    assert_allclose(np.array(actions)[:, 6], ROBOT.command(target.key_pose.closed))
     if settings.execution == "open_loop":  # it cannot know
         assert float(se3.distances(world.T, target.T_world_ee)[0]) > 0.01
         return
     # Each of the ten steps makes good a fifth.
     metres, radians = se3.distances(world.T, target.T_world_ee)
-    assert target.memory.n_steps >= 8
+    assert target.key_pose.n_steps >= 8
     assert metres < 0.2 * np.linalg.norm(drift[:3])
     assert radians < 0.2 * np.linalg.norm(drift[3:])
 
@@ -244,7 +244,7 @@ def test_empty_fingers_after_the_grasp_ask_for_another_try():
 def test_fingers_hold_something_above_a_share_of_the_demonstrated_opening(share, lost):
     executor = make()
     executor.begin(executor.plan, Hand(HOME, OPEN_WIDTH), 4)  # carrying
-    grasped = executor.plan[2].memory.opening
+    grasped = executor.plan[2].key_pose.opening
     assert executor.advance(Hand(HOME, share * grasped)) is lost
 
 
@@ -379,7 +379,7 @@ def test_closed_fingers_that_push_after_something_was_put_down_hold_nothing_that
     ]
     executor = make(key_poses=(*entry().key_poses, *pushing))
     fist = Hand(HOME, 0.0)
-    phases = [target.memory.phase for target in executor.plan]
+    phases = [target.key_pose.phase for target in executor.plan]
     for index in (9, 10):
         executor.begin(executor.plan, fist, index)
         assert not executor.has_lost_grip(fist), phases[index]

@@ -5,14 +5,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
-from tests.control.test_row import HAND, Eyes, row, watch
+from tests.control.test_controller import HAND, Perception, row, watch
 from tests.memory.builders import entry, hand_pose, key_pose, pick_and_place
 
+from lerobot_openspm.control.controller import GIVE_UP_S, Detections
 from lerobot_openspm.control.executor import Hand, Status
-from lerobot_openspm.control.row import GIVE_UP_S, Seen
 from lerobot_openspm.geometry import se3
 from lerobot_openspm.memory.entry import Anchor, Axis, Outcome
-from lerobot_openspm.perception.camera_watch import Fault
+from lerobot_openspm.perception.tracking.camera_health import Fault
 
 OPEN = "open the top drawer"
 CABINET = {"cabinet": se3.from_yaw([0.1, 0.0, 0.0], 0.5)}
@@ -44,7 +44,7 @@ def test_travel_is_the_inverse_of_following(axis):
 
 @pytest.mark.parametrize("axis", KINDS.values(), ids=list(KINDS))
 def test_a_handle_that_slipped_out_is_taken_again_where_it_is_now_for_the_rest_of_its_way(axis):
-    eyes, one = Eyes(CABINET), row(handle(axis), instruction=OPEN)
+    eyes, one = Perception(CABINET), row(handle(axis), instruction=OPEN)
     one.observe(HAND, eyes)
     shown = [target.T_world_ee for target in one.executor.plan]
     here = Hand(shown[2], 0.03)
@@ -64,7 +64,7 @@ def test_a_handle_that_slipped_out_is_taken_again_where_it_is_now_for_the_rest_o
 
 def test_a_handle_that_went_back_when_it_slipped_out_is_looked_for_nearer_to_where_it_was():
     axis = KINDS["slide"]
-    eyes, one = Eyes(CABINET), row(handle(axis), instruction=OPEN)
+    eyes, one = Perception(CABINET), row(handle(axis), instruction=OPEN)
     one.observe(HAND, eyes)
     shown = [target.T_world_ee for target in one.executor.plan]
     one.executor.begin(one.executor.plan, Hand(shown[2], 0.03), 3)
@@ -82,7 +82,7 @@ def test_a_handle_that_went_back_when_it_slipped_out_is_looked_for_nearer_to_whe
 @pytest.mark.parametrize("share", [0.93, 0.97, 1.1])
 def test_a_handle_that_slipped_out_near_the_end_and_went_back_is_not_looked_for_further_out(share):
     axis = KINDS["slide"]
-    eyes, one = Eyes(CABINET), row(handle(axis), instruction=OPEN)
+    eyes, one = Perception(CABINET), row(handle(axis), instruction=OPEN)
     one.observe(HAND, eyes)
     shown = [target.T_world_ee for target in one.executor.plan]
     one.executor.begin(one.executor.plan, Hand(shown[2], 0.03), 3)
@@ -105,7 +105,7 @@ def test_a_handle_that_slipped_out_near_the_end_and_went_back_is_not_looked_for_
 
 def test_a_handle_that_does_not_move_on_in_the_fingers_is_taken_again_where_it_is():
     axis = KINDS["slide"]
-    eyes, one = Eyes(CABINET), row(handle(axis), instruction=OPEN)
+    eyes, one = Perception(CABINET), row(handle(axis), instruction=OPEN)
     one.observe(HAND, eyes)
     shown = [target.T_world_ee for target in one.executor.plan]
     one.executor.begin(one.executor.plan, Hand(shown[2], 0.03), 3)
@@ -134,7 +134,7 @@ def stuck(one, eyes, hand, index):
 
 def carrying(opening):
     """The bowl is in the hand, and its place is not reached."""
-    eyes, one = Eyes(entry().layout), row()
+    eyes, one = Perception(entry().layout), row()
     one.observe(HAND, eyes)
     one.executor.begin(one.executor.plan, HAND, 2)
     grasp = one.executor.plan[2]
@@ -150,18 +150,18 @@ def carrying(opening):
 def test_what_is_still_in_the_hand_is_not_fetched_again_but_set_down_once_more():
     one = carrying(opening=0.03)
     assert one.status is Status.RUNNING
-    assert one.executor.plan[one.executor.index].memory.phase == "pre-place"
+    assert one.executor.plan[one.executor.index].key_pose.phase == "pre-place"
     assert one.tracker.held == {"bowl"}
 
 
 def test_what_is_no_more_in_the_hand_is_fetched():
     one = carrying(opening=0.0)
-    assert one.executor.plan[one.executor.index].memory.phase == "approach"
+    assert one.executor.plan[one.executor.index].key_pose.phase == "approach"
     assert one.tracker.held == frozenset()
 
 
 def test_what_slipped_out_while_it_was_lifted_stands_where_it_stood_and_does_not_hang_in_the_air():
-    eyes, one = Eyes(entry().layout), row()
+    eyes, one = Perception(entry().layout), row()
     one.observe(HAND, eyes)
     first = one.executor.plan[0].T_world_ee
     one.executor.begin(one.executor.plan, HAND, 2)
@@ -178,14 +178,14 @@ def test_what_a_later_sub_task_grasps_again_stays_in_the_hand():
     both = "put the bowl on the plate and put the bowl on the stove"
     again = [replace(pose, sub_task=1) for pose in pick_and_place("bowl", "stove")]
     layout = {**entry().layout, "stove": se3.from_yaw([-0.2, -0.1, 0.0], 0.0)}
-    eyes, one = Eyes(layout), row(entry(both, (*pick_and_place(), *again), layout), instruction=both)
+    eyes, one = Perception(layout), row(entry(both, (*pick_and_place(), *again), layout), instruction=both)
     one.observe(HAND, eyes)
     one.executor.begin(one.executor.plan, HAND, 2)
     grasp, lift = one.executor.plan[2], one.executor.plan[3]
     watch(one, eyes, Hand(grasp.T_world_ee, 0.03), grasp.memory.n_steps + 1)
     eyes.layout["bowl"] = lift.T_world_ee @ se3.inverse(grasp.T_world_ee) @ layout["bowl"]
     watch(one, eyes, Hand(lift.T_world_ee, 0.03), 1)
-    assert one.executor.plan[one.executor.index].memory.phase == "pre-place"
+    assert one.executor.plan[one.executor.index].key_pose.phase == "pre-place"
     eyes.layout["plate"] = layout["plate"] @ se3.from_yaw([0.05, 0.05, 0.0], 0.0)
     watch(one, eyes, Hand(lift.T_world_ee, 0.03), 15)
     assert one.executor.attempts == 0
@@ -198,7 +198,7 @@ ON_PLATE = Outcome(0, "bowl", Anchor("plate", "plate"), np.zeros(3), np.zeros(3)
 def ended(at, look=None):
     """A bowl that was let go at a place relative to the plate, the hand gone, and looks from then on."""
     place = entry().layout["plate"] @ se3.from_yaw([*at], 0.0)
-    eyes, one = Eyes(entry().layout), row(entry(outcomes=(ON_PLATE,)))
+    eyes, one = Perception(entry().layout), row(entry(outcomes=(ON_PLATE,)))
     one.observe(HAND, eyes)
     one.executor.begin(one.executor.plan, HAND, 7)
     eyes.layout["bowl"] = place
@@ -224,7 +224,7 @@ def test_what_lies_in_its_place_is_left_alone():
 @pytest.mark.parametrize("seconds", [0.1, GIVE_UP_S])
 @pytest.mark.parametrize("off_m", [0.0, 0.06])
 def test_without_a_picture_what_was_done_is_neither_seen_nor_tried_again(off_m, seconds):
-    one, _ = ended([off_m, 0.0, 0.0], lambda *_: Seen({}, {"front": Fault("black", seconds)}))
+    one, _ = ended([off_m, 0.0, 0.0], lambda *_: Detections({}, {"front": Fault("black", seconds)}))
     assert one.status is Status.DONE
     assert one.executor.attempts == 0
     assert one.succeeded is None
@@ -236,7 +236,7 @@ def drawer_opened_but_bowl_missed(putting):
     layout = {**entry().layout, **CABINET}
     both = "put the bowl on the plate and open the top drawer"
     whole = entry(both, (*putting, *pull), layout, outcomes=(ON_PLATE,))
-    eyes, one = Eyes(layout), row(whole, instruction=both)
+    eyes, one = Perception(layout), row(whole, instruction=both)
     one.observe(HAND, eyes)
     last = len(one.executor.plan) - 1
     one.executor.begin(one.executor.plan, HAND, last)
@@ -248,7 +248,7 @@ def drawer_opened_but_bowl_missed(putting):
 def test_of_several_things_to_do_only_the_one_that_is_missed_is_done_again():
     eyes, one = drawer_opened_but_bowl_missed(pick_and_place())
     assert one.executor.index == 0
-    assert {target.memory.sub_task for target in one.executor.plan} == {0}
+    assert {target.key_pose.sub_task for target in one.executor.plan} == {0}
     one.executor.begin(one.executor.plan, HAND, 7)
     eyes.layout["bowl"] = entry().layout["plate"]
     watch(one, eyes, Hand(one.executor.plan[7].T_world_ee, 0.08), 12)
@@ -259,7 +259,7 @@ def test_of_several_things_to_do_only_the_one_that_is_missed_is_done_again():
 
 def test_what_is_done_again_ends_with_the_hand_backed_off():
     _, one = drawer_opened_but_bowl_missed(pick_and_place()[:-1])
-    assert [target.memory.phase for target in one.executor.plan[-2:]] == ["release", "retreat"]
+    assert [target.key_pose.phase for target in one.executor.plan[-2:]] == ["release", "retreat"]
 
 
 def test_an_outcome_that_no_key_pose_leads_to_is_not_tried_again():
@@ -267,7 +267,7 @@ def test_an_outcome_that_no_key_pose_leads_to_is_not_tried_again():
     memory = entry("put both bowls on the plate", pick_and_place(), layout,
                    outcomes=(replace(ON_PLATE, sub_task=1),))  # fmt: skip
     assert len(memory.key.sub_tasks) == 2
-    eyes, one = Eyes(layout), row(memory, instruction="put both bowls on the plate")
+    eyes, one = Perception(layout), row(memory, instruction="put both bowls on the plate")
     one.observe(HAND, eyes)
     one.executor.begin(one.executor.plan, HAND, 7)
     eyes.layout["bowl"] = layout["plate"] @ se3.from_yaw([0.06, 0.0, 0.0], 0.0)
@@ -292,7 +292,7 @@ def test_an_episode_that_is_given_up_has_failed():
 def test_a_handle_that_went_all_the_way_is_a_success_if_the_fingers_could_feel_it():
     for opening, expected in ((0.03, True), (0.001, None)):
         poses = [replace(pose, opening=opening) for pose in handle(KINDS["slide"]).key_poses]
-        eyes, one = Eyes(CABINET), row(entry(OPEN, poses, CABINET), instruction=OPEN)
+        eyes, one = Perception(CABINET), row(entry(OPEN, poses, CABINET), instruction=OPEN)
         one.observe(HAND, eyes)
         last = len(one.executor.plan) - 1
         one.executor.begin(one.executor.plan, HAND, last)

@@ -6,15 +6,15 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose
-from tests.control.test_row import HAND, Eyes, row, shifted, watch
+from tests.control.test_controller import HAND, Perception, row, shifted, watch
 from tests.memory.builders import entry, hand_pose, key_pose, robot
 
+from lerobot_openspm.control.controller import LEFT_BEHIND_M, OUTRUN_M
 from lerobot_openspm.control.executor import ControlSettings, Executor, Hand, Status
-from lerobot_openspm.control.row import LEFT_BEHIND_M, OUTRUN_M
 from lerobot_openspm.control.transfer import Target, push_ways, transfer
 from lerobot_openspm.geometry import se3
 from lerobot_openspm.memory.entry import Anchor, Outcome
-from lerobot_openspm.perception.tracker import TrackStatus
+from lerobot_openspm.perception.tracking.tracker import TrackStatus
 
 INSTRUCTION = "push the plate to the front of the stove"
 LAYOUT = {"plate": se3.from_yaw([0.3, 0.1, 0.0], 0.0), "stove": se3.from_yaw([-0.1, 0.0, 0.0], 0.0)}
@@ -138,7 +138,7 @@ def test_where_a_push_turns_the_hand_passes_by():
 
 
 def test_a_plate_goes_along_around_the_turn_of_a_push_and_is_let_go_at_its_end():
-    eyes, one = Eyes(LAYOUT), row(turning_push(), instruction=INSTRUCTION)
+    eyes, one = Perception(LAYOUT), row(turning_push(), instruction=INSTRUCTION)
     one.observe(HAND, eyes)
     eyes.visible = 0.0
     ends = [target.T_world_ee for target in one.executor.plan]
@@ -157,7 +157,7 @@ def test_what_is_pushed_goes_along_and_not_what_the_hand_began_relative_to():
         contact, anchor=Anchor("stove", "stove"), T_obj_ee=se3.inverse(T_stove) @ T_plate @ contact.T_obj_ee
     )
     memory = entry(INSTRUCTION, (approach, of_stove, corner, end), LAYOUT)
-    eyes, one = Eyes(LAYOUT), row(memory, instruction=INSTRUCTION)
+    eyes, one = Perception(LAYOUT), row(memory, instruction=INSTRUCTION)
     one.observe(HAND, eyes)
     one.executor.begin(one.executor.plan, HAND, 1)
     watch(one, eyes, Hand(one.executor.plan[1].T_world_ee, 0.0), 1)
@@ -166,7 +166,7 @@ def test_what_is_pushed_goes_along_and_not_what_the_hand_began_relative_to():
 
 def test_a_plate_that_the_hand_has_not_reached_yet_is_not_left_behind():
     for gone, is_fetched in ((0.5 * OUTRUN_M, False), (3 * OUTRUN_M, True)):
-        eyes, one = Eyes(LAYOUT), row(turning_push(), instruction=INSTRUCTION)
+        eyes, one = Perception(LAYOUT), row(turning_push(), instruction=INSTRUCTION)
         one.observe(HAND, eyes)
         contact = one.executor.plan[1].T_world_ee
         one.executor.begin(one.executor.plan, HAND, 1)
@@ -182,7 +182,7 @@ def test_a_hand_that_is_on_its_way_to_the_plate_has_not_outrun_it():
     approach, contact, corner, end = turning_push().key_poses
     far = replace(contact, T_obj_ee=hand_pose(0.0, -0.2, 0.02))
     memory = entry(INSTRUCTION, (approach, far, corner, end), LAYOUT)
-    eyes, one = Eyes(LAYOUT), row(memory, instruction=INSTRUCTION)
+    eyes, one = Perception(LAYOUT), row(memory, instruction=INSTRUCTION)
     one.observe(HAND, eyes)
     met = one.executor.plan[1].T_world_ee
     one.executor.begin(one.executor.plan, HAND, 1)
@@ -199,7 +199,7 @@ def test_where_a_push_turns_the_place_of_meeting_is_not_told_by_its_end():
     straight, turning = push(), replace(turning_push(), outcomes=(outcome,))
     for memory, known in ((straight, True), (turning, False)):
         targets = transfer(memory, LAYOUT, {}, HAND.T_world_ee)
-        pushes = [target for target in targets if target.memory.phase == "push"]
+        pushes = [target for target in targets if target.key_pose.phase == "push"]
         assert all((target.push is not None) is known for target in pushes)
 
 
@@ -207,7 +207,7 @@ def test_what_a_push_leads_to_is_watched_beyond_a_turn():
     approach, contact, _, end = turning_push().key_poses
     corner = replace(end, T_obj_ee=end.T_obj_ee @ se3.from_yaw([0.1, 0.0, 0.0], 0.0))
     memory = entry(INSTRUCTION, (approach, contact, corner, end), LAYOUT)
-    eyes, one = Eyes(LAYOUT), row(memory, instruction=INSTRUCTION)
+    eyes, one = Perception(LAYOUT), row(memory, instruction=INSTRUCTION)
     one.observe(HAND, eyes)
     here = Hand(one.executor.plan[2].T_world_ee, 0.0)
     shown = one.executor.plan[3].T_world_ee
@@ -225,7 +225,7 @@ def pushing(one, eyes, ahead_m):
     one.executor.begin(one.executor.plan, HAND, 1)
     inside = one.executor.plan[1].T_world_ee
     one.observe(Hand(inside, 0.0), eyes)
-    assert one.executor.target.memory.phase == "push"
+    assert one.executor.target.key_pose.phase == "push"
     way = one.executor.target.T_world_ee[:3, 3] - inside[:3, 3]
     T = inside.copy()
     T[:3, 3] += ahead_m * way / np.linalg.norm(way)
@@ -233,7 +233,7 @@ def pushing(one, eyes, ahead_m):
 
 
 def test_the_plate_goes_along_from_where_the_hand_meets_its_rim():
-    eyes, one = Eyes(LAYOUT), row(push(), instruction=INSTRUCTION)
+    eyes, one = Perception(LAYOUT), row(push(), instruction=INSTRUCTION)
     hand = pushing(one, eyes, 0.5 * (LEAD_M - 0.03))
     watch(one, eyes, hand, 1)
     assert one.tracker.held == frozenset()
@@ -244,7 +244,7 @@ def test_the_plate_goes_along_from_where_the_hand_meets_its_rim():
 
 def test_a_plate_that_slides_under_the_hand_is_pushed_on_and_one_left_behind_is_fetched():
     for behind, is_fetched in ((0.4 * LEFT_BEHIND_M, False), (3 * LEFT_BEHIND_M, True)):
-        eyes, one = Eyes(LAYOUT), row(push(), instruction=INSTRUCTION)
+        eyes, one = Perception(LAYOUT), row(push(), instruction=INSTRUCTION)
         hand = pushing(one, eyes, LEAD_M - 0.03 + 0.1)
         watch(one, eyes, hand, 1)
         met = hand.T_world_ee[:3, 3].copy()
@@ -269,7 +269,7 @@ def done(one, eyes, end):
 
 
 def test_a_plate_in_its_place_is_a_success():
-    eyes, one = Eyes(LAYOUT), row(push(), instruction=INSTRUCTION)
+    eyes, one = Perception(LAYOUT), row(push(), instruction=INSTRUCTION)
     goal = se3.from_yaw(se3.apply(LAYOUT["stove"], GOAL[None])[0], 0.0)
     done(one, eyes, goal)
     assert one.status is Status.DONE
@@ -277,7 +277,7 @@ def test_a_plate_in_its_place_is_a_success():
 
 
 def test_a_plate_that_stopped_short_is_pushed_on_until_attempts_are_used_up():
-    eyes, one = Eyes(LAYOUT), row(push(), instruction=INSTRUCTION)
+    eyes, one = Perception(LAYOUT), row(push(), instruction=INSTRUCTION)
     goal = se3.from_yaw(se3.apply(LAYOUT["stove"], GOAL[None])[0], 0.0)
     hand = done(one, eyes, shifted(goal, 0.05))
     for attempt in range(1, ControlSettings().max_attempts + 1):
@@ -294,7 +294,7 @@ def test_a_plate_that_stopped_short_is_pushed_on_until_attempts_are_used_up():
 
 
 def test_what_cannot_be_seen_in_the_end_is_done_and_not_known():
-    eyes, one = Eyes(LAYOUT), row(push(), instruction=INSTRUCTION)
+    eyes, one = Perception(LAYOUT), row(push(), instruction=INSTRUCTION)
     one.observe(HAND, eyes)
     one.executor.begin(one.executor.plan, HAND, 3)
     eyes.visible = 0.0

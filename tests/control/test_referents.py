@@ -2,13 +2,13 @@ import dataclasses
 
 import numpy as np
 import pytest
-from tests.control.test_row import knowledge
+from tests.control.test_controller import knowledge
 
 from lerobot_openspm.control.referents import Referents, references
 from lerobot_openspm.geometry import se3
-from lerobot_openspm.memory.compound import Candidate
+from lerobot_openspm.memory.compose import Candidate
 from lerobot_openspm.memory.entry import MemoryEntry, Reference, RetrievalKey, SubTask
-from lerobot_openspm.perception.types import PoseEstimate
+from lerobot_openspm.types import PoseEstimate
 
 NEXT_TO_RACK = Reference("next to", ("rack",))
 

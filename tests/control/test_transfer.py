@@ -93,15 +93,15 @@ def test_a_symmetric_object_is_met_from_the_side_that_turns_the_hand_least(hand_
 def test_one_choice_of_side_holds_for_all_key_poses_of_an_object():
     memory = entry()
     targets = transfer(memory, memory.layout, {"bowl": np.pi}, hand_pose(0, 0, 0.3, np.pi + 0.3))
-    at_bowl = [t for t in targets if t.memory.anchor.place == "bowl"]
+    at_bowl = [t for t in targets if t.key_pose.anchor.place == "bowl"]
     turned = memory.layout["bowl"] @ se3.from_yaw(np.zeros(3), np.pi)
     for target in at_bowl:
-        assert_allclose(target.T_world_ee, turned @ target.memory.T_obj_ee, atol=1e-9)
+        assert_allclose(target.T_world_ee, turned @ target.key_pose.T_obj_ee, atol=1e-9)
 
 
 def test_contacts_and_the_arrivals_before_them_are_precise():
     targets = transfer(entry(), entry().layout, {}, HOME)
-    assert [(t.memory.phase, t.precise) for t in targets] == [
+    assert [(t.key_pose.phase, t.precise) for t in targets] == [
         ("approach", False), ("approach", True), ("grasp", True), ("lift", False), ("pre-place", False),
         ("place", True), ("release", True), ("retreat", False),
     ]  # fmt: skip
@@ -174,7 +174,7 @@ def test_a_cut_demonstration_ends_with_a_retreat_against_its_arrival():
     whole = entry()
     cut = entry(key_poses=whole.key_poses[:-1])
     targets = transfer(cut, cut.layout, {}, HOME)
-    assert [target.memory.phase for target in targets[-2:]] == ["release", "retreat"]
+    assert [target.key_pose.phase for target in targets[-2:]] == ["release", "retreat"]
     released, left = targets[-2].T_world_ee, targets[-1].T_world_ee
     # It came down from above, so it leaves upwards, turned as it was.
     assert_allclose(left[:3, 3] - released[:3, 3], [0, 0, RETREAT_M], atol=1e-9)
@@ -186,20 +186,20 @@ def test_a_demonstration_cut_with_the_object_in_the_hand_ends_with_letting_go():
     memory = entry(key_poses=entry().key_poses[:6])
     assert memory.key_poses[-1].phase == "place"
     targets = transfer(memory, memory.layout, {}, HOME)
-    assert [target.memory.phase for target in targets[-3:]] == ["place", "release", "retreat"]
+    assert [target.key_pose.phase for target in targets[-3:]] == ["place", "release", "retreat"]
     release, retreat = targets[-2:]
     assert_allclose(release.T_world_ee, targets[5].T_world_ee)
     assert release.memory.dwell
     assert not release.memory.closed
     assert not retreat.memory.closed
-    assert release.memory.n_steps == targets[2].memory.n_steps  # as long as the fingers took to close
+    assert release.memory.n_steps == targets[2].key_pose.n_steps  # as long as the fingers took to close
 
 
 def test_what_is_not_to_be_put_anywhere_is_not_let_go():
     poses = [*entry().key_poses[:3], key_pose("bowl", hand_pose(0, 0, 0.3), "place", closed=True)]
     memory = entry("open the top drawer of the bowl", key_poses=poses)
     targets = transfer(memory, memory.layout, {}, HOME)
-    assert "release" not in [target.memory.phase for target in targets]
+    assert "release" not in [target.key_pose.phase for target in targets]
 
 
 def score(layout, memory=None, **limits):

@@ -2,7 +2,7 @@
 
 import pytest
 
-from lerobot_openspm.envs.tabletop_env import TabletopEnv
+from lerobot_openspm.envs.tabletop.env import TabletopEnv
 
 
 @pytest.fixture

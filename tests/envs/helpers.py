@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from lerobot_openspm.envs.experts import expert_actions
-from lerobot_openspm.envs.tabletop_env import TabletopEnv
+from lerobot_openspm.envs.tabletop.env import TabletopEnv
+from lerobot_openspm.envs.tabletop.experts import expert_actions
 
 
 def run_expert(env: TabletopEnv, seed: int) -> tuple[dict, int]:

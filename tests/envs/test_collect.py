@@ -6,8 +6,8 @@ import pytest
 
 from lerobot_openspm.cli.collect import CollectConfig, SimulatorConfig, collect, main
 from lerobot_openspm.envs.seeds import DEMO_SEED_START, TUNING_SEED_START
-from lerobot_openspm.envs.tabletop_recording import TabletopSource
-from lerobot_openspm.envs.tasks import TASK_NAMES
+from lerobot_openspm.envs.tabletop.recording import TabletopSource
+from lerobot_openspm.envs.tabletop.tasks import TASK_NAMES
 
 ARGUMENTS = ["--env.task=turn_on_stove", "--episodes=2", "--height=128", "--width=128", "--workers=0"]
 

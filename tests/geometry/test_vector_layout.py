@@ -6,7 +6,7 @@ from tests.geometry.strategies import rotvecs
 
 from lerobot_openspm.errors import LayoutError
 from lerobot_openspm.geometry import se3
-from lerobot_openspm.geometry.layout import parse_layout
+from lerobot_openspm.geometry.vector_layout import parse_layout
 
 AXIS_ANGLE = ["axis_angle_x", "axis_angle_y", "axis_angle_z"]
 TABLETOP_STATE = ["x", "y", "z", *AXIS_ANGLE, "finger_left", "finger_right"]

@@ -14,7 +14,7 @@ import pytest
 from tests.hub.loopback_hub import LoopbackHub
 from tests.memory.memory_files import names
 
-from lerobot_openspm.experience import load_experience, save_experience
+from lerobot_openspm.memory.memory import read_memory, write_memory
 
 REPO = "tester/openspm-tabletop"
 
@@ -61,7 +61,7 @@ PULL = """
 root, repo = sys.argv[1:]
 policy = OpenSPMPolicy.from_pretrained(repo)
 pre, post = make_pre_post_processors(policy.config, repo)
-print(json.dumps([act(policy, pre, post, root), len(policy.experience.entries)]))
+print(json.dumps([act(policy, pre, post, root), len(policy.memory.entries)]))
 """
 
 Run = Callable[..., subprocess.CompletedProcess[str]]
@@ -125,8 +125,8 @@ def test_a_changed_memory_is_pushed_again_and_what_it_was_before_is_not_pulled(
 ):
     first = answer(run(ACT + PUSH, checkpoint, tiny_dataset, REPO, home="home_a"))
     changed = Path(shutil.copytree(checkpoint, tmp_path / "changed"))
-    experience = load_experience(changed)
-    save_experience(replace(experience, entries=experience.entries[:5]), changed)
+    memory = read_memory(changed)
+    write_memory(replace(memory, entries=memory.entries[:5]), changed)
     answer(run(ACT + PUSH, changed, tiny_dataset, REPO, home="home_a"))
     files = loopback_hub.files(REPO)
     # LeRobot's upload deletes nothing.

@@ -3,9 +3,9 @@
 import numpy as np
 
 from lerobot_openspm.geometry import se3
+from lerobot_openspm.language.instruction import read_task
+from lerobot_openspm.language.names import TABLE_NAMES
 from lerobot_openspm.memory.entry import Anchor, MemoryEntry, MemoryKeyPose, RetrievalKey
-from lerobot_openspm.memory.instruction import read_task
-from lerobot_openspm.memory.names import TABLE_NAMES
 from lerobot_openspm.memory.retrieval import candidates_for, read_instruction
 from lerobot_openspm.memory.robot import RobotModel
 

@@ -6,8 +6,8 @@ import json
 import numpy as np
 from safetensors.numpy import load, save
 
-from lerobot_openspm.experience_files import lines_to_arrays, read_header, sealed
 from lerobot_openspm.memory.bank import DIGEST_BYTES, HEAD, TAIL, Lines
+from lerobot_openspm.memory.files import lines_to_arrays, read_header, sealed
 
 
 def name_of(directory, kind):

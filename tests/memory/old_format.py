@@ -9,32 +9,32 @@ from safetensors.numpy import save
 
 from lerobot_openspm.geometry.camera import cameras_to_dict
 from lerobot_openspm.memory.store import robot_to_dict
-from lerobot_openspm.perception.store import to_parts
+from lerobot_openspm.perception.objects.store import to_parts
 
 
-def save_version_4(experience, directory):
+def save_version_4(memory, directory):
     arrays, objects = {}, []
-    for model in experience.objects.values():
+    for model in memory.objects.values():
         fields, own = to_parts(model)
         objects.append(fields)
         arrays |= {f"objects.{model.name}.{key}": np.ascontiguousarray(value) for key, value in own.items()}
-    arrays["entries.T_obj_ee"] = np.stack([p.T_obj_ee for e in experience.entries for p in e.key_poses])
-    arrays["entries.T_world_obj"] = np.stack([T for e in experience.entries for T in e.layout.values()])
+    arrays["entries.T_obj_ee"] = np.stack([p.T_obj_ee for e in memory.entries for p in e.key_poses])
+    arrays["entries.T_world_obj"] = np.stack([T for e in memory.entries for T in e.layout.values()])
     blob = save(arrays)
     directory.mkdir(exist_ok=True)
     (directory / "memory.safetensors").write_bytes(blob)
-    (directory / "cameras.json").write_text(json.dumps(cameras_to_dict(experience.cameras)))
+    (directory / "cameras.json").write_text(json.dumps(cameras_to_dict(memory.cameras)))
     memory = {
         "format": "openspm-memory",
         "version": 4,
         "arrays": {"file": "memory.safetensors", "sha256": hashlib.sha256(blob).hexdigest()},
-        "perception": experience.perception,
-        "segmentation": experience.segmentation,
-        "shape": experience.shape,
-        "simulator_objects": list(experience.simulator_objects),
-        "robot": robot_to_dict(experience.robot),
+        "perception": memory.perception,
+        "segmentation": memory.segmentation,
+        "shape": memory.shape,
+        "simulator_objects": list(memory.simulator_objects),
+        "robot": robot_to_dict(memory.robot),
         "objects": objects,
-        "entries": [_row(entry) for entry in experience.entries],
+        "entries": [_row(entry) for entry in memory.entries],
     }
     (directory / "memory.json").write_text(json.dumps(memory))
 

@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 from tests.memory.builders import entry, hand_pose, key_pose, pick_and_place
 
-from lerobot_openspm.envs.tasks import ANY_TASK
+from lerobot_openspm.envs.tabletop.tasks import ANY_TASK
 from lerobot_openspm.errors import InstructionError
 from lerobot_openspm.geometry import se3
-from lerobot_openspm.memory.compound import parts, phrase, plan_parts, sub_task_index
+from lerobot_openspm.language.instruction import parse_instruction
+from lerobot_openspm.memory.compose import parts, phrase, plan_parts, sub_task_index
 from lerobot_openspm.memory.entry import Reference, SubTask
-from lerobot_openspm.memory.instruction import parse_instruction
 
 DRAWER = "open the top drawer and put the bowl inside"
 

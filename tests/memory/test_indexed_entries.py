@@ -6,6 +6,7 @@ from tests.memory.builders import entry, semantic_candidates
 
 from lerobot_openspm.bench.synthetic_keys import distinct_keys, said_otherwise
 from lerobot_openspm.errors import InstructionError
+from lerobot_openspm.language.instruction import parse_instruction
 from lerobot_openspm.memory import indexed_entries as module
 from lerobot_openspm.memory.columns import columns_of, key_digest
 from lerobot_openspm.memory.entry import RetrievalKey, SubTask
@@ -17,7 +18,6 @@ from lerobot_openspm.memory.indexed_entries import (
     indexed,
     near,
 )
-from lerobot_openspm.memory.instruction import parse_instruction
 from lerobot_openspm.memory.retrieval import MIN_SEMANTIC, semantic_score
 
 BOWL, STOVE = "put the bowl on the plate", "turn on the stove"
@@ -96,7 +96,7 @@ def test_retrieval_is_that_of_all_entries(many):
 
 
 def test_what_is_unknown_is_refused_with_what_is_nearest(many):
-    with pytest.raises(InstructionError, match="holds no experience"):
+    with pytest.raises(InstructionError, match="holds no memory"):
         semantic_candidates("put the trombone on the xylophone", indexed(many))
 
 

@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from lerobot_openspm.language.instruction import parse_instruction
 from lerobot_openspm.memory.entry import Reference, SubTask
-from lerobot_openspm.memory.instruction import parse_instruction
 from lerobot_openspm.memory.key_vector import DIMENSIONS, SCHEME, key_vector, key_vectors
 
 names = st.text("abc ", max_size=8).map(lambda text: " ".join(text.split()))

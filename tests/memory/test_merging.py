@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 from tests.memory.builders import entry, key_pose, pick_and_place
-from tests.memory.experiences import SLIDE
+from tests.memory.memories import SLIDE
 
 from lerobot_openspm.geometry import se3
 from lerobot_openspm.memory.merging import mean_pose, merge, merge_near_duplicates

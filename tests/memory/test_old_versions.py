@@ -2,11 +2,11 @@ from dataclasses import replace
 
 import pytest
 from tests.memory.builders import entry, key_pose, pick_and_place
-from tests.memory.experiences import experience
+from tests.memory.memories import a_memory
 from tests.memory.old_format import save_version_4
 
-from lerobot_openspm.experience import load_experience
 from lerobot_openspm.geometry import se3
+from lerobot_openspm.memory.memory import read_memory
 from lerobot_openspm.memory.old_versions import sub_tasks_of_phases
 
 PUT = ["approach", "grasp", "lift", "pre-place", "place", "release"]
@@ -36,6 +36,6 @@ def test_the_sub_tasks_of_an_old_memorys_key_poses_are_derived(tmp_path):
     opening = [key_pose("cabinet", T, phase) for phase in OPEN]
     putting = [replace(pose, sub_task=1) for pose in pick_and_place()]
     made = entry(instruction, [*opening, *putting])
-    save_version_4(experience(entries=(made,)), tmp_path)
-    loaded = load_experience(tmp_path).entries[0]
+    save_version_4(a_memory(entries=(made,)), tmp_path)
+    loaded = read_memory(tmp_path).entries[0]
     assert [pose.sub_task for pose in loaded.key_poses] == [0] * 6 + [1] * 8

@@ -3,7 +3,7 @@ import json
 import numpy as np
 import pytest
 from tests.memory.builders import entry
-from tests.memory.experiences import same
+from tests.memory.memories import same
 
 from lerobot_openspm.memory.entry import WORLD, Anchor, Outcome
 from lerobot_openspm.memory.fields import MALFORMED

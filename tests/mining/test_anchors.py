@@ -4,8 +4,8 @@ from numpy.testing import assert_allclose
 from tests.memory.builders import hand_pose
 
 from lerobot_openspm.geometry import se3
+from lerobot_openspm.language.instruction import parse_instruction
 from lerobot_openspm.memory.entry import WORLD, Anchor
-from lerobot_openspm.memory.instruction import parse_instruction
 from lerobot_openspm.mining.anchors import Demonstration, align_symmetric, consensus, qualities, roles
 from lerobot_openspm.mining.key_poses import KeyPose
 

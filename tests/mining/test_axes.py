@@ -6,8 +6,8 @@ from numpy.testing import assert_allclose
 from tests.memory.builders import hand_pose
 
 from lerobot_openspm.geometry import se3
+from lerobot_openspm.language.instruction import parse_instruction
 from lerobot_openspm.memory.entry import Anchor, Axis
-from lerobot_openspm.memory.instruction import parse_instruction
 from lerobot_openspm.mining.anchors import Demonstration, consensus
 from lerobot_openspm.mining.axes import constrained_axes
 from lerobot_openspm.mining.key_poses import KeyPose

@@ -6,7 +6,7 @@ from lerobot.datasets import LeRobotDataset
 
 from lerobot_openspm.errors import ObservationError
 from lerobot_openspm.geometry.camera import Camera
-from lerobot_openspm.geometry.layout import parse_layout
+from lerobot_openspm.geometry.vector_layout import parse_layout
 from lerobot_openspm.mining.dataset import Demonstrations
 
 SIZE = 64

@@ -4,8 +4,8 @@ from numpy.testing import assert_allclose
 from tests.mining.test_anchors import SUB_TASKS, demonstrations
 
 from lerobot_openspm.geometry import se3
+from lerobot_openspm.language.instruction import parse_instruction
 from lerobot_openspm.memory.entry import WORLD
-from lerobot_openspm.memory.instruction import parse_instruction
 from lerobot_openspm.mining.anchors import Demonstration
 from lerobot_openspm.mining.outcomes import LEAST_TOLERANCE_M, MOST_SPREAD_M, carried_to, outcomes
 

@@ -8,8 +8,8 @@ from tests.memory.builders import robot
 from tests.mining.episodes import Drawer, pick_and_place
 
 from lerobot_openspm.geometry import se3
-from lerobot_openspm.memory.compound import parts
-from lerobot_openspm.memory.instruction import parse_instruction
+from lerobot_openspm.language.instruction import parse_instruction
+from lerobot_openspm.memory.compose import parts
 from lerobot_openspm.mining.entries import task_entries
 from lerobot_openspm.mining.key_poses import find_key_poses
 from lerobot_openspm.mining.mined import MinedEpisode

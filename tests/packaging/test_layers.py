@@ -135,7 +135,7 @@ def test_the_method_needs_neither_lerobot_nor_mujoco(part: str):
     ("code", "expected"),
     [
         ("from lerobot_openspm import control", ["lerobot_openspm.control"]),
-        ("from ..control import row", ["lerobot_openspm.control.row"]),
+        ("from ..control import row", ["lerobot_openspm.control.controller"]),
         ("def f():\n    import mujoco", []),
         ("try:\n    import mujoco\nexcept ImportError:\n    pass", ["mujoco"]),
     ],

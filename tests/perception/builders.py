@@ -7,7 +7,7 @@ import numpy as np
 from lerobot_openspm.geometry import se3
 from lerobot_openspm.geometry.camera import Camera
 from lerobot_openspm.perception.colour import N_BINS
-from lerobot_openspm.perception.model import BoxModel, ObjectModel, Patch, PatchModel, Probe
+from lerobot_openspm.perception.objects.model import BoxModel, ObjectModel, Patch, PatchModel, Probe
 
 
 def model(name, seed=0, yaw_period=2 * np.pi):

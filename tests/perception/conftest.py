@@ -9,9 +9,9 @@ import pytest
 from safetensors.numpy import load_file, save_file
 from tests.perception.drawn_world import demonstration
 
-from lerobot_openspm.perception import store
-from lerobot_openspm.perception.learning import learn_objects
-from lerobot_openspm.perception.model import ObjectModel
+from lerobot_openspm.perception.objects import store
+from lerobot_openspm.perception.objects.learning import learn_objects
+from lerobot_openspm.perception.objects.model import ObjectModel
 
 
 def learn(folder: Path) -> None:

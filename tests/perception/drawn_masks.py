@@ -8,9 +8,9 @@ from tests.perception.drawn_world import DISTRACTOR, SHAPES, SIZE, cameras, view
 
 from lerobot_openspm.geometry import se3
 from lerobot_openspm.geometry.camera import project, ray_directions
-from lerobot_openspm.perception.box import Box
+from lerobot_openspm.perception.objects.box.box import Box
 from lerobot_openspm.perception.segmentation.given import GivenSegmenter
-from lerobot_openspm.perception.types import Segmentation, View
+from lerobot_openspm.types import Segmentation, View
 
 LABELS = {"block": 1, "cup": 2, "distractor": 3}
 FINE = 4

@@ -7,7 +7,7 @@ import numpy as np
 
 from lerobot_openspm.geometry import se3
 from lerobot_openspm.geometry.camera import Camera, project
-from lerobot_openspm.perception.types import Hint, Scene, View
+from lerobot_openspm.types import ContactCue, Scene, View
 
 SIZE = 160
 TABLE = (196, 166, 128)
@@ -81,7 +81,7 @@ def demonstration(rng: np.random.Generator, wrong: bool = False) -> Scene:
         aside = np.array([0.2, 0.0, 0.0])
         grasp, release = release + aside, grasp - aside
     later = poses | {"cup": se3.from_yaw(poses["block"][:3, 3] + [0, 0, 0.05], 0.0)}
-    hints = (Hint("cup", grasp, "grasp"), Hint("block", release, "release"))
+    hints = (ContactCue("cup", grasp, "grasp"), ContactCue("block", release, "release"))
     return Scene(views_of(poses), hints, views_of(later))
 
 

@@ -7,10 +7,10 @@ import pytest
 from tests.perception.builders import model
 from tests.perception.drawn_world import demonstration, draw_poses
 
-from lerobot_openspm.perception.learning import learn_objects
-from lerobot_openspm.perception.model import PatchModel
-from lerobot_openspm.perception.patch_learning import hardly_moving
-from lerobot_openspm.perception.types import Hint, Scene
+from lerobot_openspm.perception.objects.learning import learn_objects
+from lerobot_openspm.perception.objects.model import PatchModel
+from lerobot_openspm.perception.objects.patches.learn import hardly_moving
+from lerobot_openspm.types import ContactCue, Scene
 
 # How far to either side of the middle objects stand, along both axes.
 NEAR_M, FAR_M = 0.007, 0.06
@@ -22,7 +22,9 @@ def scenes(sides_m: dict[str, float], touches: int, places: int = 1) -> list[Sce
         Scene(
             {},
             tuple(
-                Hint(name, np.array([(-1) ** i * side, (-1) ** i * side, 0.1]), "grasp", f"{name} {place}")
+                ContactCue(
+                    name, np.array([(-1) ** i * side, (-1) ** i * side, 0.1]), "grasp", f"{name} {place}"
+                )
                 for name, side in sides_m.items()
             ),
         )

@@ -4,9 +4,9 @@ from tests.perception.drawn_world import cameras, draw_poses, views_of
 
 from lerobot_openspm.geometry import se3
 from lerobot_openspm.geometry.camera import project
-from lerobot_openspm.perception.localise import localise
+from lerobot_openspm.perception.objects.localise import localise
 from lerobot_openspm.perception.occlusion import hand_mask
-from lerobot_openspm.perception.types import View
+from lerobot_openspm.types import View
 
 DOWN = np.diag([1.0, -1.0, -1.0])
 

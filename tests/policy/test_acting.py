@@ -122,7 +122,7 @@ def test_an_object_that_is_out_of_sight_stops_the_hand(
 
 
 def test_live_environments_act_the_same_together_and_alone(policy: OpenSPMPolicy):
-    from lerobot_openspm.envs.tabletop_env import TabletopEnv
+    from lerobot_openspm.envs.tabletop.env import TabletopEnv
 
     seeds, steps = (2_000_003, 2_000_004, 2_000_005), 12
     envs = [TabletopEnv("turn_on_stove", observation_height=128, observation_width=128) for _ in seeds]

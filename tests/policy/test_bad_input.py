@@ -25,7 +25,7 @@ from lerobot_openspm.errors import (
     OpenSPMError,
     PerceptionError,
 )
-from lerobot_openspm.experience import VERSION
+from lerobot_openspm.memory.memory import VERSION
 from lerobot_openspm.modeling_openspm import OpenSPMPolicy
 
 FRONT = "observation.images.front"
@@ -176,8 +176,8 @@ def test_a_changed_memory_is_refused(
 def test_a_checkpoint_loads_from_any_folder(copy: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.chdir(tmp_path)
     policy = OpenSPMPolicy.from_pretrained(copy)
-    assert policy.experience is not None
-    assert len(policy.experience.cameras) == 3
+    assert policy.memory is not None
+    assert len(policy.memory.cameras) == 3
 
 
 def test_a_path_that_is_no_checkpoint_is_named():
@@ -186,7 +186,7 @@ def test_a_path_that_is_no_checkpoint_is_named():
 
 
 def test_nothing_is_saved_without_a_memory(policy: OpenSPMPolicy, tmp_path: Path):
-    policy.experience = None
+    policy.memory = None
     with pytest.raises(MemoryFormatError, match="this policy has no memory"):
         policy.save_pretrained(tmp_path / "out")
     assert not (tmp_path / "out/memory.json").exists()
@@ -304,8 +304,8 @@ def test_a_calibration_that_was_changed_is_refused_until_somebody_means_it(
     file.write_text(json.dumps(data))
     with pytest.raises(CalibrationError, match=r"cameras\.json: its checksum.*--policy\.cameras="):
         load(copy, cameras=None)
-    experience = load(copy, cameras=str(file)).require_experience()
-    assert experience.cameras[FRONT].fx == data["cameras"][FRONT]["fx"]
+    memory = load(copy, cameras=str(file)).require_memory()
+    assert memory.cameras[FRONT].fx == data["cameras"][FRONT]["fx"]
 
 
 def test_an_object_that_perception_does_not_know_is_refused_when_it_is_loaded(

@@ -9,7 +9,7 @@ from lerobot.envs.utils import preprocess_observation
 from tests.policy.conftest import Frame, batch_of
 
 from lerobot_openspm.control.executor import Status
-from lerobot_openspm.envs.tabletop_env import TabletopEnv
+from lerobot_openspm.envs.tabletop.env import TabletopEnv
 from lerobot_openspm.modeling_openspm import OpenSPMPolicy
 
 FRONT = "observation.images.front"

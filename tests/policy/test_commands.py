@@ -8,7 +8,7 @@ import pytest
 from tests.memory.memory_files import names
 from tests.policy.lerobot_commands import call_lerobot, pretrained, train_arguments, training_options
 
-from lerobot_openspm.experience import load_experience
+from lerobot_openspm.memory.memory import read_memory
 
 BOWL, STOVE = "put the bowl on the plate", "turn on the stove"
 PUSH = "push the plate to the front of the stove"
@@ -16,7 +16,7 @@ PUSH = "push the plate to the front of the stove"
 
 def sources(checkpoint: Path) -> list[tuple[str, str]]:
     """Instruction and dataset of every entry of a checkpoint's memory."""
-    return [(e.language, e.source) for e in load_experience(checkpoint).entries]
+    return [(e.language, e.source) for e in read_memory(checkpoint).entries]
 
 
 def train(*options: str) -> None:
@@ -91,6 +91,6 @@ def test_fine_tuning_appends_another_dataset(checkpoint: Path, other_dataset: Pa
 def test_the_oracle_ablation_trains_and_evaluates(tiny_dataset: Path, tmp_path: Path):
     output = tmp_path / "run"
     train(*training_options(tiny_dataset, output, 10), "--policy.perception=oracle")
-    assert load_experience(pretrained(output)).perception == "oracle"
+    assert read_memory(pretrained(output)).perception == "oracle"
     summary, _ = evaluate(pretrained(output), tmp_path / "eval", "--env.object_poses=true")
     assert summary["overall"]["n_episodes"] == 2

@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from lerobot_openspm.cli.mine import MineConfig
 from lerobot_openspm.configuration_openspm import OpenSPMConfig
 from lerobot_openspm.errors import LayoutError
-from lerobot_openspm.observation import split_batch
+from lerobot_openspm.perception.observation import split_batch
 
 FINGERS = ["finger_left", "finger_right"]
 

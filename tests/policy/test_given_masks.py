@@ -16,16 +16,16 @@ from tests.policy.conftest import NAME
 from tests.policy.lerobot_commands import CALIBRATION
 
 from lerobot_openspm.configuration_openspm import OpenSPMConfig
-from lerobot_openspm.envs import scene
-from lerobot_openspm.envs.tabletop_env import TabletopEnv
+from lerobot_openspm.envs.tabletop import scene
+from lerobot_openspm.envs.tabletop.env import TabletopEnv
 from lerobot_openspm.errors import MemoryFormatError, PerceptionError
-from lerobot_openspm.experience import load_experience
 from lerobot_openspm.geometry.camera import Camera
+from lerobot_openspm.memory.memory import read_memory
 from lerobot_openspm.mining.dataset import Demonstrations
 from lerobot_openspm.mining.signals import Episode
 from lerobot_openspm.modeling_openspm import OpenSPMPolicy
-from lerobot_openspm.perception.model import BoxModel
-from lerobot_openspm.perception.types import View
+from lerobot_openspm.perception.objects.model import BoxModel
+from lerobot_openspm.types import View
 
 LABELS = {noun: scene.OBJECT_LABELS[noun] for noun in ("bowl", "plate", "stove")}
 TUNING_SEED = 2_100_000
@@ -115,13 +115,11 @@ def succeeds(policy: OpenSPMPolicy, task: str, seed: int) -> bool:
 
 
 def test_given_masks_are_learned_as_boxes(policy: OpenSPMPolicy):
-    experience = policy.experience
-    assert experience is not None
-    assert (experience.segmentation, experience.shape) == ("given", "box")
-    assert {name: type(model) for name, model in experience.objects.items()} == dict.fromkeys(
-        LABELS, BoxModel
-    )
-    assert len(experience.entries) == 6
+    memory = policy.memory
+    assert memory is not None
+    assert (memory.segmentation, memory.shape) == ("given", "box")
+    assert {name: type(model) for name, model in memory.objects.items()} == dict.fromkeys(LABELS, BoxModel)
+    assert len(memory.entries) == 6
 
 
 @pytest.mark.slow
@@ -142,7 +140,7 @@ def test_without_masks_in_the_observation_the_option_is_named(policy: OpenSPMPol
 def test_a_memory_of_masks_is_not_read_as_one_of_colours(mined: Path):
     config = PreTrainedConfig.from_pretrained(mined)
     assert isinstance(config, OpenSPMConfig)
-    assert load_experience(mined).segmentation == "given"
+    assert read_memory(mined).segmentation == "given"
     config.segmentation, config.mask_labels, config.shape = "demonstrations", None, "demonstrations"
     with pytest.raises(MemoryFormatError, match=r"segmentation=given, got --policy\.segmentation=demonstr"):
         OpenSPMPolicy.from_pretrained(mined, config=config)

@@ -164,8 +164,8 @@ def test_held_out_episodes_are_neither_remembered_nor_drawn(
     assert mined == Counter(range(6)), "every episode is mined once"
     assert set(seen) == set(kept), "of what is held out no image is looked at"
     assert max(seen.values()) <= 2
-    assert policy.experience is not None
-    assert sorted(e.source for e in policy.experience.entries) == [f"{tiny_meta.repo_id}#{i}" for i in kept]
+    assert policy.memory is not None
+    assert sorted(e.source for e in policy.memory.entries) == [f"{tiny_meta.repo_id}#{i}" for i in kept]
 
     # Unperturbed, every sample is known by its numbers.
     plain = {"perturbation_m": 0.0, "perturbation_rad": 0.0}
@@ -190,8 +190,8 @@ def test_an_episode_that_does_not_exist_is_named(tiny_meta: LeRobotDatasetMetada
 
 
 def languages(policy: OpenSPMPolicy) -> list[str]:
-    assert policy.experience is not None
-    return [entry.language for entry in policy.experience.entries]
+    assert policy.memory is not None
+    return [entry.language for entry in policy.memory.entries]
 
 
 @pytest.mark.parametrize(

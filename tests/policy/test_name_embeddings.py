@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 import torch
-from tests.memory.text_model import make_model
+from tests.language.text_model import make_model
 from tests.policy.conftest import Frame, batch_of
 
 from lerobot_openspm.configuration_openspm import OpenSPMConfig
@@ -27,7 +27,7 @@ def test_a_name_that_only_embeddings_know_is_acted_on(
     batch = asked(recorded, "put the bowl on the plate", "put the zorb on the plate")
     without = load()
     without.select_action(batch)
-    assert "no experience" in without.rows[0].refusal
+    assert "no memory" in without.rows[0].refusal
     policy = load(name_embeddings=str(model))
     action = policy.select_action(batch)
     assert torch.isfinite(action).all()

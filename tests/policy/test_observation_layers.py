@@ -6,13 +6,13 @@ import torch
 from lerobot.envs.utils import preprocess_observation
 
 from lerobot_openspm.configuration_openspm import OpenSPMConfig
-from lerobot_openspm.envs import scene
 from lerobot_openspm.envs.calibration import calibration_document
-from lerobot_openspm.envs.configuration_tabletop import TabletopEnvConfig
+from lerobot_openspm.envs.tabletop import scene
+from lerobot_openspm.envs.tabletop.configuration import TabletopEnvConfig
 from lerobot_openspm.errors import ObservationError
 from lerobot_openspm.geometry.camera import cameras_from_dict
-from lerobot_openspm.geometry.layout import parse_layout
-from lerobot_openspm.observation import split_batch
+from lerobot_openspm.geometry.vector_layout import parse_layout
+from lerobot_openspm.perception.observation import split_batch
 from lerobot_openspm.perception.segmentation.given import GivenSegmenter
 from lerobot_openspm.processor_openspm import make_openspm_pre_post_processors
 

@@ -8,13 +8,13 @@ from tests.policy.conftest import Frame, batch_of
 
 from lerobot_openspm.control.executor import Status
 from lerobot_openspm.errors import OpenSPMError
-from lerobot_openspm.experience import load_experience
+from lerobot_openspm.memory.memory import read_memory
 from lerobot_openspm.modeling_openspm import OpenSPMPolicy
 
 
 def trials(policy: OpenSPMPolicy) -> dict[str, tuple[int, int]]:
     """Trials and successes by source, of entries that have any."""
-    return {e.source: (e.trials, e.successes) for e in policy.require_experience().entries if e.trials}
+    return {e.source: (e.trials, e.successes) for e in policy.require_memory().entries if e.trials}
 
 
 def test_outcomes_change_the_entries_that_were_acted_by_and_are_saved(
@@ -26,7 +26,7 @@ def test_outcomes_change_the_entries_that_were_acted_by_and_are_saved(
     bowl, stove = used[0][0], used[1][0]
     policy.report_outcomes([False, True, None])
     assert trials(policy) == {bowl.source: (1, 0), stove.source: (1, 1)}
-    quality = {e.source: e.quality for e in policy.require_experience().entries}
+    quality = {e.source: e.quality for e in policy.require_memory().entries}
     assert quality[bowl.source] < bowl.quality
     assert stove.quality < quality[stove.source]
     # An episode counts once; what was not known may follow later.
@@ -38,7 +38,7 @@ def test_outcomes_change_the_entries_that_were_acted_by_and_are_saved(
     expected[third] = (tried + 1, succeeded + 1)
     assert trials(policy) == expected
     policy.save_pretrained(tmp_path)
-    saved = {e.source: (e.trials, e.successes) for e in load_experience(tmp_path).entries if e.trials}
+    saved = {e.source: (e.trials, e.successes) for e in read_memory(tmp_path).entries if e.trials}
     assert saved == expected
 
 

@@ -18,7 +18,7 @@ from tests.policy.lerobot_commands import CALIBRATION
 
 from lerobot_openspm.configuration_openspm import OpenSPMConfig
 from lerobot_openspm.memory.entry import MemoryEntry
-from lerobot_openspm.training import dataset_processor, experience_of, open_demonstrations, training_set
+from lerobot_openspm.training import dataset_processor, memory_of, open_demonstrations, training_set
 
 PUBLIC = "local/public_layout"
 CAMERAS = {
@@ -96,9 +96,9 @@ def test_the_same_key_poses_are_mined_whatever_names_and_rate_the_card_gives(
         config(calibrations["own"], memory_episodes=EPISODES),
         config(calibrations["public"], **PUBLIC_ROTATION),
     )
-    own = experience_of(dataset_processor(tiny_meta, ours).mine(), ours)
+    own = memory_of(dataset_processor(tiny_meta, ours).mine(), ours)
     mined = dataset_processor(public_meta, theirs).mine()
-    found = experience_of(mined, theirs)
+    found = memory_of(mined, theirs)
     assert len(found.entries) == len(own.entries) == len(EPISODES)
     for entry, same in zip(own.entries, found.entries, strict=True):
         assert told(entry) == told(same)

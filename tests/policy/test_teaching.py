@@ -14,7 +14,7 @@ from tests.policy.conftest import NAME, Frame, batch_of
 
 from lerobot_openspm import teaching
 from lerobot_openspm.errors import DatasetError, MemoryFormatError
-from lerobot_openspm.experience import Experience
+from lerobot_openspm.memory.memory import Memory
 from lerobot_openspm.modeling_openspm import OpenSPMPolicy
 
 PUSH = "push the plate to the front of the stove"
@@ -49,32 +49,31 @@ def test_a_taught_memory_travels_with_the_checkpoint(
 ):
     lesson = policy.teach(push_meta)
     policy.save_pretrained(tmp_path)
-    entries = load(tmp_path).require_experience().entries
+    entries = load(tmp_path).require_memory().entries
     assert [entry.source for entry in entries[-2:]] == [entry.source for entry in lesson.entries]
     assert len(entries) == 8
 
 
-def without_stove(experience: Experience, episodes: tuple[int, ...]) -> Experience:
+def without_stove(memory: Memory, episodes: tuple[int, ...]) -> Memory:
     """The same where the stove was not found in some of the episodes."""
     unseen = {f"{NAME}#{index}" for index in episodes}
     entries = [
-        replace(e, layout={"plate": e.layout["plate"]}) if e.source in unseen else e
-        for e in experience.entries
+        replace(e, layout={"plate": e.layout["plate"]}) if e.source in unseen else e for e in memory.entries
     ]
-    return replace(experience, entries=tuple(entries))
+    return replace(memory, entries=tuple(entries))
 
 
 @pytest.mark.parametrize("hidden", [(1,), (0, 1)])
 def test_demonstrations_that_do_not_show_an_object_are_not_believed(
     policy: OpenSPMPolicy, push_meta: Any, monkeypatch: pytest.MonkeyPatch, hidden: tuple[int, ...]
 ):
-    remember = teaching.experience_of
-    monkeypatch.setattr(teaching, "experience_of", lambda *given: without_stove(remember(*given), hidden))
-    before = policy.experience
+    remember = teaching.memory_of
+    monkeypatch.setattr(teaching, "memory_of", lambda *given: without_stove(remember(*given), hidden))
+    before = policy.memory
     if len(hidden) == 2:
         with pytest.raises(DatasetError, match=r"not learned from episodes \[0, 1\].*could not find stove"):
             policy.teach(push_meta)
-        assert policy.experience is before
+        assert policy.memory is before
     else:
         lesson = policy.teach(push_meta)
         assert (len(lesson.entries), lesson.skipped) == (1, (1,))
@@ -83,17 +82,17 @@ def test_demonstrations_that_do_not_show_an_object_are_not_believed(
 def test_demonstrations_of_another_robot_are_refused(
     policy: OpenSPMPolicy, push_meta: Any, monkeypatch: pytest.MonkeyPatch
 ):
-    remember = teaching.experience_of
+    remember = teaching.memory_of
 
-    def of_another(*given: Any) -> Experience:
+    def of_another(*given: Any) -> Memory:
         mined = remember(*given)
         return replace(mined, robot=replace(mined.robot, close_command=-mined.robot.close_command))
 
-    monkeypatch.setattr(teaching, "experience_of", of_another)
-    before = policy.experience
+    monkeypatch.setattr(teaching, "memory_of", of_another)
+    before = policy.memory
     with pytest.raises(MemoryFormatError, match="another robot or controller"):
         policy.teach(push_meta)
-    assert policy.experience is before
+    assert policy.memory is before
 
 
 @pytest.mark.parametrize(

@@ -11,11 +11,11 @@ from typing import Protocol
 import numpy as np
 import torch
 
+from lerobot_openspm.control.controller import EpisodeController
 from lerobot_openspm.control.executor import Hand
-from lerobot_openspm.control.row import Row
 from lerobot_openspm.envs.recording import pose_vector
 from lerobot_openspm.modeling_openspm import OpenSPMPolicy
-from lerobot_openspm.observation import Observation
+from lerobot_openspm.perception.observation import Observation
 
 IMAGES = "observation.images."
 
@@ -86,14 +86,14 @@ class Episode:
 
     success: bool
     actions: np.ndarray
-    row: Row
+    row: EpisodeController
 
 
 def run_episode(
     policy: OpenSPMPolicy,
     world: World,
     interfere: Callable[[int], None] | None = None,
-    note: Callable[[int, Observation, Row], None] | None = None,
+    note: Callable[[int, Observation, EpisodeController], None] | None = None,
 ) -> Episode:
     """Act from the world's present state until it says that the episode is over.
 

@@ -23,7 +23,7 @@ from lerobot_openspm.bench.contact_events import PHASES, contact_events
 from lerobot_openspm.bench.recording import OPERATORS, Job, Recording, record
 from lerobot_openspm.bench.results import ResultOption
 from lerobot_openspm.envs.recording import Names, source
-from lerobot_openspm.geometry.layout import RotationKind, parse_layout
+from lerobot_openspm.geometry.vector_layout import RotationKind, parse_layout
 from lerobot_openspm.mining.key_poses import find_key_poses
 from lerobot_openspm.mining.signals import Episode, observe_robot
 

@@ -15,11 +15,11 @@ import numpy as np
 from lerobot_openspm.bench.results import ResultOption
 from lerobot_openspm.bench.taught_words import acted_entries, teach_each
 from lerobot_openspm.errors import InstructionError, OpenSPMError
-from lerobot_openspm.memory.compound import plan_parts
+from lerobot_openspm.language.instruction import parse_instruction
+from lerobot_openspm.language.meaning import same_meaning
+from lerobot_openspm.language.names import TABLE_NAMES, Model2VecNames, NameSimilarity
+from lerobot_openspm.memory.compose import plan_parts
 from lerobot_openspm.memory.entry import MemoryEntry, Reference, RetrievalKey, SubTask
-from lerobot_openspm.memory.instruction import parse_instruction
-from lerobot_openspm.memory.meaning import same_meaning
-from lerobot_openspm.memory.names import TABLE_NAMES, Model2VecNames, NameSimilarity
 
 # The instructions and their elements, which were checked by reading every line.
 KNOWN, PARAPHRASES, OUT_OF_DOMAIN = "known.json", "paraphrases.json", "out_of_domain.json"
@@ -174,7 +174,10 @@ def measure(options: Options) -> dict[str, Any]:
 
 
 def _measure_acting(
-    everyday: Sequence[Row], paraphrases: Sequence[Row], names: NameSimilarity, failures: dict[str, list[str]]
+    everyday: Sequence[Row],
+    paraphrases: Sequence[Row],
+    names: NameSimilarity,
+    failures: dict[str, list[str]],
 ) -> dict[str, Any]:
     """What the policy acts by after one drawn demonstration each, with everything but the words against it.
 

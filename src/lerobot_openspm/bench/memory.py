@@ -14,10 +14,10 @@ import numpy as np
 from lerobot_openspm.bench.results import ResultOption
 from lerobot_openspm.bench.synthetic_bank import synthetic_experience
 from lerobot_openspm.bench.synthetic_keys import Key, distinct_keys, said_otherwise
-from lerobot_openspm.experience import load_experience, save_experience
 from lerobot_openspm.memory.index import ExactIndex, FaissIndex, KeyIndex, make_index
 from lerobot_openspm.memory.indexed_entries import NEAREST_KEYS, IndexedEntries
 from lerobot_openspm.memory.key_vector import DIMENSIONS, Vectors, key_vectors
+from lerobot_openspm.memory.memory import read_memory, write_memory
 from lerobot_openspm.memory.retrieval import semantic_score
 
 WARM_UP = 100
@@ -149,15 +149,15 @@ def _semantic_recall(
 
 def _load(count: int, n_queries: int, rng: np.random.Generator) -> tuple[float, np.ndarray]:
     """Median of three loads in seconds; milliseconds of finding the entries for an instruction in it."""
-    experience = synthetic_experience(count, rng)
+    memory = synthetic_experience(count, rng)
     asked = [
-        said_otherwise(experience.entries[i].key.sub_tasks, rng) for i in rng.integers(count, size=n_queries)
+        said_otherwise(memory.entries[i].key.sub_tasks, rng) for i in rng.integers(count, size=n_queries)
     ]
     with TemporaryDirectory() as folder:
-        save_experience(experience, Path(folder))
-        del experience
-        times = [_seconds(lambda: load_experience(Path(folder)))[0] for _ in range(3)]
-        bank = IndexedEntries(load_experience(Path(folder)).entries)
+        write_memory(memory, Path(folder))
+        del memory
+        times = [_seconds(lambda: read_memory(Path(folder)))[0] for _ in range(3)]
+        bank = IndexedEntries(read_memory(Path(folder)).entries)
     near_s = [_seconds(lambda key=key: bank.near(key, semantic_score))[0] for key in asked]
     return float(np.median(times)), 1000 * np.array(near_s)
 

@@ -8,20 +8,20 @@ from __future__ import annotations
 
 import numpy as np
 
-from lerobot_openspm.experience import Experience
 from lerobot_openspm.geometry import se3
+from lerobot_openspm.memory.memory import Memory
 from lerobot_openspm.mining.dataset import Demonstrations
 from lerobot_openspm.perception.oracle import name_simulator_poses
 
 
-def offset(experience: Experience, name: str, demonstrations: Demonstrations) -> np.ndarray:
+def offset(memory: Memory, name: str, demonstrations: Demonstrations) -> np.ndarray:
     """The model's frame in the simulator's, ``T_sim_obj``, as the median over the demonstrations."""
-    period, relative = experience.objects[name].yaw_period, []
-    for entry in experience.entries:
+    period, relative = memory.objects[name].yaw_period, []
+    for entry in memory.entries:
         if name in entry.layout:
             episode = demonstrations.episodes([int(entry.source.rsplit("#", 1)[1])])[0]
             poses = demonstrations.simulator_poses(episode, 0)
-            truth = upright(name_simulator_poses(poses, [name], experience.objects)[name])
+            truth = upright(name_simulator_poses(poses, [name], memory.objects)[name])
             equivalents = [se3.inverse(truth) @ T for T in se3.yaw_equivalents(entry.layout[name], period)]
             relative.append(min(equivalents, key=lambda T: abs(float(se3.yaw_of(T)))))
     relative = np.stack(relative)

@@ -17,18 +17,18 @@ from lerobot.datasets import LeRobotDatasetMetadata
 from lerobot_openspm.bench.episode import IMAGES, World, load, run_episode
 from lerobot_openspm.bench.object_frames import offset
 from lerobot_openspm.bench.truth import Truth, pose_error, true_period
-from lerobot_openspm.control.row import Row
+from lerobot_openspm.control.controller import EpisodeController
 from lerobot_openspm.envs.recording import source
 from lerobot_openspm.files import write_json
 from lerobot_openspm.geometry.se3 import Array
 from lerobot_openspm.modeling_openspm import OpenSPMPolicy
-from lerobot_openspm.observation import Observation
-from lerobot_openspm.perceive import Eyes
-from lerobot_openspm.perception import kalman
-from lerobot_openspm.perception.localise import localise, prepare
-from lerobot_openspm.perception.tracker import Tracker, TrackerSettings
-from lerobot_openspm.perception.types import View
+from lerobot_openspm.perception.objects.localise import localise, prepare
+from lerobot_openspm.perception.observation import Observation
+from lerobot_openspm.perception.pipeline import Perception
+from lerobot_openspm.perception.tracking import kalman
+from lerobot_openspm.perception.tracking.tracker import Tracker, TrackerSettings
 from lerobot_openspm.training import open_demonstrations
+from lerobot_openspm.types import View
 
 # What the policy follows, each picture's own estimate, what would be followed with the first camera alone.
 VARIANTS = ("filtered", "unfiltered", "one_view")
@@ -60,7 +60,7 @@ def world(env_type: str, task: str, seed: int) -> Generator[World]:
     """A task's scene drawn from a seed."""
     if env_type == "openspm_tabletop":
         from lerobot_openspm.bench.tabletop import TabletopWorld
-        from lerobot_openspm.envs.tabletop_env import TabletopEnv
+        from lerobot_openspm.envs.tabletop.env import TabletopEnv
 
         with contextlib.closing(TabletopEnv(task=task)) as env:
             yield TabletopWorld(env, seed)
@@ -83,8 +83,8 @@ def run(setting: Setting, folder: Path, task: str, seed: int) -> None:
     policy = load(setting.checkpoint)
     meta = LeRobotDatasetMetadata(setting.repo_id, root=setting.dataset)
     demonstrations = open_demonstrations(meta, policy.config)
-    experience = policy.require_experience()
-    offsets = {name: offset(experience, name, demonstrations) for name in experience.objects}
+    memory = policy.require_memory()
+    offsets = {name: offset(memory, name, demonstrations) for name in memory.objects}
     with world(setting.env_type, task, seed) as scene:
         success, samples = measure_episode(policy, scene, setting.env_type, task, offsets)
     write_json(file_of(folder, task, seed), {"success": success, "samples": samples})
@@ -103,18 +103,18 @@ def costs(setting: Setting) -> dict[str, Any]:
     """What a look at three objects in two views of 256 pixels takes, and a step of the filter; one thread."""
     cv2.setNumThreads(1)
     policy = load(setting.checkpoint)
-    experience = policy.require_experience()
+    memory = policy.require_memory()
     task = tasks(setting.env_type, "all")[0]
     with world(setting.env_type, task, 0) as scene:
         vector = scene.state().astype(float)
         T_world_ee = policy.config.layouts()[0].poses(vector)
         views = {}
-        for key, camera in list(experience.cameras.items())[:COST_VIEWS]:
+        for key, camera in list(memory.cameras.items())[:COST_VIEWS]:
             image = scene.image(key.removeprefix(IMAGES))
             image = np.asarray(cv2.resize(image, (256, 256), interpolation=cv2.INTER_AREA), np.uint8)
             scaled = camera.scaled(256, 256)
             views[key] = View(image, scaled, scaled.T_world_cam(T_world_ee))
-    spent = milliseconds(policy, views, list(experience.objects)[:COST_OBJECTS], COST_RUNS)
+    spent = milliseconds(policy, views, list(memory.objects)[:COST_OBJECTS], COST_RUNS)
     one, twenty = filter_microseconds(1), filter_microseconds(20)
     return {
         "ms_per_observation": spent["first_ms"]["median"],
@@ -141,7 +141,7 @@ def measure_episode(
     truth, shadow = Truth(world.object_poses(), offsets), _Shadow(policy)
     samples: dict[str, list[Sample]] = {variant: [] for variant in VARIANTS}
 
-    def compare(step: int, observation: Observation, row: Row) -> None:
+    def compare(step: int, observation: Observation, row: EpisodeController) -> None:
         if not row.ranked:
             return
         T_world_ee = observation.hand.T_world_ee
@@ -167,16 +167,16 @@ class _Shadow:
     """What each picture alone tells, and what would be followed with the first camera alone."""
 
     def __init__(self, policy: OpenSPMPolicy) -> None:
-        experience = policy.require_experience()
-        first = next(iter(experience.cameras))
-        one_camera = replace(experience, cameras={first: experience.cameras[first]})
-        self._eyes = Eyes(one_camera, policy.config.hand_radius_m, policy.segmenter)
+        memory = policy.require_memory()
+        first = next(iter(memory.cameras))
+        one_camera = replace(memory, cameras={first: memory.cameras[first]})
+        self._eyes = Perception(one_camera, policy.config.hand_radius_m, policy.segmenter)
         self._step_s = policy.step_s
-        self.tracker = Tracker(experience.yaw_periods, TrackerSettings())
+        self.tracker = Tracker(memory.yaw_periods, TrackerSettings())
         self.seen: dict[str, Array] = {}
         self._time_s = self._looked_at_s = 0.0
 
-    def follow(self, observation: Observation, row: Row) -> None:
+    def follow(self, observation: Observation, row: EpisodeController) -> None:
         """Look when the policy has looked, hold what it holds."""
         self._time_s += self._step_s
         self.tracker.predict(self._step_s)
@@ -242,7 +242,7 @@ def milliseconds(
         names: The objects to find.
         n: Runs.
     """
-    objects = policy.require_experience().objects
+    objects = policy.require_memory().objects
     found = {name: localise(views, objects[name]).T_world_obj for name in names}
 
     def look(expected: Mapping[str, Array]) -> None:

@@ -143,8 +143,8 @@ def _gather(job: Job, failures: int, steps: Iterator[_Step]) -> Recording | None
 
 
 def _tabletop(task: str, seed: int, operator: type[ScriptedHand[Any]]) -> Iterator[_Step]:
-    from lerobot_openspm.envs.experts import expert_actions
-    from lerobot_openspm.envs.tabletop_env import TabletopEnv
+    from lerobot_openspm.envs.tabletop.env import TabletopEnv
+    from lerobot_openspm.envs.tabletop.experts import expert_actions
 
     env = TabletopEnv(task, episode_length=MAX_STEPS)
     env.reset(seed=seed)

@@ -8,10 +8,10 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from lerobot_openspm.bench.synthetic_keys import Key, distinct_keys
-from lerobot_openspm.experience import Experience
 from lerobot_openspm.geometry import se3
 from lerobot_openspm.geometry.camera import Camera
 from lerobot_openspm.memory.entry import Anchor, MemoryEntry, MemoryKeyPose, RetrievalKey
+from lerobot_openspm.memory.memory import Memory
 from lerobot_openspm.memory.robot import RobotModel
 
 # What picking and placing is made of, and whether the hand is closed on the way.
@@ -23,7 +23,7 @@ _PHASES = (
 _PER_KEY = 100
 
 
-def synthetic_experience(count: int, rng: np.random.Generator) -> Experience:
+def synthetic_experience(count: int, rng: np.random.Generator) -> Memory:
     """So many entries, a hundred of each task, with eight key poses and a layout of two objects each."""
     keys = distinct_keys(-(-count // _PER_KEY), rng)
     poses = _transforms(count * len(_PHASES), rng).reshape(count, len(_PHASES), 4, 4)
@@ -35,7 +35,7 @@ def synthetic_experience(count: int, rng: np.random.Generator) -> Experience:
     workspace = np.array([[-0.5, -0.5, 0.0], [0.5, 0.5, 0.5]])
     robot = RobotModel(1.0, -1.0, 0.08, 0.01, 0.1, 0.01, workspace)
     camera = Camera(64, 48, 50.0, 50.0, 32.0, 24.0, "world", np.eye(4))
-    return Experience(entries, {}, robot, {"observation.images.front": camera}, "demonstrations")
+    return Memory(entries, {}, robot, {"observation.images.front": camera}, "demonstrations")
 
 
 def _transforms(count: int, rng: np.random.Generator) -> se3.Array:

@@ -8,13 +8,14 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from lerobot_openspm.envs import layout, scene
-from lerobot_openspm.envs.simulator import TabletopSimulator
-from lerobot_openspm.envs.tabletop_env import RENDER_SIZE, TabletopEnv
-from lerobot_openspm.envs.tasks import ANY_TASK, TASKS
+from lerobot_openspm.envs.tabletop import placement as layout
+from lerobot_openspm.envs.tabletop import scene
+from lerobot_openspm.envs.tabletop.env import RENDER_SIZE, TabletopEnv
+from lerobot_openspm.envs.tabletop.simulator import TabletopSimulator
+from lerobot_openspm.envs.tabletop.tasks import ANY_TASK, TASKS
 from lerobot_openspm.geometry import se3
 from lerobot_openspm.geometry.camera import Camera
-from lerobot_openspm.memory.instruction import parse_instruction
+from lerobot_openspm.language.instruction import parse_instruction
 
 MAX_TRIES = 10_000
 MAX_CAMERA_SHIFT_M, MAX_CAMERA_TURN_DEG = 0.10, 10.0

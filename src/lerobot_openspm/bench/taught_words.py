@@ -13,17 +13,17 @@ from functools import partial
 import numpy as np
 
 from lerobot_openspm.control.executor import ControlSettings
-from lerobot_openspm.control.knowledge import Knowledge
+from lerobot_openspm.control.planning_context import PlanningContext
 from lerobot_openspm.control.transfer import TransferLimits
 from lerobot_openspm.errors import InstructionError, OpenSPMError
 from lerobot_openspm.geometry import se3
 from lerobot_openspm.geometry.se3 import Array
+from lerobot_openspm.language.instruction import read_tasks
+from lerobot_openspm.language.names import TABLE_NAMES, NameSimilarity
 from lerobot_openspm.memory.bank import entry_from_json, entry_to_json
-from lerobot_openspm.memory.compound import plan_parts
+from lerobot_openspm.memory.compose import plan_parts
 from lerobot_openspm.memory.entry import MemoryEntry
 from lerobot_openspm.memory.indexed_entries import known_names
-from lerobot_openspm.memory.instruction import read_tasks
-from lerobot_openspm.memory.names import TABLE_NAMES, NameSimilarity
 from lerobot_openspm.memory.retrieval import ScoreWeights
 from lerobot_openspm.memory.robot import RobotModel
 from lerobot_openspm.mining.anchors import Demonstration
@@ -134,7 +134,7 @@ def acted_entries(
         parts = plan_parts(instruction, rated, names)
     except InstructionError:
         return ()
-    knowledge = Knowledge(rated, {}, ROBOT, ScoreWeights(), TransferLimits(), ControlSettings())
+    knowledge = PlanningContext(rated, {}, ROBOT, ScoreWeights(), TransferLimits(), ControlSettings())
     T_world_ee = se3.transform(_HAND_DOWN, [0.0, 0.0, 0.3])
     acted: list[MemoryEntry] = []
     for part in parts:

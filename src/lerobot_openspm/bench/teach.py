@@ -23,7 +23,7 @@ import numpy as np
 from lerobot_openspm.bench.results import ResultOption
 from lerobot_openspm.bench.workers import each
 from lerobot_openspm.cli.bench import DEFAULTS, DatasetOption, EnvironmentOption
-from lerobot_openspm.envs.tasks import TASKS, select_tasks
+from lerobot_openspm.envs.tabletop.tasks import TASKS, select_tasks
 from lerobot_openspm.errors import DatasetError, OpenSPMError
 from lerobot_openspm.files import write_json
 
@@ -158,7 +158,7 @@ def teach(data: Demonstrations, nine: Path, task: str, demos: int, folder: Path)
         wrong. The folder holds the taught checkpoint, unless there was an error.
     """
     from lerobot_openspm.bench.episode import load
-    from lerobot_openspm.experience import save_experience
+    from lerobot_openspm.memory.memory import write_memory
     from lerobot_openspm.mining.dataset import dataset_metadata
 
     note = folder.with_name(f"{folder.name}.json")
@@ -170,7 +170,7 @@ def teach(data: Demonstrations, nine: Path, task: str, demos: int, folder: Path)
     try:
         policy = load(str(folder))
         lesson = policy.teach(dataset_metadata(data.repo_id, data.root), data.episodes[task][:demos])
-        save_experience(policy.require_experience(), folder)
+        write_memory(policy.require_memory(), folder)
         found = {"error": None, "objects_learned": lesson.objects_learned, "skipped": lesson.skipped}
     except OpenSPMError as error:
         found = {"error": str(error)}
@@ -184,7 +184,7 @@ def run(folder: Path, task: str, demos: int, seed: int) -> Any:
     from lerobot_openspm.bench.episode import load, run_episode
     from lerobot_openspm.bench.tabletop import TabletopWorld
     from lerobot_openspm.bench.tracking import Result
-    from lerobot_openspm.envs.tabletop_env import TabletopEnv
+    from lerobot_openspm.envs.tabletop.env import TabletopEnv
 
     if json.loads(folder.with_name(f"{folder.name}.json").read_text())["error"] is not None:
         return Result(str(demos), task, seed, False, 0, NOT_TAUGHT, 0, None)

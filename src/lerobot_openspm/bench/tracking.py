@@ -14,8 +14,8 @@ import numpy as np
 from lerobot_openspm.bench.episode import load, run_episode
 from lerobot_openspm.bench.tabletop import GRASPED, Disturbance, TabletopWorld, move_cameras
 from lerobot_openspm.cli.pipeline import rate
-from lerobot_openspm.envs.tabletop_env import TabletopEnv
-from lerobot_openspm.envs.tasks import TASK_NAMES, select_tasks
+from lerobot_openspm.envs.tabletop.env import TabletopEnv
+from lerobot_openspm.envs.tabletop.tasks import TASK_NAMES, select_tasks
 from lerobot_openspm.errors import OpenSPMError
 
 
@@ -73,8 +73,8 @@ def run(checkpoint: str, condition: Condition, task: str, seed: int) -> Result:
     world = TabletopWorld(env, seed)
     rng = np.random.default_rng([seed, TASK_NAMES.index(task)])
     if condition.cameras_moved:
-        experience = policy.require_experience()
-        policy.experience = replace(experience, cameras=move_cameras(env.simulator, experience.cameras, rng))
+        memory = policy.require_memory()
+        policy.memory = replace(memory, cameras=move_cameras(env.simulator, memory.cameras, rng))
     disturbance = Disturbance(world, condition.disturbance, rng) if condition.disturbance else None
     episode = run_episode(policy, world, disturbance)
     env.close()

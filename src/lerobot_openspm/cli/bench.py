@@ -14,7 +14,7 @@ from typing import Any
 from lerobot_openspm.bench.results import ResultOption, write_result
 from lerobot_openspm.bench.workers import each
 from lerobot_openspm.envs.gl_backend import set_default_gl_backend
-from lerobot_openspm.envs.tasks import select_tasks
+from lerobot_openspm.envs.tabletop.tasks import select_tasks
 from lerobot_openspm.errors import OpenSPMError
 
 logger = logging.getLogger(__name__)

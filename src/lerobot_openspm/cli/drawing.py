@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from lerobot_openspm.geometry.camera import project
 from lerobot_openspm.geometry.se3 import Array
-from lerobot_openspm.perception.types import View
+from lerobot_openspm.types import View
 
 Image = NDArray[np.uint8]
 # One colour per phase, RGB; the same in every picture.

@@ -10,7 +10,7 @@ from pathlib import Path
 import draccus
 
 from lerobot_openspm.cli.memory_show import table
-from lerobot_openspm.experience import load_experience
+from lerobot_openspm.memory.memory import read_memory
 
 
 @dataclass
@@ -31,13 +31,13 @@ class InspectConfig:
 def main(args: list[str]) -> None:
     """Print the entries, then one JSON object."""
     config = draccus.parse(InspectConfig, args=args)
-    experience = load_experience(Path(config.path))
-    shown = [entry for entry in experience.entries if config.instruction in entry.language]
+    memory = read_memory(Path(config.path))
+    shown = [entry for entry in memory.entries if config.instruction in entry.language]
     for entry in shown[: config.limit]:
         print("\n".join(table(entry)), end="\n\n")
-    per_task = Counter(entry.language for entry in experience.entries)
+    per_task = Counter(entry.language for entry in memory.entries)
     print(
         json.dumps(
-            {"entries": len(experience.entries), "shown": len(shown[: config.limit]), "per_task": per_task}
+            {"entries": len(memory.entries), "shown": len(shown[: config.limit]), "per_task": per_task}
         )
     )

@@ -11,11 +11,11 @@ from pathlib import Path
 import draccus
 
 from lerobot_openspm.errors import OpenSPMError
-from lerobot_openspm.experience import Experience, load_experience, save_experience
-from lerobot_openspm.experience_exchange import combined, read_parcel
-from lerobot_openspm.experience_files import changing
 from lerobot_openspm.geometry.camera import load_cameras
 from lerobot_openspm.memory.entry import MemoryEntry
+from lerobot_openspm.memory.exchange import combined, read_parcel
+from lerobot_openspm.memory.files import changing
+from lerobot_openspm.memory.memory import Memory, read_memory, write_memory
 from lerobot_openspm.memory.merging import merge_near_duplicates
 from lerobot_openspm.memory.quality import with_outcome
 
@@ -124,11 +124,11 @@ def add(args: list[str]) -> None:
     parcel = read_parcel(Path(config.other))
     folder = Path(config.path)
     with changing(folder):
-        before = load_experience(folder)
+        before = read_memory(folder)
         after, n_added = combined(before, parcel, config.other)
         if n_added:
-            save_experience(after, folder)
-    _report(after, added=n_added, unchanged=len(parcel.experience.entries) - n_added)
+            write_memory(after, folder)
+    _report(after, added=n_added, unchanged=len(parcel.memory.entries) - n_added)
 
 
 def remove(args: list[str]) -> None:
@@ -137,7 +137,7 @@ def remove(args: list[str]) -> None:
     _required(config.source + config.instruction, "--source=DATASET#EPISODE or --instruction=TEXT")
     folder = Path(config.path)
     with changing(folder):
-        before = load_experience(folder)
+        before = read_memory(folder)
         gone = _chosen(before, config.source, config.instruction, config.path)
         kept = [entry for i, entry in enumerate(before.entries) if i not in gone]
         if not kept:
@@ -146,7 +146,7 @@ def remove(args: list[str]) -> None:
                 "be done with an empty one; delete the folder instead"
             )
         after = replace(before, entries=tuple(kept), superseded=(*before.superseded, *gone.values()))
-        save_experience(after, folder)
+        write_memory(after, folder)
     for entry in gone.values():
         print(f"removed version {entry.version} of {entry.source}: {entry.language!r}")
     _report(after, removed=len(gone))
@@ -158,7 +158,7 @@ def restore(args: list[str]) -> None:
     _required(config.source, "--source=DATASET#EPISODE")
     folder = Path(config.path)
     with changing(folder):
-        before = load_experience(folder)
+        before = read_memory(folder)
         old = [(e.version, i) for i, e in enumerate(before.superseded) if e.source == config.source]
         found = [(version, i) for version, i in old if config.version in (None, version)]
         if not found:
@@ -169,7 +169,7 @@ def restore(args: list[str]) -> None:
             )
         _, newest = max(found)
         after = before.restored(newest)
-        save_experience(after, folder)
+        write_memory(after, folder)
     _report(after, restored=config.source, version=after.entries[-1].version)
 
 
@@ -178,7 +178,7 @@ def merge(args: list[str]) -> None:
     config = draccus.parse(MergeConfig, args=args)
     folder = Path(config.path)
     with changing(folder):
-        before = load_experience(folder)
+        before = read_memory(folder)
         result = merge_near_duplicates(
             before.entries, config.distance_m, config.angle_rad, config.instruction or None
         )
@@ -187,7 +187,7 @@ def merge(args: list[str]) -> None:
             after = replace(
                 before, entries=result.entries, superseded=(*before.superseded, *result.superseded)
             )
-            save_experience(after, folder)
+            write_memory(after, folder)
     n_merged = len(result.superseded)
     _report(after, merged=n_merged, into=len(after.entries) - len(before.entries) + n_merged)
 
@@ -200,18 +200,18 @@ def rate(args: list[str]) -> None:
         raise OpenSPMError("how did it end? pass --success=true or --success=false")
     folder = Path(config.path)
     with changing(folder):
-        before = load_experience(folder)
+        before = read_memory(folder)
         index, entry = _the_one(before, config)
         rated = with_outcome(entry, config.success)
         entries = tuple(rated if i == index else other for i, other in enumerate(before.entries))
         after = replace(before, entries=entries)
-        save_experience(after, folder)
+        write_memory(after, folder)
     _report(after, quality=rated.quality, trials=rated.trials, successes=rated.successes)
 
 
-def _the_one(experience: Experience, config: RateConfig) -> tuple[int, MemoryEntry]:
+def _the_one(memory: Memory, config: RateConfig) -> tuple[int, MemoryEntry]:
     """The entry to rate, and its number. Raises if it is none or several, with the option that tells."""
-    chosen = _chosen(experience, config.source, config.instruction, config.path)
+    chosen = _chosen(memory, config.source, config.instruction, config.path)
     if config.entry is not None:
         if config.entry not in chosen:
             raise OpenSPMError(
@@ -245,8 +245,8 @@ def cameras(args: list[str]) -> None:
     folder, file = Path(config.path), Path(config.file)
     load_cameras(file)
     with changing(folder):
-        after = load_experience(folder, cameras=file)
-        save_experience(after, folder)
+        after = read_memory(folder, cameras=file)
+        write_memory(after, folder)
     _report(after, cameras=sorted(after.cameras))
 
 
@@ -255,17 +255,17 @@ def _required(value: str, option: str) -> None:
         raise OpenSPMError(f"nothing to do; pass {option}")
 
 
-def _chosen(experience: Experience, source: str, instruction: str, path: str) -> dict[int, MemoryEntry]:
+def _chosen(memory: Memory, source: str, instruction: str, path: str) -> dict[int, MemoryEntry]:
     """Entries by index of a source and of an instruction, where these are given. Raises if there is none."""
     found = {
         i: entry
-        for i, entry in enumerate(experience.entries)
+        for i, entry in enumerate(memory.entries)
         if source in ("", entry.source) and instruction in ("", entry.language)
     }
     if not found:
         asked = " and ".join(repr(value) for value in (source, instruction) if value)
         raise OpenSPMError(
-            f"the memory at {path} holds no entry of {asked}; it knows: {_known(experience.entries)}. "
+            f"the memory at {path} holds no entry of {asked}; it knows: {_known(memory.entries)}. "
             f"`openspm memory list --path={path}` lists its entries"
         )
     return found
@@ -276,7 +276,7 @@ def _known(entries: Sequence[MemoryEntry], limit: int = 20) -> str:
     return "; ".join(languages[:limit]) + (" ..." if len(languages) > limit else "")
 
 
-def _report(after: Experience, **numbers: object) -> None:
+def _report(after: Memory, **numbers: object) -> None:
     """Print one JSON object: what there is now, and what was done."""
     now = {"entries": len(after.entries), "superseded": len(after.superseded)}
     print(json.dumps({**now, **numbers}))

@@ -9,8 +9,8 @@ from pathlib import Path
 import draccus
 
 from lerobot_openspm.errors import OpenSPMError
-from lerobot_openspm.experience import load_experience, save_experience
-from lerobot_openspm.experience_exchange import write_entries_file
+from lerobot_openspm.memory.exchange import write_entries_file
+from lerobot_openspm.memory.memory import read_memory, write_memory
 
 
 @dataclass
@@ -34,10 +34,10 @@ class ExportConfig:
 def export(args: list[str]) -> None:
     """Write the chosen entries, and print one JSON object."""
     config = draccus.parse(ExportConfig, args=args)
-    experience = load_experience(Path(config.path))
+    memory = read_memory(Path(config.path))
     entries = tuple(
         entry
-        for entry in experience.entries
+        for entry in memory.entries
         if config.source in ("", entry.source) and config.instruction in ("", entry.language)
     )
     if not entries:
@@ -49,9 +49,9 @@ def export(args: list[str]) -> None:
     if output.exists():
         raise FileExistsError(f"{output} exists already; choose another --output, or remove it")
     output.parent.mkdir(parents=True, exist_ok=True)
-    chosen = replace(experience, entries=entries, superseded=())
+    chosen = replace(memory, entries=entries, superseded=())
     if output.suffix == ".json":
         write_entries_file(chosen, output)
     else:
-        save_experience(chosen, output)
+        write_memory(chosen, output)
     print(json.dumps({"entries": len(entries), "output": str(output)}))

@@ -11,9 +11,9 @@ import draccus
 
 from lerobot_openspm.cli.memory_show import check_limit
 from lerobot_openspm.errors import OpenSPMError
-from lerobot_openspm.experience import load_experience
+from lerobot_openspm.language.names import TABLE_NAMES, NameSimilarity, names_from
 from lerobot_openspm.memory.entry import Reference, SubTask
-from lerobot_openspm.memory.names import TABLE_NAMES, NameSimilarity, names_from
+from lerobot_openspm.memory.memory import read_memory
 from lerobot_openspm.memory.retrieval import ScoreWeights
 from lerobot_openspm.search import Found, Hit, observation_of, search_memory, search_scene
 
@@ -71,7 +71,7 @@ def search(args: list[str]) -> None:
 
 def _search(instruction: str, config: SearchConfig) -> Found:
     if config.dataset.root is None and config.dataset.repo_id is None:
-        entries = load_experience(Path(config.path)).entries
+        entries = read_memory(Path(config.path)).entries
         return search_memory(instruction, entries, *_scoring(config.path))
     if config.dataset.root is not None and not (Path(config.dataset.root) / "meta/info.json").is_file():
         raise FileNotFoundError(f"no dataset at --dataset.root={config.dataset.root}")

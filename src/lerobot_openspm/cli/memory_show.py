@@ -12,9 +12,9 @@ import draccus
 import numpy as np
 
 from lerobot_openspm.errors import OpenSPMError
-from lerobot_openspm.experience import load_experience
 from lerobot_openspm.geometry import se3
 from lerobot_openspm.memory.entry import MemoryEntry, MemoryKeyPose, Outcome
+from lerobot_openspm.memory.memory import read_memory
 
 
 @dataclass
@@ -68,10 +68,10 @@ def check_limit(limit: int) -> None:
 def list_entries(args: list[str]) -> None:
     """Print a line for every entry or task, then one JSON object."""
     config = draccus.parse(ListConfig, args=args)
-    experience = load_experience(Path(config.path))
+    memory = read_memory(Path(config.path))
     tasks: dict[str, list[float]] = defaultdict(list)
     lines: list[str] = []  # as many as are printed: a memory may hold a million entries
-    for entry in experience.entries:
+    for entry in memory.entries:
         if config.instruction in entry.language:
             tasks[entry.language].append(entry.quality)
             if not config.tasks and len(lines) < config.limit:
@@ -81,14 +81,14 @@ def list_entries(args: list[str]) -> None:
     if config.tasks:
         lines = [_task_line(language, qualities) for language, qualities in tasks.items()]
     if config.all:
-        old = [entry for entry in experience.superseded if config.instruction in entry.language]
+        old = [entry for entry in memory.superseded if config.instruction in entry.language]
         lines += [f"{_line(entry)}  superseded" for entry in old]
         n_lines += len(old)
     for line in lines[: config.limit]:
         print(line)
     if n_lines > config.limit:
         print(f"... {n_lines - config.limit} more; --limit={n_lines} lists all")
-    counts = {"entries": len(experience.entries), "superseded": len(experience.superseded)}
+    counts = {"entries": len(memory.entries), "superseded": len(memory.superseded)}
     per_task = {language: len(qualities) for language, qualities in tasks.items()}
     print(json.dumps({**counts, "listed": n_listed, "per_task": per_task}))
 
@@ -96,10 +96,10 @@ def list_entries(args: list[str]) -> None:
 def show(args: list[str]) -> None:
     """Print entries with all their numbers, then one JSON object."""
     config = draccus.parse(ShowConfig, args=args)
-    experience = load_experience(Path(config.path))
+    memory = read_memory(Path(config.path))
     wanted = (
         entry
-        for entry in experience.entries
+        for entry in memory.entries
         if config.instruction in entry.language and config.source in ("", entry.source)
     )
     shown = list(islice(wanted, config.limit))
@@ -110,7 +110,7 @@ def show(args: list[str]) -> None:
         )
     for entry in shown:
         print("\n".join(table(entry)), end="\n\n")
-    print(json.dumps({"entries": len(experience.entries), "shown": len(shown)}))
+    print(json.dumps({"entries": len(memory.entries), "shown": len(shown)}))
 
 
 def _line(entry: MemoryEntry) -> str:

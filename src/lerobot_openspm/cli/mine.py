@@ -10,10 +10,10 @@ from pathlib import Path
 import draccus
 
 from lerobot_openspm.configuration_openspm import OpenSPMConfig
-from lerobot_openspm.experience import save_experience
+from lerobot_openspm.memory.memory import write_memory
 from lerobot_openspm.mining.annotate import check_folder, write_annotated
 from lerobot_openspm.mining.dataset import dataset_metadata
-from lerobot_openspm.training import dataset_processor, experience_of
+from lerobot_openspm.training import dataset_processor, memory_of
 
 
 @dataclass
@@ -46,16 +46,16 @@ def main(args: list[str]) -> None:
     if annotated is not None:
         check_folder(processor.demonstrations, annotated)
     mined = processor.mine(held_out=annotated is not None)
-    experience = experience_of(mined, config.policy)
-    save_experience(experience, Path(config.output))
+    memory = memory_of(mined, config.policy)
+    write_memory(memory, Path(config.output))
     if annotated is not None:
         write_annotated(processor.demonstrations, mined, annotated)
     summary = {
-        "entries": len(experience.entries),
+        "entries": len(memory.entries),
         "episodes": int(meta.total_episodes),
-        "key_poses": sum(len(entry.key_poses) for entry in experience.entries),
-        "skipped": int(meta.total_episodes) - len(experience.entries),
-        "objects": sorted(experience.objects),
+        "key_poses": sum(len(entry.key_poses) for entry in memory.entries),
+        "skipped": int(meta.total_episodes) - len(memory.entries),
+        "objects": sorted(memory.objects),
         "output": config.output,
         "annotated": config.annotated,
         "seconds": round(time.monotonic() - start_s, 1),

@@ -22,7 +22,7 @@ from tqdm import tqdm
 
 import lerobot_openspm
 from lerobot_openspm.cli.collect import SUMMARY_FILE, CollectConfig, SimulatorConfig, collect
-from lerobot_openspm.envs.tasks import TASK_NAMES
+from lerobot_openspm.envs.tabletop.tasks import TASK_NAMES
 from lerobot_openspm.errors import OpenSPMError
 from lerobot_openspm.files import write_beside, write_json
 

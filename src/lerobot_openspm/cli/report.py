@@ -15,9 +15,9 @@ from tqdm import tqdm
 from lerobot_openspm.cli.drawing import draw_key_poses, film_strip, save_png
 from lerobot_openspm.cli.pipeline import REPO_ID, Episode, mean_steps, rate
 from lerobot_openspm.configuration_openspm import OpenSPMConfig
-from lerobot_openspm.envs.tasks import TASKS
-from lerobot_openspm.experience import Experience, load_experience
+from lerobot_openspm.envs.tabletop.tasks import TASKS
 from lerobot_openspm.memory.entry import MemoryEntry
+from lerobot_openspm.memory.memory import Memory, read_memory
 from lerobot_openspm.training import open_demonstrations
 
 # Rollouts shown per task: this many that succeeded, and this many that failed.
@@ -33,17 +33,17 @@ def write_report(
     evaluation: Path,
 ) -> Path:
     """Draw the pictures and write ``index.html``. Returns its path."""
-    experience = load_experience(checkpoint)
+    memory = read_memory(checkpoint)
     demonstrations = LeRobotDataset(REPO_ID, root=dataset, video_backend="pyav")
     tasks = []
     for name in tqdm(dict.fromkeys(e.task for e in episodes), desc="Drawing", unit="task"):
         own = [e for e in episodes if e.task == name]
         instruction = TASKS[name].instruction
-        entries = [entry for entry in experience.entries if entry.language == instruction]
+        entries = [entry for entry in memory.entries if entry.language == instruction]
         best = max(entries, key=lambda entry: entry.quality, default=None)
         poses = folder / f"{name}_key_poses.png"
         if best is not None:
-            save_png(_key_pose_picture(best, experience, demonstrations), poses)
+            save_png(_key_pose_picture(best, memory, demonstrations), poses)
         tasks.append(
             {
                 "instruction": instruction,
@@ -62,12 +62,12 @@ def write_report(
     return path
 
 
-def _key_pose_picture(entry: MemoryEntry, experience: Experience, dataset: LeRobotDataset) -> Any:
+def _key_pose_picture(entry: MemoryEntry, memory: Memory, dataset: LeRobotDataset) -> Any:
     """The entry's key poses in the first frame of the demonstration it was mined from."""
     config = OpenSPMConfig(device="cpu", push_to_hub=False)
     demonstrations = open_demonstrations(dataset.meta, config)
     episode = demonstrations.episodes([int(entry.source.rsplit("#", 1)[1])])[0]
-    key, camera = next((k, c) for k, c in experience.cameras.items() if c.mount == "world")
+    key, camera = next((k, c) for k, c in memory.cameras.items() if c.mount == "world")
     view = demonstrations.views(episode, 0, {key: camera})[key]
     poses = [pose.anchor.frame(entry.layout) @ pose.T_obj_ee for pose in entry.key_poses]
     return draw_key_poses(view, poses, [pose.phase for pose in entry.key_poses])

@@ -14,9 +14,9 @@ from typing import TYPE_CHECKING, Any
 import draccus
 
 from lerobot_openspm.errors import OpenSPMError
-from lerobot_openspm.experience import MEMORY_JSON, Experience, load_experience, save_experience
-from lerobot_openspm.experience_exchange import digest
-from lerobot_openspm.experience_files import changing
+from lerobot_openspm.memory.exchange import digest
+from lerobot_openspm.memory.files import changing
+from lerobot_openspm.memory.memory import MEMORY_JSON, Memory, read_memory, write_memory
 from lerobot_openspm.mining.dataset import dataset_metadata
 from lerobot_openspm.teaching import Lesson
 
@@ -60,17 +60,17 @@ def main(args: list[str]) -> None:
     _check_folders(into, output)
     meta = dataset_metadata(config.dataset.repo_id, config.dataset.root)
     policy = _policy(config)
-    known, lesson = policy.require_experience(), policy.teach(meta, config.dataset.episodes)
+    known, lesson = policy.require_memory(), policy.teach(meta, config.dataset.episodes)
     if output is None:
-        experience, lesson = _appended(known, lesson, into, lambda now: _taught(policy, now, meta, config))
+        memory, lesson = _appended(known, lesson, into, lambda now: _taught(policy, now, meta, config))
     else:
-        experience = policy.require_experience()
-        _write_copy(experience, into, output)
+        memory = policy.require_memory()
+        _write_copy(memory, into, output)
     print("\n".join(_lines(lesson)))
     summary = {
         "taught": list(lesson.instructions),
         "entries": len(lesson.entries),
-        "entries_in_memory": len(experience.entries),
+        "entries_in_memory": len(memory.entries),
         "entries_known_before": sum(lesson.known_before.values()),
         "skipped": list(lesson.skipped),
         "objects_learned": list(lesson.objects_learned),
@@ -101,42 +101,42 @@ def _policy(config: TeachConfig) -> OpenSPMPolicy:
     return policy
 
 
-def _taught(policy: OpenSPMPolicy, known: Experience, meta: Any, config: TeachConfig) -> Lesson:
-    policy.experience = known
+def _taught(policy: OpenSPMPolicy, known: Memory, meta: Any, config: TeachConfig) -> Lesson:
+    policy.memory = known
     return policy.teach(meta, config.dataset.episodes)
 
 
 def _appended(
-    known: Experience, lesson: Lesson, into: Path, again: Callable[[Experience], Lesson]
-) -> tuple[Experience, Lesson]:
+    known: Memory, lesson: Lesson, into: Path, again: Callable[[Memory], Lesson]
+) -> tuple[Memory, Lesson]:
     """Append a lesson to what the memory holds by now; what is saved, and the lesson.
 
     A lesson takes long, so others may change the memory meanwhile. Its key poses mean nothing in the frames
     of other models of its objects, so where these have changed the lesson is given again.
     """
     with changing(into):
-        now = load_experience(into)
+        now = read_memory(into)
         if not all(_same_model(known, now, name) for name in lesson.learned.objects):
             lesson = again(now)
-        experience = now.appended(lesson.learned)
-        save_experience(experience, into)
+        memory = now.appended(lesson.learned)
+        write_memory(memory, into)
     before = Counter(entry.language for entry in now.entries)
-    return experience, replace(lesson, known_before={task: before[task] for task in lesson.instructions})
+    return memory, replace(lesson, known_before={task: before[task] for task in lesson.instructions})
 
 
-def _same_model(known: Experience, now: Experience, name: str) -> bool:
+def _same_model(known: Memory, now: Memory, name: str) -> bool:
     """Whether two memories know an object by the same model, or neither knows it."""
     models = [one.objects.get(name) for one in (known, now)]
     return len({digest(model) if model else "" for model in models}) == 1
 
 
-def _write_copy(experience: Experience, into: Path, output: Path) -> None:
+def _write_copy(memory: Memory, into: Path, output: Path) -> None:
     """Write the checkpoint with another memory, as a whole or not at all."""
     beside = output.with_name(f".{output.name}.partial")
     if beside.exists():  # of a run that was interrupted
         shutil.rmtree(beside)
     shutil.copytree(into, beside)
-    save_experience(experience, beside)
+    write_memory(memory, beside)
     beside.rename(output)
 
 

@@ -161,12 +161,12 @@ class Executor:
         """The next canonical action ``(7,)``, or None when a chunk is needed (:meth:`query`)."""
         if self.status is not Status.RUNNING:
             return self.hold()
-        if self.plan[self.index].memory.dwell:
+        if self.plan[self.index].key_pose.dwell:
             action = self._toward(hand)
         elif self._queue:
             action = self._queue.popleft()
             is_corrected = self._settings.execution == "closed_loop_trc"
-            if is_corrected and self.plan[self.index].memory.phase == "push":
+            if is_corrected and self.plan[self.index].key_pose.phase == "push":
                 action = self._kept_on_way(action, hand)
         elif self._settings.execution == "closed_loop_trc" and self._steps >= self._nominal_steps():
             action = self._correct(hand)
@@ -179,7 +179,7 @@ class Executor:
 
     def hold(self) -> Array:
         """The action that stays where it is, fingers as they are."""
-        closed = self.plan[self.index].memory.closed if self.plan else False
+        closed = self.plan[self.index].key_pose.closed if self.plan else False
         return np.array([0.0] * 6 + [self._robot.command(closed)])
 
     def _correct(self, hand: Hand) -> Array:
@@ -205,7 +205,7 @@ class Executor:
         residual = se3.increment(self._here(hand), target.T_world_ee)
         motion: Array = np.where(gains > 0, share * residual / np.maximum(gains, 1e-9), 0.0)
         motion = motion / max(1.0, float(np.abs(motion).max()))
-        return np.append(motion, self._robot.command(target.memory.closed))
+        return np.append(motion, self._robot.command(target.key_pose.closed))
 
     def _kept_on_way(self, action: Array, hand: Hand) -> Array:
         """An action whose motion across the straight way to the key pose leads back to it.
@@ -241,9 +241,9 @@ class Executor:
             T_world_ee=here,
             T_world_target=target.T_world_ee,
             progress=progress(self._start, here, target.T_world_ee),
-            closed=np.asarray(float(target.memory.closed)),
+            closed=np.asarray(float(target.key_pose.closed)),
             opening=np.asarray(hand.opening / max(self._robot.open_width, 1e-9)),
-            phase=np.asarray(PHASES.index(target.memory.phase)),
+            phase=np.asarray(PHASES.index(target.key_pose.phase)),
         )
 
     def push_chunk(self, actions: Array) -> None:
@@ -274,15 +274,15 @@ class Executor:
     def _nominal_steps(self) -> int:
         """How long the way to the key pose should take, by the demonstration and by its length here."""
         target = self.plan[self.index]
-        if target.memory.dwell:
-            return target.memory.n_steps
+        if target.key_pose.dwell:
+            return target.key_pose.n_steps
         length = float(se3.distance(self._start, target.T_world_ee))
-        return max(target.memory.n_steps, int(np.ceil(length / self._robot.metres_per_step)))
+        return max(target.key_pose.n_steps, int(np.ceil(length / self._robot.metres_per_step)))
 
     def _finished(self, hand: Hand) -> bool:
         target, settings = self.plan[self.index], self._settings
         time_is_up = self._steps >= self._nominal_steps()
-        if target.memory.dwell or settings.execution == "open_loop":
+        if target.key_pose.dwell or settings.execution == "open_loop":
             return time_is_up
         if settings.execution == "closed_loop" and time_is_up:
             return True
@@ -296,8 +296,8 @@ class Executor:
         """Whether the fingers closed further than the demonstration's did around the object."""
         if self._settings.execution != "closed_loop_trc" or self.index == 0:
             return False
-        before, now = self.plan[self.index - 1].memory, self.plan[self.index].memory
-        passed = [one.memory for one in self.plan[: self.index]]
+        before, now = self.plan[self.index - 1].key_pose, self.plan[self.index].key_pose
+        passed = [one.key_pose for one in self.plan[: self.index]]
         grasped = next((p for p in reversed(passed) if p.phase in ("grasp", "release", "push")), None)
         if not (before.closed and now.closed) or now.phase == "push":
             return False
@@ -316,17 +316,17 @@ class Executor:
         if self._settings.execution != "closed_loop_trc":
             return set()
         ends = [i for i, target in enumerate(self.plan) if target.axis is not None]
-        return {self.plan[i].memory.sub_task for i in ends if self.feels_handle(i)}
+        return {self.plan[i].key_pose.sub_task for i in ends if self.feels_handle(i)}
 
     def feels_handle(self, index: int) -> bool:
         """Whether the fingers hold something before a key pose, so that a loss would show in the opening."""
         held = self._robot.open_width * HOLDING_SHARE
-        return index > 0 and self.plan[index - 1].memory.opening >= held
+        return index > 0 and self.plan[index - 1].key_pose.opening >= held
 
     def try_again(self, why: str) -> bool:
         """Count another attempt at the present key pose; without one left there is no progress."""
         self.attempts += 1
-        phase = self.plan[self.index].memory.phase
+        phase = self.plan[self.index].key_pose.phase
         if self.attempts > self._settings.max_attempts:
             self.status = Status.NO_PROGRESS
             self._queue.clear()
@@ -342,9 +342,9 @@ class Executor:
 
     def entry_index(self) -> int:
         """The first key pose of the way to the present one, at the same anchor and after the last contact."""
-        index, place = self.index, self.plan[self.index].memory.anchor.place
+        index, place = self.index, self.plan[self.index].key_pose.anchor.place
         while index > 0:
-            before = self.plan[index - 1].memory
+            before = self.plan[index - 1].key_pose
             if before.anchor.place != place or before.phase in CONTACTS:
                 break
             index -= 1
@@ -353,9 +353,9 @@ class Executor:
     def retry_index(self) -> int:
         """The first key pose of the approach that the present one depends on."""
         index = self.index
-        while index > 0 and self.plan[index].memory.phase != "approach":
+        while index > 0 and self.plan[index].key_pose.phase != "approach":
             index -= 1
-        while index > 0 and self.plan[index - 1].memory.phase == "approach":
+        while index > 0 and self.plan[index - 1].key_pose.phase == "approach":
             index -= 1
         return index
 

@@ -10,9 +10,9 @@ import numpy as np
 
 from lerobot_openspm.control.reference import choose
 from lerobot_openspm.geometry.se3 import Array
-from lerobot_openspm.memory.compound import Candidate
+from lerobot_openspm.memory.compose import Candidate
 from lerobot_openspm.memory.entry import Reference
-from lerobot_openspm.perception.types import PoseEstimate
+from lerobot_openspm.types import PoseEstimate
 
 logger = logging.getLogger(__name__)
 

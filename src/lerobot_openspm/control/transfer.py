@@ -82,7 +82,7 @@ class Target:
 
     Attributes:
         T_world_ee: Where the hand is to be, ``(4, 4)``.
-        memory: The key pose it was carried over from.
+        key_pose: The key pose it was carried over from.
         precise: Whether it is met by terminal residual correction, or only passed by.
         axis: The constraint that the way here follows, its direction in the world; None in free space.
         push: The way of what is pushed on the way here; None where it is not known or turns, or nothing is
@@ -90,7 +90,7 @@ class Target:
     """
 
     T_world_ee: Array
-    memory: MemoryKeyPose
+    key_pose: MemoryKeyPose
     precise: bool
     axis: Axis | None = None
     push: PushWays | None = None
@@ -156,14 +156,14 @@ def transfer(
 
 def _gone_on(targets: Sequence[Target], sub_task: int, amount: float) -> list[Target]:
     """Key poses of a sub-task whose drawer or knob has gone part of its way: take it where it is."""
-    found = ((i, one.axis) for i, one in enumerate(targets) if one.axis and one.memory.sub_task == sub_task)
+    found = ((i, one.axis) for i, one in enumerate(targets) if one.axis and one.key_pose.sub_task == sub_task)
     end, axis = next(found, (0, None))
     if axis is None:
         return list(targets)
     amount = min(max(amount, 0.0), axis.amount)
     so_far, left = replace(axis, amount=amount), replace(axis, amount=axis.amount - amount)
     before = [
-        replace(one, T_world_ee=so_far.follow(one.T_world_ee)) if one.memory.sub_task == sub_task else one
+        replace(one, T_world_ee=so_far.follow(one.T_world_ee)) if one.key_pose.sub_task == sub_task else one
         for one in targets[:end]
     ]
     return [*before, replace(targets[end], axis=left), *targets[end + 1 :]]
@@ -204,13 +204,18 @@ def _release(targets: Sequence[Target]) -> list[Target]:
     A benchmark ends an episode when its goal first holds, which an object that is being lowered may do.
     """
     last = targets[-1]
-    if last.memory.phase != "place":
+    if last.key_pose.phase != "place":
         return []
-    waits = [target.memory.n_steps for target in targets if target.memory.dwell]
-    memory = replace(
-        last.memory, phase="release", closed=False, n_steps=max(waits, default=1), dwell=True, confidence=0.5
+    waits = [target.key_pose.n_steps for target in targets if target.key_pose.dwell]
+    key_pose = replace(
+        last.key_pose,
+        phase="release",
+        closed=False,
+        n_steps=max(waits, default=1),
+        dwell=True,
+        confidence=0.5,
     )
-    return [Target(last.T_world_ee, memory, precise=True)]
+    return [Target(last.T_world_ee, key_pose, precise=True)]
 
 
 def _retreat(targets: Sequence[Target]) -> tuple[Target, ...]:
@@ -223,9 +228,9 @@ def _retreat(targets: Sequence[Target]) -> tuple[Target, ...]:
         i
         for i, target in enumerate(targets)
         if i > 0
-        and (target.memory.phase == "place" or (target.memory.phase == "approach" and target.precise))
+        and (target.key_pose.phase == "place" or (target.key_pose.phase == "approach" and target.precise))
     ]
-    contacts = [target for target in targets if target.memory.phase in CONTACT_PHASES]
+    contacts = [target for target in targets if target.key_pose.phase in CONTACT_PHASES]
     if not arrivals or not contacts:
         return ()
     last, contact = targets[-1], contacts[-1]
@@ -234,7 +239,7 @@ def _retreat(targets: Sequence[Target]) -> tuple[Target, ...]:
     arrival, before = targets[arrivals[-1]], targets[arrivals[-1] - 1]
     back = (se3.inverse(arrival.T_world_ee) @ before.T_world_ee)[:3, 3]
     step = se3.transform(np.eye(3), RETREAT_M * back / max(float(np.linalg.norm(back)), 1e-9))
-    memory = replace(last.memory, phase="retreat", n_steps=1, dwell=False, confidence=0.5)
+    key_pose = replace(last.key_pose, phase="retreat", n_steps=1, dwell=False, confidence=0.5)
     return (Target(contact.T_world_ee @ step, memory, precise=False),)
 
 
@@ -248,7 +253,7 @@ def rise(last: Target, height: float) -> tuple[Target, ...]:
     if height - T_world_ee[2, 3] < LEVEL_M:
         return ()
     T_world_ee[2, 3] = height
-    memory = replace(last.memory, phase="retreat", n_steps=1, dwell=False, axis=None, confidence=0.5)
+    key_pose = replace(last.key_pose, phase="retreat", n_steps=1, dwell=False, axis=None, confidence=0.5)
     return (Target(T_world_ee, memory, precise=False),)
 
 
@@ -311,7 +316,7 @@ def check_transfer(
     low, high = robot.workspace
     before = T_world_ee
     for i, target in enumerate(targets):
-        where = f"key pose {i} ({target.memory.phase} at {target.memory.anchor.place})"
+        where = f"key pose {i} ({target.key_pose.phase} at {target.key_pose.anchor.place})"
         p = target.T_world_ee[:3, 3]
         outside = np.maximum(np.maximum(low - p, p - high), 0.0)
         if (beyond := float(np.linalg.norm(outside[:2]))) > limits.reach_margin_m or (

@@ -6,8 +6,8 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from lerobot_openspm.envs.scene import CAMERA_NAMES
-from lerobot_openspm.envs.simulator import compiled_model
+from lerobot_openspm.envs.tabletop.scene import CAMERA_NAMES
+from lerobot_openspm.envs.tabletop.simulator import compiled_model
 
 # MuJoCo's cameras look along -z with y up, OpenCV's along z with y down.
 MUJOCO_FROM_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])

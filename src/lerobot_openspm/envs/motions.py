@@ -12,7 +12,7 @@ from typing import Protocol
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from lerobot_openspm.envs.simulator import HOME_ROTATION, MAX_STEP_M, MAX_STEP_RAD
+from lerobot_openspm.envs.tabletop.simulator import HOME_ROTATION, MAX_STEP_M, MAX_STEP_RAD
 
 GAIN = 0.5
 ACTION_NOISE = 0.03

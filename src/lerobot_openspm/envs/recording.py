@@ -114,7 +114,7 @@ def source(env_type: str) -> Source:
         ValueError: There is no such source, or it is not installed.
     """
     if env_type == "openspm_tabletop":
-        from lerobot_openspm.envs.tabletop_recording import TabletopSource
+        from lerobot_openspm.envs.tabletop.recording import TabletopSource
 
         return TabletopSource()
     if env_type == "libero":

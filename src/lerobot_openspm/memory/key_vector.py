@@ -15,8 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csr_array  # pyright: ignore[reportMissingTypeStubs]
 
+from lerobot_openspm.language.meaning import canonical
 from lerobot_openspm.memory.entry import Reference, SubTask
-from lerobot_openspm.memory.meaning import canonical
 
 Vectors = NDArray[np.float32]
 

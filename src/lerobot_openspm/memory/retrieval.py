@@ -7,12 +7,12 @@ from dataclasses import dataclass
 from functools import partial
 
 from lerobot_openspm.errors import InstructionError
+from lerobot_openspm.language.instruction import parse_instruction, read_task
+from lerobot_openspm.language.meaning import means_the_same, semantic_score
+from lerobot_openspm.language.names import TABLE_NAMES, AmongKnown, NameSimilarity
+from lerobot_openspm.language.own_words import normal_words, unread
 from lerobot_openspm.memory.entry import MemoryEntry, SubTask
 from lerobot_openspm.memory.indexed_entries import known_names, near
-from lerobot_openspm.memory.instruction import parse_instruction, read_task
-from lerobot_openspm.memory.meaning import means_the_same, semantic_score
-from lerobot_openspm.memory.names import TABLE_NAMES, AmongKnown, NameSimilarity
-from lerobot_openspm.memory.own_words import normal_words, unread
 
 # Below this semantic score an entry is about something else.
 MIN_SEMANTIC = 0.75
@@ -149,7 +149,7 @@ def _unknown(
     is_near = nearest is not None and scores[nearest.key.sub_tasks] > 0
     did_you_mean = f"; did you mean {nearest.language!r}?" if nearest is not None and is_near else ""
     return (
-        f"the memory holds no experience for the instruction {instruction!r}{did_you_mean or ';'} it knows: "
+        f"the memory holds no memory for the instruction {instruction!r}{did_you_mean or ';'} it knows: "
         f"{known}. Record demonstrations of it and train again, or use one of these instructions"
     )
 

@@ -11,6 +11,7 @@ import numpy as np
 from lerobot_openspm.errors import MemoryFormatError
 from lerobot_openspm.geometry import se3
 from lerobot_openspm.geometry.se3 import Array
+from lerobot_openspm.language.vocabulary import REFERENCES, RELATIONS, VERBS
 from lerobot_openspm.memory.entry import (
     OWN_WORDS,
     PHASES,
@@ -40,7 +41,6 @@ from lerobot_openspm.memory.fields import (
     texts,
 )
 from lerobot_openspm.memory.robot import RobotModel
-from lerobot_openspm.memory.vocabulary import REFERENCES, RELATIONS, VERBS
 
 ENTRY = frozenset(
     (

@@ -10,7 +10,7 @@ import numpy as np
 
 from lerobot_openspm.geometry import se3
 from lerobot_openspm.geometry.se3 import Array
-from lerobot_openspm.memory.compound import sub_task_index
+from lerobot_openspm.memory.compose import sub_task_index
 from lerobot_openspm.memory.entry import CONTACT_PHASES, WORLD, Anchor, SubTask
 from lerobot_openspm.mining.key_poses import KeyPose
 

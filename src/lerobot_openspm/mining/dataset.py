@@ -18,14 +18,14 @@ from numpy.typing import NDArray
 
 from lerobot_openspm.errors import DatasetError
 from lerobot_openspm.geometry.camera import Camera
-from lerobot_openspm.geometry.layout import VectorLayout
 from lerobot_openspm.geometry.se3 import Array
+from lerobot_openspm.geometry.vector_layout import VectorLayout
 from lerobot_openspm.mining.columns import TYPES, decode_key_poses
 from lerobot_openspm.mining.key_poses import KeyPose
 from lerobot_openspm.mining.signals import Episode
 from lerobot_openspm.perception.layers import DEPTH, MASKS, depth_of, labels_of
 from lerobot_openspm.perception.oracle import decode_object_poses
-from lerobot_openspm.perception.types import View
+from lerobot_openspm.types import View
 
 # True object poses of simulated demonstrations; read for the oracle ablation alone.
 SIMULATOR_POSES = "simulator.object_poses"

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 
 from lerobot_openspm.errors import DatasetError
 from lerobot_openspm.geometry import se3
-from lerobot_openspm.memory.compound import sub_task_index
+from lerobot_openspm.memory.compose import sub_task_index
 from lerobot_openspm.memory.entry import (
     CONTACT_PHASES,
     Anchor,

@@ -16,12 +16,12 @@ from lerobot_openspm.mining.dataset import Demonstrations
 from lerobot_openspm.mining.key_poses import KeyPose
 from lerobot_openspm.mining.mined import MinedEpisode
 from lerobot_openspm.mining.outcomes import carried_to
-from lerobot_openspm.perception.learning import Shape, learn_objects
-from lerobot_openspm.perception.localise import localise_all
-from lerobot_openspm.perception.model import KnownObject
-from lerobot_openspm.perception.object_shape import ShapeBackend
+from lerobot_openspm.perception.objects.learning import Shape, learn_objects
+from lerobot_openspm.perception.objects.localise import localise_all
+from lerobot_openspm.perception.objects.model import KnownObject
+from lerobot_openspm.perception.objects.object_shape import ShapeBackend
 from lerobot_openspm.perception.oracle import name_simulator_poses
-from lerobot_openspm.perception.types import Hint, PoseEstimate, Scene, Segmenter
+from lerobot_openspm.types import ContactCue, PoseEstimate, Scene, Segmenter
 
 logger = logging.getLogger(__name__)
 
@@ -114,7 +114,7 @@ def _ends(
     return {**carried, **sure}
 
 
-def _place(name: str, estimate: PoseEstimate, touched: Sequence[Hint]) -> Array | None:
+def _place(name: str, estimate: PoseEstimate, touched: Sequence[ContactCue]) -> Array | None:
     """Where an object is; of several that look alike, the one that the hand went to. None if unknown."""
     points = [hint.point_world[:2] for hint in touched if hint.name == name]
     if estimate.status == "not_found" or (estimate.status == "ambiguous" and not points):
@@ -147,21 +147,23 @@ def simulator_poses(
     return found, ends, names
 
 
-def hints(item: MinedEpisode) -> tuple[Hint, ...]:
+def hints(item: MinedEpisode) -> tuple[ContactCue, ...]:
     """Where the hand touched the objects of the instruction, for perception to learn their looks from."""
     found = []
     for pose in item.key_poses:
         sub_task, point = sub_task_of(pose, item.sub_tasks), pose.T_world_ee[:3, 3]
         if pose.phase == "grasp":
-            found.append(Hint(sub_task.target, point, "grasp", f"{item.episode.task}: {len(found)}"))
+            found.append(ContactCue(sub_task.target, point, "grasp", f"{item.episode.task}: {len(found)}"))
         elif pose.phase == "release" and sub_task.relation and not sub_task.part:
             # What goes into an opened part lies where nothing was to be seen in the first frame.
-            found.append(Hint(sub_task.landmark, point, "release", f"{item.episode.task}: {len(found)}"))
+            found.append(
+                ContactCue(sub_task.landmark, point, "release", f"{item.episode.task}: {len(found)}")
+            )
     for before, pose in zip(item.key_poses[:-1], item.key_poses[1:], strict=True):
         if pose.phase == "push" != before.phase:
             target = sub_task_of(pose, item.sub_tasks).target
             place = f"{item.episode.task}: {len(found)}"
-            found.append(Hint(target, before.T_world_ee[:3, 3], "contact", place))
+            found.append(ContactCue(target, before.T_world_ee[:3, 3], "contact", place))
     return tuple(found)
 
 

@@ -20,8 +20,8 @@ from lerobot.datasets import LeRobotDataset, LeRobotDatasetMetadata
 
 from lerobot_openspm.errors import CalibrationError, DatasetError
 from lerobot_openspm.geometry.camera import Camera, check_sizes
-from lerobot_openspm.geometry.layout import VectorLayout
-from lerobot_openspm.memory.instruction import read_tasks
+from lerobot_openspm.geometry.vector_layout import VectorLayout
+from lerobot_openspm.language.instruction import read_tasks
 from lerobot_openspm.memory.robot import RobotModel
 from lerobot_openspm.mining.anchors import as_shown, things_taken
 from lerobot_openspm.mining.dataset import Demonstrations, open_dataset
@@ -30,10 +30,10 @@ from lerobot_openspm.mining.mined import MinedDataset, MinedEpisode, MinedKeyPos
 from lerobot_openspm.mining.objects import find_objects, learn_scenes, simulator_poses
 from lerobot_openspm.mining.signals import Episode, observe_robot
 from lerobot_openspm.mining.tasks import compare
-from lerobot_openspm.perception.learning import Shape
-from lerobot_openspm.perception.model import KnownObject
-from lerobot_openspm.perception.object_shape import ShapeBackend
-from lerobot_openspm.perception.types import Segmenter
+from lerobot_openspm.perception.objects.learning import Shape
+from lerobot_openspm.perception.objects.model import KnownObject
+from lerobot_openspm.perception.objects.object_shape import ShapeBackend
+from lerobot_openspm.types import Segmenter
 
 logger = logging.getLogger(__name__)
 

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from lerobot_openspm.geometry.camera import ray_directions
 from lerobot_openspm.geometry.se3 import Array
-from lerobot_openspm.perception.silhouette import Float32
-from lerobot_openspm.perception.types import Mask, View
+from lerobot_openspm.perception.objects.shape.silhouette import Float32
+from lerobot_openspm.types import Mask, View
 
 
 @dataclass(frozen=True)

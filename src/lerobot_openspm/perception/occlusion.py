@@ -8,7 +8,7 @@ import numpy as np
 from lerobot_openspm.geometry import se3
 from lerobot_openspm.geometry.camera import project
 from lerobot_openspm.geometry.se3 import Array
-from lerobot_openspm.perception.types import Mask, View
+from lerobot_openspm.types import Mask, View
 
 # The hand and the arm behind it as balls along the hand's approach axis: from its fingertips this far back.
 TIP_M, BACK_M, BALLS = 0.01, -0.30, 12

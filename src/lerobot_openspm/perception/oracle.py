@@ -8,7 +8,7 @@ import numpy as np
 
 from lerobot_openspm.geometry import se3
 from lerobot_openspm.geometry.se3 import Array
-from lerobot_openspm.perception.model import KnownObject
+from lerobot_openspm.perception.objects.model import KnownObject
 
 
 def decode_object_poses(values: Array, names: Sequence[str]) -> dict[str, Array]:

@@ -8,12 +8,12 @@ import numpy as np
 from tests.perception.drawn_world import SHAPES, TABLE, draw_poses, render, views_of
 from tests.perception.segmentation import tiny_models
 
-from lerobot_openspm.perception.model import ObjectModel
+from lerobot_openspm.perception.objects.model import ObjectModel
 from lerobot_openspm.perception.segmentation.given import GivenSegmenter
 from lerobot_openspm.perception.segmentation.grounded_sam2 import GroundedSam2Segmenter
 from lerobot_openspm.perception.segmentation.learned import LearnedSegmenter
 from lerobot_openspm.perception.segmentation.sam3 import Sam3Segmenter
-from lerobot_openspm.perception.types import Segmenter, View
+from lerobot_openspm.types import Segmenter, View
 
 Views = dict[str, View]
 PHRASES = ("block", "cup")

@@ -8,7 +8,7 @@ import torch
 from tests.perception.segmentation.backends import BACKENDS, PHRASES, Backend, demonstrations
 
 from lerobot_openspm.errors import ObservationError, PerceptionError
-from lerobot_openspm.perception.model import ObjectModel
+from lerobot_openspm.perception.objects.model import ObjectModel
 
 
 @pytest.fixture(scope="module", autouse=True)

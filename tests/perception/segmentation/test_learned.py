@@ -8,7 +8,7 @@ from tests.perception.builders import model, patch_model
 from tests.perception.segmentation.backends import LABELS, PHRASES, Backend, demonstrations
 
 from lerobot_openspm.errors import PerceptionError
-from lerobot_openspm.perception.model import ObjectModel
+from lerobot_openspm.perception.objects.model import ObjectModel
 from lerobot_openspm.perception.segmentation.learned import LearnedSegmenter
 
 

@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 
 from lerobot_openspm.errors import PerceptionError
 from lerobot_openspm.perception.segmentation.instances import check_query
-from lerobot_openspm.perception.types import Segmentation, View
+from lerobot_openspm.types import Segmentation, View
 
 
 class GivenSegmenter:
@@ -31,7 +31,7 @@ class GivenSegmenter:
     def segment(
         self, views: Mapping[str, View], phrases: Sequence[str]
     ) -> dict[str, dict[str, tuple[Segmentation, ...]]]:
-        """See :class:`lerobot_openspm.perception.types.Segmenter`.
+        """See :class:`lerobot_openspm.types.Segmenter`.
 
         Raises:
             PerceptionError: A phrase without a number, or a view without labels of the image's size.

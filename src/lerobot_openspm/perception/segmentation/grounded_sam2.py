@@ -15,7 +15,7 @@ from lerobot_openspm.errors import PerceptionError
 from lerobot_openspm.geometry.se3 import Array
 from lerobot_openspm.perception.segmentation.instances import check_query, distinct_instances
 from lerobot_openspm.perception.segmentation.pretrained import fetch, load_model, load_processor
-from lerobot_openspm.perception.types import Segmentation, View
+from lerobot_openspm.types import Segmentation, View
 
 DETECTOR_WEIGHTS = "IDEA-Research/grounding-dino-tiny"
 MASK_WEIGHTS = "facebook/sam2.1-hiera-tiny"
@@ -79,7 +79,7 @@ class GroundedSam2Segmenter:
     def segment(
         self, views: Mapping[str, View], phrases: Sequence[str]
     ) -> dict[str, dict[str, tuple[Segmentation, ...]]]:
-        """See :class:`lerobot_openspm.perception.types.Segmenter`.
+        """See :class:`lerobot_openspm.types.Segmenter`.
 
         Raises:
             PerceptionError: A phrase is empty or too long.

@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 
 from lerobot_openspm.errors import PerceptionError
 from lerobot_openspm.geometry.se3 import Array
-from lerobot_openspm.perception.localise import Prepared, prepare
-from lerobot_openspm.perception.types import Segmentation, View
+from lerobot_openspm.perception.objects.localise import Prepared, prepare
+from lerobot_openspm.types import Segmentation, View
 
 # Intersection over union from which on two masks of one phrase are the same instance.
 DUPLICATE_OVERLAP = 0.7

@@ -10,10 +10,10 @@ from numpy.typing import NDArray
 from lerobot_openspm.errors import PerceptionError
 from lerobot_openspm.perception import colour
 from lerobot_openspm.perception.blobs import find_blobs
-from lerobot_openspm.perception.localise import Prepared
-from lerobot_openspm.perception.model import KnownObject, ObjectModel, PatchModel
+from lerobot_openspm.perception.objects.localise import Prepared
+from lerobot_openspm.perception.objects.model import KnownObject, ObjectModel, PatchModel
 from lerobot_openspm.perception.segmentation.instances import check_query, distinct_instances
-from lerobot_openspm.perception.types import Segmentation, View
+from lerobot_openspm.types import Segmentation, View
 
 # Smaller blobs of an object's colours are noise.
 MIN_BLOB_PX = 12
@@ -40,7 +40,7 @@ class LearnedSegmenter:
     def segment(
         self, views: Mapping[str, View], phrases: Sequence[str]
     ) -> dict[str, dict[str, tuple[Segmentation, ...]]]:
-        """See :class:`lerobot_openspm.perception.types.Segmenter`.
+        """See :class:`lerobot_openspm.types.Segmenter`.
 
         Raises:
             PerceptionError: A phrase that no demonstration has taught, or of an object without a mask.

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 
 from lerobot_openspm.errors import PerceptionError
-from lerobot_openspm.perception.model import KnownObject
+from lerobot_openspm.perception.objects.model import KnownObject
 from lerobot_openspm.perception.segmentation.given import GivenSegmenter
 from lerobot_openspm.perception.segmentation.grounded_sam2 import (
     DETECTOR_WEIGHTS,
@@ -14,7 +14,7 @@ from lerobot_openspm.perception.segmentation.grounded_sam2 import (
 )
 from lerobot_openspm.perception.segmentation.learned import LearnedSegmenter
 from lerobot_openspm.perception.segmentation.sam3 import WEIGHTS, Sam3Segmenter
-from lerobot_openspm.perception.types import Segmenter
+from lerobot_openspm.types import Segmenter
 
 # What each backend loads if nothing else is asked for.
 DEFAULT_WEIGHTS: dict[str, tuple[str, ...]] = {

@@ -11,7 +11,7 @@ import numpy as np
 from lerobot_openspm.errors import PerceptionError
 from lerobot_openspm.perception.segmentation.instances import check_query, distinct_instances
 from lerobot_openspm.perception.segmentation.pretrained import fetch, load_model, load_processor
-from lerobot_openspm.perception.types import Segmentation, View
+from lerobot_openspm.types import Segmentation, View
 
 WEIGHTS = "facebook/sam3"
 # What the model's authors take.
@@ -55,7 +55,7 @@ class Sam3Segmenter:
     def segment(
         self, views: Mapping[str, View], phrases: Sequence[str]
     ) -> dict[str, dict[str, tuple[Segmentation, ...]]]:
-        """See :class:`lerobot_openspm.perception.types.Segmenter`.
+        """See :class:`lerobot_openspm.types.Segmenter`.
 
         Raises:
             PerceptionError: A phrase is empty or too long.

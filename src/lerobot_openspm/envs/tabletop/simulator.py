@@ -1,0 +1,285 @@
+"""The MuJoCo side of the tabletop: physics, the hand's bounded drive, contacts, true poses and rendering."""
+
+# mujoco ships no stubs for its compiled part.
+# pyright: reportAttributeAccessIssue=false
+
+import atexit
+import copy
+import functools
+import math
+import weakref
+from typing import Any
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from lerobot_openspm.envs.gl_backend import rendering_error, set_default_gl_backend
+from lerobot_openspm.envs.tabletop import scene
+from lerobot_openspm.envs.tabletop.placement import Placement
+
+set_default_gl_backend()
+
+# After the choice of the backend: mujoco loads it on import, and fails there when its libraries are missing.
+try:
+    import mujoco
+except (ImportError, AttributeError, OSError, RuntimeError) as error:
+    raise rendering_error(error) from error
+
+CONTROL_PERIOD_S = 0.05
+# The target moves in this many equal parts per control step, so that the hand is pulled smoothly.
+TARGET_PARTS = 5
+STEPS_PER_PART = round(CONTROL_PERIOD_S / scene.TIMESTEP_S / TARGET_PARTS)
+MAX_STEP_M = 0.02
+MAX_STEP_RAD = 0.15
+# How far the target may lead the hand: it bounds the force and keeps a blocked hand from winding up.
+MAX_LEAD_M = 0.03
+MAX_LEAD_RAD = 0.30
+WORKSPACE_LOW = np.array([-0.40, -0.46, 0.010])
+WORKSPACE_HIGH = np.array([0.50, 0.46, 0.58])
+SETTLE_STEPS = 120
+HOME_ROTATION = np.diag([1.0, -1.0, -1.0])
+FINGER_OPEN_M = scene.FINGER_TRAVEL
+# Beyond closed, so that the position drive keeps pressing on whatever is between the fingers.
+FINGER_CLOSED_M = -0.02
+HAND_BODIES = ("hand", "finger_left", "finger_right")
+
+
+@functools.cache
+def compiled_model(second_bowl: bool = False) -> mujoco.MjModel:
+    """Compile a scene once per process; every simulator works on its own copy."""
+    return mujoco.MjModel.from_xml_string(scene.build_mjcf(second_bowl))
+
+
+def _bounded(vector: np.ndarray, limit: float) -> np.ndarray:
+    length = float(np.linalg.norm(vector))
+    return vector if length <= limit else vector * (limit / length)
+
+
+class TabletopSimulator:
+    """One tabletop. Instances share nothing but the compiled model, of which each has its own copy.
+
+    Args:
+        second_bowl: Whether there is another bowl just like the first, `scene.SECOND_BOWL`.
+    """
+
+    def __init__(self, second_bowl: bool = False) -> None:
+        self.model: mujoco.MjModel = copy.copy(compiled_model(second_bowl))
+        self.data = mujoco.MjData(self.model)
+        self._renderers: dict[tuple[int, int], Any] = {}
+        self._movable = (*scene.MOVABLE_NAMES, *((scene.SECOND_BOWL,) if second_bowl else ()))
+        fingers = ("finger_left", "finger_right")
+        bodies = ("hand", *scene.OBJECT_NAMES, *self._movable, *scene.DRAWER_NAMES, "knob", *fingers)
+        joints = ("hand", *fingers, "knob", *self._movable, *scene.DRAWER_NAMES)
+        self._body = {n: self.model.body(n).id for n in bodies}
+        self._qpos = {n: int(self.model.joint(n).qposadr[0]) for n in joints}
+        self._dof = {n: int(self.model.joint(n).dofadr[0]) for n in joints}
+        self._hand_bodies = {self._body[n] for n in HAND_BODIES}
+        self._geom_labels = self._label_geoms()
+        self._target_position = np.array(scene.HOME_POSITION)
+        self._target_rotation = HOME_ROTATION.copy()
+
+    def reset(self, layout: dict[str, Placement]) -> None:
+        """Place every object, put the hand home with open fingers and let the scene settle."""
+        mujoco.mj_resetData(self.model, self.data)
+        for name, at in layout.items():
+            quat_wxyz = (math.cos(at.yaw / 2), 0.0, 0.0, math.sin(at.yaw / 2))
+            if name in self._movable:
+                start = self._qpos[name]
+                self.data.qpos[start : start + 7] = (at.x, at.y, 0.0, *quat_wxyz)
+            else:
+                self.model.body_pos[self._body[name]] = (at.x, at.y, 0.0)
+                self.model.body_quat[self._body[name]] = quat_wxyz
+        hand = self._qpos["hand"]
+        self.data.qpos[hand : hand + 7] = (*scene.HOME_POSITION, 0.0, 1.0, 0.0, 0.0)
+        self.data.qpos[self._qpos["finger_left"]] = FINGER_OPEN_M
+        self.data.qpos[self._qpos["finger_right"]] = -FINGER_OPEN_M
+        self._target_position = np.array(scene.HOME_POSITION)
+        self._target_rotation = HOME_ROTATION.copy()
+        self._drive_fingers(closing=False)
+        self._write_target(self._target_position, self._target_rotation)
+        mujoco.mj_step(self.model, self.data, SETTLE_STEPS)
+        mujoco.mj_forward(self.model, self.data)
+
+    def apply(self, action: np.ndarray) -> None:
+        """Advance one control step (0.05 s).
+
+        Args:
+            action: (7,) in [-1, 1]: world-frame position increment in units of 0.02 m, world-frame rotation
+                vector in units of 0.15 rad (left-multiplied), gripper (positive closes, else opens).
+        """
+        before = self._target_position, Rotation.from_matrix(self._target_rotation)
+        self._integrate_target(np.asarray(action, dtype=np.float64))
+        self._drive_fingers(closing=bool(action[6] > 0))
+        turn = (Rotation.from_matrix(self._target_rotation) * before[1].inv()).as_rotvec()
+        for part in range(1, TARGET_PARTS + 1):
+            share = part / TARGET_PARTS
+            position = before[0] + share * (self._target_position - before[0])
+            self._write_target(position, (Rotation.from_rotvec(share * turn) * before[1]).as_matrix())
+            mujoco.mj_step(self.model, self.data, STEPS_PER_PART)
+        # Positions, contacts and the camera poses as of now, not as of one physics step ago.
+        mujoco.mj_forward(self.model, self.data)
+
+    def _integrate_target(self, action: np.ndarray) -> None:
+        ee = self.ee_pose()
+        position = self._target_position + action[:3] * MAX_STEP_M
+        position = ee[:3, 3] + _bounded(position - ee[:3, 3], MAX_LEAD_M)
+        self._target_position = np.clip(position, WORKSPACE_LOW, WORKSPACE_HIGH)
+        actual = Rotation.from_matrix(ee[:3, :3])
+        wanted = Rotation.from_rotvec(action[3:6] * MAX_STEP_RAD) * Rotation.from_matrix(
+            self._target_rotation
+        )
+        lead = _bounded((wanted * actual.inv()).as_rotvec(), MAX_LEAD_RAD)
+        self._target_rotation = (Rotation.from_rotvec(lead) * actual).as_matrix()
+
+    def _write_target(self, position: np.ndarray, rotation: np.ndarray) -> None:
+        self.data.mocap_pos[0] = position
+        mujoco.mju_mat2Quat(self.data.mocap_quat[0], np.ascontiguousarray(rotation).reshape(9))
+
+    def _drive_fingers(self, closing: bool) -> None:
+        goal = FINGER_CLOSED_M if closing else FINGER_OPEN_M
+        self.data.ctrl[:] = (goal, -goal)
+
+    def ee_pose(self) -> np.ndarray:
+        """T_world_ee, (4, 4): the point between the fingertips; z out of the hand, fingers open along y."""
+        return self._pose("hand")
+
+    def object_poses(self) -> dict[str, np.ndarray]:
+        """T_world_obj, (4, 4), per name in `scene.OBJECT_NAMES`."""
+        return {name: self._pose(name) for name in scene.OBJECT_NAMES}
+
+    def _pose(self, body: str) -> np.ndarray:
+        index = self._body[body]
+        pose = np.eye(4)
+        pose[:3, :3] = self.data.xmat[index].reshape(3, 3)
+        pose[:3, 3] = self.data.xpos[index]
+        return pose
+
+    def finger_positions(self) -> np.ndarray:
+        """(2,) metres: left is positive, right negative, as in LIBERO; (0.04, -0.04) is open.
+
+        The joints' stops are soft: fingers that press on nothing go a little beyond, which reads as closed.
+        """
+        left, right = (float(self.data.qpos[self._qpos[name]]) for name in ("finger_left", "finger_right"))
+        return np.array([max(left, 0.0), min(right, 0.0)])
+
+    def put(self, name: str, T_world_obj: np.ndarray) -> None:
+        """Put a movable object somewhere else at once, at rest: somebody moved it, or it slipped and fell."""
+        start = self._qpos[name]
+        x, y, z, w = Rotation.from_matrix(T_world_obj[:3, :3]).as_quat()
+        self.data.qpos[start : start + 7] = (*T_world_obj[:3, 3], w, x, y, z)
+        self.data.qvel[self._dof[name] : self._dof[name] + 6] = 0.0
+        mujoco.mj_forward(self.model, self.data)
+
+    def place_camera(self, name: str, T_world_cam: np.ndarray) -> None:
+        """Put a camera that is fixed in the world elsewhere; the pose is OpenCV's (4, 4): x right, y down."""
+        index = self.model.camera(name).id
+        R_world_mujoco = T_world_cam[:3, :3] @ np.diag([1.0, -1.0, -1.0])
+        self.model.cam_pos[index] = T_world_cam[:3, 3]
+        self.model.cam_quat[index] = np.roll(Rotation.from_matrix(R_world_mujoco).as_quat(), 1)
+        mujoco.mj_forward(self.model, self.data)
+
+    def joint_position(self, name: str) -> float:
+        """Metres a drawer is pulled out, or radians the knob is turned."""
+        return float(self.data.qpos[self._qpos[name]])
+
+    def is_at_rest(self, name: str, linear: float = 0.02, angular: float = 0.4) -> bool:
+        """Whether an object, a drawer or the knob moves slower than `linear` m/s and `angular` rad/s."""
+        start = self._dof[name]
+        if name not in self._movable:
+            return abs(self.data.qvel[start]) < (angular if name == "knob" else linear)
+        velocity = self.data.qvel[start : start + 6]
+        return bool(np.linalg.norm(velocity[:3]) < linear and np.linalg.norm(velocity[3:]) < angular)
+
+    def touching(self, name: str) -> set[str]:
+        """Names of the bodies in contact with body `name`; "hand" is palm or fingers, "world" the table."""
+        own = {self._body[name]}
+        touched = set()
+        for contact in self.data.contact:
+            a, b = self.model.geom_bodyid[contact.geom1], self.model.geom_bodyid[contact.geom2]
+            if contact.dist < 0.0005 and (a in own or b in own):
+                other = int(b if a in own else a)
+                touched.add("hand" if other in self._hand_bodies else self.model.body(other).name)
+        return touched
+
+    def is_unstable(self) -> bool:
+        """Whether the state is not finite, or MuJoCo warned: of a bad state, or of contacts left out."""
+        warned = any(warning.number > 0 for warning in self.data.warning)
+        return warned or not bool(np.isfinite(self.data.qpos).all() and np.isfinite(self.data.qvel).all())
+
+    def render(self, camera: str, height: int, width: int) -> np.ndarray:
+        """Render a camera to an upright (height, width, 3) uint8 RGB image.
+
+        Raises:
+            RenderingUnavailableError: The OpenGL stack of this machine is incomplete.
+        """
+        return np.ascontiguousarray(self._looking_through(camera, height, width).render())
+
+    def render_labels(self, camera: str, height: int, width: int) -> np.ndarray:
+        """Number of the object that each pixel shows, (height, width) int32, as in `scene.OBJECT_LABELS`.
+
+        Drawers and their handles are the cabinet's, the knob is the stove's; 0 is the hand and the room.
+
+        Raises:
+            RenderingUnavailableError: The OpenGL stack of this machine is incomplete.
+        """
+        renderer = self._looking_through(camera, height, width)
+        renderer.enable_segmentation_rendering()
+        try:
+            geoms, kinds = np.moveaxis(renderer.render(), -1, 0)
+        finally:
+            renderer.disable_segmentation_rendering()
+        is_geom = kinds == mujoco.mjtObj.mjOBJ_GEOM
+        return np.where(is_geom, self._geom_labels[np.where(is_geom, geoms, 0)], 0).astype(np.int32)
+
+    def render_depth(self, camera: str, height: int, width: int) -> np.ndarray:
+        """Distance along the optical axis of what each pixel shows, (height, width) float32 metres.
+
+        Raises:
+            RenderingUnavailableError: The OpenGL stack of this machine is incomplete.
+        """
+        renderer = self._looking_through(camera, height, width)
+        renderer.enable_depth_rendering()
+        try:
+            return np.array(renderer.render())
+        finally:
+            renderer.disable_depth_rendering()
+
+    def _looking_through(self, camera: str, height: int, width: int) -> Any:
+        renderer = self._renderers.get((height, width))
+        if renderer is None:
+            renderer = self._renderers[(height, width)] = _make_renderer(self.model, height, width)
+            # mujoco shuts EGL down at exit; registered after that hook, this one runs before it.
+            atexit.register(_close_at_exit, weakref.ref(self))
+        renderer.update_scene(self.data, camera=camera)
+        return renderer
+
+    def _label_geoms(self) -> np.ndarray:
+        """Number of each geom's object, (ngeom,); drawers and knob hang on their objects."""
+        labels = np.zeros(self.model.ngeom, np.int32)
+        roots = self.model.body_rootid[self.model.geom_bodyid]
+        for name, number in scene.OBJECT_LABELS.items():
+            labels[roots == self._body[name]] = number
+        if scene.SECOND_BOWL in self._body:
+            labels[roots == self._body[scene.SECOND_BOWL]] = scene.OBJECT_LABELS["bowl"]
+        return labels
+
+    def close(self) -> None:
+        """Free the renderers' OpenGL contexts."""
+        while self._renderers:
+            self._renderers.popitem()[1].close()
+
+
+def _close_at_exit(reference: "weakref.ref[TabletopSimulator]") -> None:
+    simulator = reference()
+    if simulator is not None:
+        simulator.close()
+
+
+def _make_renderer(model: mujoco.MjModel, height: int, width: int) -> Any:
+    try:
+        renderer = mujoco.Renderer(model, height, width)
+    except (RuntimeError, ImportError, AttributeError, OSError, mujoco.FatalError) as error:
+        raise rendering_error(error) from error
+    renderer.scene.flags[mujoco.mjtRndFlag.mjRND_SHADOW] = False
+    renderer.scene.flags[mujoco.mjtRndFlag.mjRND_REFLECTION] = False
+    return renderer

@@ -1,0 +1,1 @@
+"""English in, subtasks and similarities out. No other room knows a word of English."""

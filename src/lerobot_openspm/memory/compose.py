@@ -1,0 +1,220 @@
+"""Compound tasks: what an entry teaches by its parts, and by which entries an instruction is carried out.
+
+"open the top drawer and put the bowl inside" also teaches "open the top drawer". An instruction that no
+demonstration shows as a whole is carried out by entries of its parts, one after another.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from functools import partial
+
+from lerobot_openspm.errors import InstructionError
+from lerobot_openspm.language.meaning import semantic_score
+from lerobot_openspm.language.names import TABLE_NAMES, NameSimilarity
+from lerobot_openspm.language.own_words import normal_words
+from lerobot_openspm.memory.entry import MemoryEntry, MemoryKeyPose, Reference, RetrievalKey, SubTask
+from lerobot_openspm.memory.indexed_entries import near
+from lerobot_openspm.memory.retrieval import candidates_for, read_instruction, why_unread
+
+# A sub-task takes hold of something and lets it go again.
+TRANSITIONS_PER_SUB_TASK = 2
+# Ways through free space; without the objects they are relative to, the hand finds another way.
+FREE_PHASES = ("approach", "lift", "pre-place", "retreat")
+# Relations that are not the preposition that one says.
+_PREPOSITIONS = {
+    "front of": "to the front of", "left of": "to the left of", "right of": "to the right of", "at": "to",
+    "front": "in front of", "back": "behind", "left": "to the left of", "right": "to the right of",
+    "center": "in the center of",
+}  # fmt: skip
+_VERBS = {"pick": "pick up"}
+# What one thing after another is said with: "wipe the table, and then open the drawer".
+_NEXT = re.compile(r"(?:\band )?\bthen\b|[;.!?\n]+", re.IGNORECASE)
+_AND = re.compile(r"\band\b", re.IGNORECASE)
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """An entry that a part of an instruction can be carried out by.
+
+    Attributes:
+        entry: What is executed: an entry of the bank, or one sub-task of it.
+        semantic: Its ``S_sem``.
+        source: The entry of the bank.
+        asked: What of the instruction it carries out, one for each of the entry's sub-tasks.
+    """
+
+    entry: MemoryEntry
+    semantic: float
+    source: MemoryEntry
+    asked: tuple[SubTask, ...] = ()
+
+
+def sub_task_index(contact: int, phase: str, count: int) -> int:
+    """Which of ``count`` sub-tasks a key pose serves, by the ordinal of its gripper transition.
+
+    Each sub-task takes two transitions, and leaving is part of it.
+    """
+    own = contact - 1 if phase == "retreat" else contact
+    return min(max(own, 0) // TRANSITIONS_PER_SUB_TASK, count - 1)
+
+
+def parts(entry: MemoryEntry) -> tuple[MemoryEntry, ...]:
+    """One entry for every sub-task of an entry that has several; the entry itself where it has one.
+
+    A part holds its own key poses, and the objects that its sub-task names. A sub-task whose contacts are
+    relative to other objects is no part, because nothing would look for these.
+    """
+    sub_tasks = entry.key.sub_tasks
+    if len(sub_tasks) == 1 or sub_tasks[0].words:
+        return (entry,)  # no words say what each part of an instruction is that cannot be read
+    serves = _sub_tasks_of(entry)
+    found: list[MemoryEntry] = []
+    for i in range(len(sub_tasks)):
+        own = [pose for pose, served in zip(entry.key_poses, serves, strict=True) if served == i]
+        part = _part(entry, i, own)
+        if part is not None:
+            found.append(part)
+    return tuple(found)
+
+
+def _part(entry: MemoryEntry, number: int, own: Sequence[MemoryKeyPose]) -> MemoryEntry | None:
+    sub_task = entry.key.sub_tasks[number]
+    kept = tuple(
+        replace(pose, sub_task=0)
+        for pose in own
+        if set(pose.anchor.objects) <= set(sub_task.objects) or pose.phase not in FREE_PHASES
+    )
+    contacts = [pose for pose in kept if pose.phase not in FREE_PHASES]
+    if not contacts or any(not set(pose.anchor.objects) <= set(sub_task.objects) for pose in contacts):
+        return None
+    return replace(
+        entry,
+        key=RetrievalKey((sub_task,), tuple(pose.phase for pose in kept)),
+        language=phrase(sub_task),
+        key_poses=kept,
+        layout={name: T for name, T in entry.layout.items() if name in sub_task.objects},
+        outcomes=tuple(replace(one, sub_task=0) for one in entry.outcomes if one.sub_task == number),
+    )
+
+
+def _sub_tasks_of(entry: MemoryEntry) -> list[int]:
+    """The sub-task of every key pose; told by the gripper where an older memory does not say it."""
+    if any(pose.sub_task > 0 for pose in entry.key_poses):
+        return [pose.sub_task for pose in entry.key_poses]
+    served: list[int] = []
+    contact = 0
+    for pose in entry.key_poses:
+        served.append(sub_task_index(contact, pose.phase, len(entry.key.sub_tasks)))
+        contact += pose.dwell  # the fingers have closed or opened here
+    return served
+
+
+def plan_parts(
+    instruction: str, entries: Sequence[MemoryEntry], names: NameSimilarity = TABLE_NAMES
+) -> tuple[tuple[Candidate, ...], ...]:
+    """What an instruction can be carried out by: for each part, in order, the entries that are about it.
+
+    An entry that was demonstrated as a whole wins; then it is one part. Else the parts are the longest runs
+    of sub-tasks that were demonstrated together, a single one also as a part of something else.
+
+    Args:
+        instruction: What is asked.
+        entries: The memory.
+        names: Says which names mean the same thing.
+
+    Raises:
+        InstructionError: There is no memory of the instruction or of one of its sub-tasks; the error
+            says why it could not be read or names the sub-task, and lists what the memory knows.
+    """
+    asked = read_instruction(instruction, entries, names)
+    if asked[0].words:
+        return _plan_by_words(instruction, asked, entries, names)
+    entries = near(asked, entries, partial(semantic_score, names=names))
+    chain: list[tuple[Candidate, ...]] = []
+    left = asked
+    while left:
+        said = instruction if len(asked) == 1 else phrase(left[0])
+        try:
+            found = _longest_run(left, said, entries, names)
+        except InstructionError as error:
+            if len(asked) == 1:
+                raise
+            raise InstructionError(
+                f"{said!r} is a part of the instruction {instruction!r} that cannot be done: {error}"
+            ) from error
+        chain.append(found)
+        left = left[len(found[0].asked) :]
+    return tuple(chain)
+
+
+def _plan_by_words(
+    instruction: str, asked: tuple[SubTask, ...], entries: Sequence[MemoryEntry], names: NameSimilarity
+) -> tuple[tuple[Candidate, ...], ...]:
+    """Likewise where the grammar cannot read: as a whole, else each of what "then" or "and" joins."""
+    close = near(asked, entries, partial(semantic_score, names=names))
+    try:
+        return (_about(asked, instruction, [Candidate(entry, 0.0, entry) for entry in close], names),)
+    except InstructionError as error:
+        splits = ([one for one in joint.split(instruction) if normal_words(one)] for joint in (_NEXT, _AND))
+        with suppress(InstructionError):
+            if sentences := next((pieces for pieces in splits if len(pieces) > 1), None):
+                return tuple(part for one in sentences for part in plan_parts(one, entries, names))
+        why = why_unread(instruction, entries)
+        raise InstructionError(f"{why}; and {error}" if why else str(error)) from error
+
+
+def _longest_run(
+    asked: Sequence[SubTask], said: str, entries: Sequence[MemoryEntry], names: NameSimilarity
+) -> tuple[Candidate, ...]:
+    """Candidates for the first sub-tasks, for as many as were demonstrated together.
+
+    Raises:
+        InstructionError: There are none for the first one, which is called as ``said``, or entries about
+            different things fit it as well.
+    """
+    whole = [Candidate(entry, 0.0, entry) for entry in entries]
+    for n_sub_tasks in range(len(asked), 0, -1):
+        with suppress(InstructionError):
+            return _about(asked[:n_sub_tasks], said, whole, names)
+    singles = [Candidate(part, 0.0, entry) for entry in entries for part in parts(entry)]
+    return _about(asked[:1], said, singles, names)
+
+
+def _about(
+    asked: Sequence[SubTask], said: str, candidates: Sequence[Candidate], names: NameSimilarity
+) -> tuple[Candidate, ...]:
+    """Those of some candidates that are about what is asked, with their score; InstructionError if none."""
+    by_entry = {id(one.entry): one for one in candidates}
+    found = candidates_for(asked, said, [one.entry for one in candidates], names)
+    return tuple(
+        # By their words things are not told from others of their name, so what is asked is what was shown.
+        replace(by_entry[id(e)], semantic=score, asked=e.key.sub_tasks if asked[0].words else tuple(asked))
+        for e, score in found
+    )
+
+
+def phrase(sub_task: SubTask) -> str:
+    """A sub-task in words, as an instruction: "put the bowl in the top drawer of the cabinet"."""
+    if sub_task.words:
+        return sub_task.words
+    verb = _VERBS.get(sub_task.operation, sub_task.operation)
+    if not sub_task.landmark:
+        return f"{verb} {_noun(sub_task.target, sub_task.part, sub_task.target_where)}"
+    preposition = _PREPOSITIONS.get(sub_task.relation, sub_task.relation)
+    target = _noun(sub_task.target, "", sub_task.target_where)
+    landmark = _noun(sub_task.landmark, sub_task.part, sub_task.landmark_where)
+    return f"{verb} {target} {preposition} {landmark}"
+
+
+def _noun(name: str, part: str, where: Reference | None) -> str:
+    told = f"the {name}"
+    if where is not None and not where.landmarks:
+        told = f"the {where.relation} {name}"
+    elif where is not None:
+        preposition = _PREPOSITIONS.get(where.relation, where.relation)
+        told = f"the {name} {preposition} {' and '.join(f'the {landmark}' for landmark in where.landmarks)}"
+    return f"the {part} of {told}" if part else told

@@ -1,0 +1,1 @@
+"""Objects known by the upright box around them."""

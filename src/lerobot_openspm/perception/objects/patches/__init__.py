@@ -1,0 +1,1 @@
+"""Objects known by patches of the demonstrations' images."""

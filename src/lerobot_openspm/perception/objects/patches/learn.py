@@ -1,0 +1,358 @@
+"""Learning objects that hardly move between demonstrations: which patches follow which object.
+
+Which camera shows an object well, where on it a patch finds hold and how large it should be is not known: a
+large one follows the table, one on a bottle's neck slides along it. So patches of all kinds are cut around
+the places that the hand touched, and each is followed through the first frames of many demonstrations, also
+of other tasks. What really follows the object is followed alike by patches of several kinds, a *group*;
+tracks that belong to other objects disagree. Where the hand touched a place of the object more than once,
+where it went has to agree; and two objects do not move alike, so a group belongs to one object alone. One
+demonstration of each of several tasks is enough.
+
+That an object hardly moves is never taken from a few scenes that happen to agree. The hand's repeated
+touches tell how likely it is, all places and both axes taken together. So do the other objects' touches, and
+how the objects are known that were learned before: in one place most objects stand still, in another most
+are moved about.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterable, Sequence
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+from scipy.stats import chi2
+
+from lerobot_openspm.geometry.camera import project
+from lerobot_openspm.geometry.se3 import Array
+from lerobot_openspm.perception.objects.model import KnownObject, Patch, PatchModel, Probe
+from lerobot_openspm.perception.objects.patches.patches import as_seen, cut, localise_patches, match
+from lerobot_openspm.types import ContactCue, Scene, View
+
+# The hand's target moves with the object; if its standard deviation along an axis is below this, patches do.
+# It is that of a uniform distribution within 3 cm of the middle, about as far as a patch is sought.
+MAX_STD_M = 0.03 / np.sqrt(3)
+# A place touched less often says nothing of how far its object moves.
+MIN_TOUCHES = 2
+RADII_M = (0.025, 0.035, 0.05, 0.07, 0.10)
+# What holds a patch may lie below the hand, which grasps a bottle's neck or lets go of something above.
+DROPS_M = (0.0, 0.05, 0.10)
+# So many first frames are looked at, as far as there are, at least half of them of the object's own tasks.
+MAX_SCENES = 40
+# Less alike than this in most demonstrations: the object turns, or is not what the patch shows.
+LEARNED_CORRELATION = 0.8
+# Less alike than this: the object is not in the scene, or hidden.
+SEEN_CORRELATION = 0.6
+# A patch is followed if it is found in this share of the first frames, and in nearly as many as the best is.
+FOLLOWED_SHARE, COVERAGE = 0.5, 0.9
+# Patches that follow one object agree within this, and it takes so many to be believed.
+AGREEMENT_M, MIN_AGREEING = 0.0025, 3
+# A group has to explain this much of where the hand went, unless it went to about the same place every time.
+EXPLAINED_SHARE, STILL_M = 0.8, 0.006
+# It may explain it so much worse than the group that does best.
+RESIDUAL_RATIO = 1.3
+# Without touches to ask, a group must move by more than passes for agreement, or it may be the table, and
+# be seen in this many scenes.
+MIN_SCENES = 6
+# Two motions that differ by less than this share of either are those of one object.
+SAME_MOTION_SHARE = 0.3
+# An object that turns looks more like its turned patch, by this much, in more than this share of the scenes.
+TURN_DEG, TURN_GAIN, TURN_SHARE = 10.0, 0.01, 0.25
+REFERENCES = 5
+MAX_PROBES = 4
+MIN_STD_M = 5e-4
+
+
+@dataclass(frozen=True)
+class _Trail:
+    """One patch, followed through the first frames.
+
+    Attributes:
+        place: Number of the touched place that it was cut at.
+        radius: Its size.
+        scene: Number of the scene that it was cut from.
+        probe: The patch with its camera.
+        points: Where its point is in each scene ``(n, 2)``; not a number where it was not found.
+        correlation: Its median.
+    """
+
+    place: int
+    radius: float
+    scene: int
+    probe: Probe
+    points: Array
+    correlation: float
+
+    @property
+    def seen(self) -> int:
+        """In how many scenes the patch was found."""
+        return int(np.isfinite(self.points[:, 0]).sum())
+
+    @property
+    def motion(self) -> Array:
+        """Displacements ``(n, 2)`` from the median place."""
+        return self.points - np.nanmedian(self.points, axis=0)
+
+
+@dataclass(frozen=True)
+class _Candidate:
+    """An object to learn: the scenes looked at, and its groups in them, the largest first."""
+
+    name: str
+    scenes: Sequence[Scene]
+    groups: list[list[_Trail]]
+
+
+def learn_patches(
+    names: Sequence[str], scenes: Sequence[Scene], known: Collection[KnownObject] = ()
+) -> dict[str, PatchModel]:
+    """Learn the objects that hardly move; the others are left out.
+
+    Args:
+        names: The objects.
+        scenes: First frames of all demonstrations, with hints at the objects.
+        known: Other objects, whose motions are not theirs.
+    """
+    still = hardly_moving(names, scenes, known)
+    candidates = [_candidate(name, scenes) for name in names if still[name] >= 0.5]
+    # What many patches agree on is claimed first: what they follow is not another object.
+    candidates.sort(key=lambda one: -max((len(group) for group in one.groups), default=0))
+    learned: dict[str, PatchModel] = {}
+    for one in candidates:
+        claimants = [*known, *learned.values()]
+        free = (group for group in one.groups if not _claimed(group[0], one.scenes, claimants))
+        models = (_model(one.name, group, one.scenes) for group in free)
+        if model := next((model for model in models if model is not None), None):
+            learned[one.name] = model
+    return learned
+
+
+def hardly_moving(
+    names: Sequence[str], scenes: Sequence[Scene], known: Collection[KnownObject] = ()
+) -> dict[str, float]:
+    """Probability by name that an object hardly moves between demonstrations, given all touches.
+
+    Two or three places that agree are weak evidence, so each object begins with what the others tell: of a
+    beta distribution, counting every other object that tells anything, and one of either kind.
+
+    Args:
+        names: The objects.
+        scenes: First frames of all demonstrations, with hints at the objects.
+        known: Other objects, which are known by patches where they hardly moved.
+    """
+    told = {name: p for name in names if (p := _hardly_moves(scenes, name)) is not None}
+    before = [float(isinstance(model, PatchModel)) for model in known if model.name not in names]
+    found = {}
+    for name in names:
+        others = [*before, *(p for other, p in told.items() if other != name)]
+        prior = (1 + sum(others)) / (2 + len(others))
+        own = told.get(name, 0.5)
+        found[name] = own * prior / (own * prior + (1 - own) * (1 - prior))
+    return found
+
+
+def _hardly_moves(scenes: Sequence[Scene], name: str) -> float | None:
+    """Probability, by the touches of one object alone, that its standard deviation is small.
+
+    The variance's posterior given n independent deviations is an inverse chi-squared distribution, where
+    nothing is known of its scale beforehand (Gelman et al., Bayesian Data Analysis, section 2.6). Kept
+    strictly between 0 and 1; None where no place was touched twice.
+    """
+    places = _places(hint for scene in scenes for hint in scene.hints if hint.name == name)
+    points = [np.stack([hint.point_world[:2] for hint in place]) for place in places]
+    degrees = 2 * sum(len(own) - 1 for own in points)
+    if degrees == 0:
+        return None
+    squares = sum(float(((own - own.mean(axis=0)) ** 2).sum()) for own in points)
+    return float(np.clip(chi2.sf(squares / MAX_STD_M**2, degrees), 1e-6, 1 - 1e-6))
+
+
+def _places(hints: Iterable[ContactCue]) -> list[list[ContactCue]]:
+    """Hints grouped by the place on the object that they touch."""
+    groups: dict[tuple[str, str], list[ContactCue]] = {}
+    for hint in hints:
+        groups.setdefault((hint.kind, hint.place), []).append(hint)
+    return list(groups.values())
+
+
+def _candidate(name: str, scenes: Sequence[Scene]) -> _Candidate:
+    """Follow patches of all kinds at an object's touched places, and group those that agree."""
+    own = [scene for scene in scenes if any(hint.name == name for hint in scene.hints)]
+    others = [scene for scene in scenes if not any(hint.name == name for hint in scene.hints)]
+    own = _spaced(own, max(MAX_SCENES // 2, MAX_SCENES - len(others)))
+    looked_at = own + _spaced(others, MAX_SCENES - len(own))
+    hints = [next(hint for hint in scene.hints if hint.name == name) for scene in own]
+    trails = []
+    for number, place in enumerate(_places(hints)):
+        first = next(i for i, hint in enumerate(hints) if hint is place[0])
+        for camera in own[first].views:
+            for drop in DROPS_M:
+                points = hints[first].point_world - [0.0, 0.0, drop]
+                found = (_follow(number, first, camera, points, radius, looked_at) for radius in RADII_M)
+                trails += [trail for trail in found if trail is not None]
+    return _Candidate(name, looked_at, _believable(_agreeing(trails), hints))
+
+
+def _spaced[T](things: Sequence[T], n: int) -> list[T]:
+    """At most ``n`` things, evenly from all."""
+    chosen = np.linspace(0, len(things) - 1, min(n, len(things))).round().astype(int)
+    return [things[i] for i in chosen]
+
+
+def _follow(
+    place: int, first: int, camera: str, point_world: Array, radius: float, scenes: Sequence[Scene]
+) -> _Trail | None:
+    """Cut a patch from one scene and find it in all; None where it is in too few."""
+    view = scenes[first].views[camera]
+    patch = cut(view, point_world, radius)
+    if patch is None:
+        return None
+    probe = Probe(camera, view.camera, view.T_world_cam, (patch,), 0.0)
+    points, correlations = np.full((len(scenes), 2), np.nan), np.zeros(len(scenes))
+    for i, scene in enumerate(scenes):
+        seen = as_seen(scene.views.get(camera), probe)
+        sight = None if seen is None else match(patch, probe, seen)
+        if sight is not None and sight.correlation > SEEN_CORRELATION:
+            points[i], correlations[i] = sight.point_world[:2], sight.correlation
+    if np.isfinite(points[:, 0]).mean() < FOLLOWED_SHARE or np.median(correlations) < LEARNED_CORRELATION:
+        return None
+    return _Trail(place, radius, first, probe, points, float(np.median(correlations)))
+
+
+def _agreeing(trails: Sequence[_Trail]) -> list[list[_Trail]]:
+    """Groups of trails that agree, the largest first, each with its most typical first."""
+    if not trails:
+        return []
+    most = max(trail.seen for trail in trails)
+    trails = [trail for trail in trails if trail.seen >= COVERAGE * most]
+    between = np.stack([[_difference(a.motion, b.motion) for b in trails] for a in trails])
+    agree, groups = between < AGREEMENT_M, []
+    while agree.any():
+        members = np.flatnonzero(agree[int(agree.sum(axis=1).argmax())])
+        agreed = _agreed([trails[i] for i in members])
+        groups.append(sorted((trails[i] for i in members), key=lambda one: _difference(one.motion, agreed)))
+        agree[members], agree[:, members] = False, False
+    return groups
+
+
+def _agreed(trails: Sequence[_Trail]) -> Array:
+    """The median motion ``(n, 2)`` of trails; not a number in scenes where none was found."""
+    motions = np.ma.masked_invalid(np.stack([trail.motion for trail in trails]))
+    return np.asarray(np.ma.median(motions, axis=0).filled(np.nan))
+
+
+def _difference(motion: Array, other: Array) -> float:
+    """Distance between two motions ``(n, 2)`` but for an offset, kept in three of four scenes, metres.
+
+    Infinite where few scenes show both.
+    """
+    apart = (motion - other)[np.isfinite(motion[:, 0]) & np.isfinite(other[:, 0])]
+    if len(apart) < FOLLOWED_SHARE * len(motion):
+        return np.inf
+    return float(np.percentile(np.linalg.norm(apart - np.median(apart, axis=0), axis=1), 75))
+
+
+def _believable(groups: Sequence[list[_Trail]], hints: Sequence[ContactCue]) -> list[list[_Trail]]:
+    """The groups that are large enough and agree with where the hand went, or else, untold, move at all."""
+    large = [group for group in groups if len(group) >= MIN_AGREEING]
+    places = [place for place in _places(hints) if len(place) >= MIN_TOUCHES]
+    if not places:
+        return [group for group in large if _moves(group[0])]
+    residuals = [_residual(group[0].points, hints, places) for group in large]
+    still = _residual(np.zeros((len(hints), 2)), hints, places)
+    bound = min(max(EXPLAINED_SHARE * still, STILL_M), RESIDUAL_RATIO * min(residuals, default=0.0))
+    return [group for group, residual in zip(large, residuals, strict=True) if residual <= bound]
+
+
+def _moves(trail: _Trail) -> bool:
+    size = float(np.nanmedian(np.linalg.norm(trail.motion, axis=1)))
+    return trail.seen >= MIN_SCENES and size > AGREEMENT_M
+
+
+def _residual(points: Array, hints: Sequence[ContactCue], places: Sequence[Sequence[ContactCue]]) -> float:
+    """Root mean square distance of points ``(n, 2)`` from hints, less each place's own offset, metres.
+
+    Offsets are estimated from the same touches, so a place of n touches tells of n - 1 distances.
+    """
+    offsets = np.stack([hint.point_world[:2] for hint in hints]) - points[: len(hints)]
+    squares, degrees = 0.0, 0
+    for place in places:
+        own = offsets[[i for i, hint in enumerate(hints) if any(hint is one for one in place)]]
+        own = own[np.isfinite(own[:, 0])]
+        if len(own) > 1:
+            squares += float(((own - own.mean(axis=0)) ** 2).sum())
+            degrees += len(own) - 1
+    return float(np.sqrt(squares / degrees)) if degrees else np.inf
+
+
+def _claimed(trail: _Trail, scenes: Sequence[Scene], known: Iterable[KnownObject]) -> bool:
+    """Whether a trail follows an object that is known by patches already."""
+    size = float(np.nanmedian(np.linalg.norm(trail.motion, axis=1)))
+    for model in known:
+        if not isinstance(model, PatchModel):
+            continue
+        found = [localise_patches(scene.views, model) for scene in scenes]
+        points = np.stack(
+            [one.T_world_obj[:2, 3] if one.status == "found" else np.full(2, np.nan) for one in found]
+        )
+        if _difference(trail.motion, points) < SAME_MOTION_SHARE * size:
+            return True
+    return False
+
+
+def _model(name: str, group: Sequence[_Trail], scenes: Sequence[Scene]) -> PatchModel | None:
+    """The object that a group follows; None if it turns."""
+    # Of one place, so that all know the same point of the object.
+    kept = [trail for trail in group if trail.place == group[0].place]
+    kept = [trail for trail in kept if not _turns(trail, scenes)][:MAX_PROBES]
+    if not kept:
+        return None
+    agreed = _agreed(kept)
+    probes = []
+    for trail in kept:
+        error = np.linalg.norm(trail.motion - agreed, axis=1)
+        std = max(1.4826 * float(np.nanmedian(error)), MIN_STD_M)
+        probes.append(replace(trail.probe, patches=_references(trail, scenes), std_m=std))
+    height = float(probes[0].patches[0].point_world[2])
+    return PatchModel(name, tuple(probes), height, float(np.median([trail.correlation for trail in kept])))
+
+
+def _turns(trail: _Trail, scenes: Sequence[Scene]) -> bool:
+    """Whether the patch, turned either way, is found more clearly than as it is in many scenes."""
+    patch, probe = trail.probe.patches[0], trail.probe
+    height, width = patch.image.shape[:2]
+    turned = [patch]
+    for angle in (-TURN_DEG, TURN_DEG):
+        turn = cv2.getRotationMatrix2D(((width - 1) / 2, (height - 1) / 2), angle, 1.0)
+        image = cv2.warpAffine(patch.image, turn, (width, height), borderMode=cv2.BORDER_REPLICATE)
+        turned.append(replace(patch, image=np.asarray(image, np.uint8)))
+    better = []
+    for scene in scenes:
+        view = as_seen(scene.views.get(probe.camera), probe)
+        if view is None:
+            continue
+        sights = [match(one, probe, view) for one in turned]
+        straight, *others = [0.0 if one is None else one.correlation for one in sights]
+        better.append(max(others) > straight + TURN_GAIN)
+    return float(np.mean(better)) > TURN_SHARE
+
+
+def _references(trail: _Trail, scenes: Sequence[Scene]) -> tuple[Patch, ...]:
+    """The trail's patch, and the like from other scenes, as if all were seen from the first one's camera."""
+    own, probe = trail.probe.patches[0], trail.probe
+    followed = np.flatnonzero(np.isfinite(trail.points[:, 0]))
+    patches = [own]
+    for i in _spaced(followed[followed != trail.scene].tolist(), REFERENCES - 1):
+        view = as_seen(scenes[i].views.get(probe.camera), probe)
+        point = np.append(trail.points[i], own.point_world[2])
+        patch = None if view is None else cut(view, point, trail.radius)
+        if view is not None and patch is not None:
+            patches.append(replace(patch, corner=patch.corner + _shift(point, view, probe)))
+    return tuple(patches)
+
+
+def _shift(point_world: Array, view: View, probe: Probe) -> Array:
+    """How far, in pixels, a point seen in a view would lie elsewhere in the probe's."""
+    there, _ = project(probe.calibration, probe.T_world_cam, point_world)
+    here, _ = project(view.camera, view.T_world_cam, point_world)
+    return there - here

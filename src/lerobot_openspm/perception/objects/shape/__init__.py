@@ -1,0 +1,1 @@
+"""Objects known by the shape of their masks."""

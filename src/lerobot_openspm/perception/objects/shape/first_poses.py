@@ -1,0 +1,91 @@
+"""Where an object is in the first frames, before its shape is known: from its patches and the hints."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lerobot_openspm.geometry import se3
+from lerobot_openspm.geometry.camera import intersect_plane
+from lerobot_openspm.geometry.se3 import Array
+from lerobot_openspm.perception import colour
+from lerobot_openspm.perception.blobs import Blob, reach, triangulate
+from lerobot_openspm.perception.objects.localise import prepare
+from lerobot_openspm.perception.objects.mask_association import Instances, touched, whole_mask
+from lerobot_openspm.perception.objects.shape import colour_bootstrap as seeding
+from lerobot_openspm.perception.objects.shape.colour_bootstrap import Picture
+from lerobot_openspm.perception.objects.shape.fitting import Evidence
+from lerobot_openspm.perception.objects.shape.shape import Posed
+from lerobot_openspm.types import Scene, View
+
+# Two rays that are to meet in an object may miss each other by this much, metres.
+MAX_RAY_GAP = 0.05
+
+# One view's evidence, and the patch of it that is the object; None where it was not seen.
+Patched = tuple[Evidence, Blob | None]
+
+
+def pictures_of(index: int, name: str, scene: Scene, floor: float) -> list[Picture]:
+    """A scene's views with the hints for one object and what changed when it was carried off."""
+    hints = tuple(hint for hint in scene.hints if hint.name == name)
+    later = scene.later_views or {}
+    return [
+        Picture(
+            index, key, view, prepare(view).bins,
+            seeding.changed_pixels(view, later[key]) if key in later else None, hints, floor,
+        )
+        for key, view in scene.views.items()
+    ]  # fmt: skip
+
+
+def coloured(pictures: Sequence[Picture], log_odds: NDArray[np.float32]) -> dict[int, list[Patched]]:
+    """By scene, each view's foreground by colour and the patch that the hints point at."""
+    visible = seeding.hiding_pixels(pictures, log_odds)
+    groups: dict[int, list[Patched]] = {}
+    for picture in pictures:
+        probability = colour.foreground(picture.bins, log_odds)
+        evidence = Evidence(picture.view, probability, visible.get(picture.camera), picture.camera)
+        groups.setdefault(picture.scene, []).append((evidence, seeding.hinted_blob(picture, log_odds)))
+    return groups
+
+
+def masked(name: str, scene: Scene, floor: float, instances: Instances) -> list[Patched]:
+    """Each view's foreground by a segmenter: the instance that the hand touched, or nothing."""
+    hints = [hint for hint in scene.hints if hint.name == name]
+    seen = touched(scene.views, instances, hints, floor)
+    group: list[Patched] = []
+    for camera, view in scene.views.items():
+        blob = whole_mask(seen[camera].mask) if camera in seen else None
+        mask = np.zeros(view.image.shape[:2], bool) if blob is None else blob.mask
+        group.append((Evidence(view, mask.astype(np.float32), None, camera), blob))
+    return group
+
+
+def first_poses(groups: Mapping[int, list[Patched]]) -> tuple[list[Posed], float]:
+    """Places from the patches' centres, at one height and yaw 0, and half the size of a cube around them."""
+    places: dict[int, Array] = {}
+    singles: dict[int, tuple[View, Blob]] = {}
+    sizes: list[float] = []
+    for index, group in groups.items():
+        seen = [(one.view, blob) for one, blob in group if blob is not None]
+        # Patches cut off by the image's border have a wrong centre: only if nothing else is left.
+        seen = [(view, blob) for view, blob in seen if blob.whole] or seen
+        if len(seen) >= 2:
+            point, gap = triangulate([view for view, _ in seen], [blob.centre for _, blob in seen])
+            if gap < MAX_RAY_GAP:
+                places[index] = point
+                sizes += [reach(view, blob, point) for view, blob in seen]
+        elif seen:
+            singles[index] = seen[0]
+    if not places:
+        return [], 0.0
+    height = float(np.median([point[2] for point in places.values()]))
+    for index, (view, blob) in singles.items():
+        places[index] = intersect_plane(view.camera, view.T_world_cam, blob.centre, height)
+    posed = [
+        Posed(tuple(one for one, _ in groups[i]), se3.from_yaw([point[0], point[1], height], 0.0))
+        for i, point in sorted(places.items())
+    ]
+    return posed, 1.25 * float(np.median(sizes))

@@ -1,0 +1,1 @@
+"""Following objects through an episode, and noticing broken cameras."""

@@ -1,0 +1,155 @@
+"""What perception takes and gives: views, hints from mining, scenes to learn from, pose estimates."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Literal, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lerobot_openspm.geometry.camera import Camera
+from lerobot_openspm.geometry.se3 import Array
+
+Mask = NDArray[np.bool_]
+
+# Standard deviation of a uniform angle: what is known of a yaw that cannot be seen.
+UNKNOWN_YAW_STD = float(np.pi / np.sqrt(3))
+
+
+@dataclass(frozen=True)
+class View:
+    """One camera's picture of one moment.
+
+    Attributes:
+        image: RGB image ``(H, W, 3)``, uint8.
+        camera: Intrinsics, already scaled to ``H x W``.
+        T_world_cam: Camera pose ``(4, 4)`` at that moment.
+        depth: Metres along the optical axis ``(H, W)``, float32, 0 where not measured; None without a depth
+            stream.
+        labels: Number of the object that each pixel shows ``(H, W)``, int32; None unless the observation
+            brings masks.
+    """
+
+    image: NDArray[np.uint8]
+    camera: Camera
+    T_world_cam: Array
+    depth: NDArray[np.float32] | None = None
+    labels: NDArray[np.int32] | None = None
+
+
+@dataclass(frozen=True)
+class Segmentation:
+    """One instance of a phrase in one view: the paper's mask, bounding box and confidence.
+
+    Attributes:
+        mask: Its pixels ``(H, W)``; at least one.
+        confidence: From 0 to 1.
+    """
+
+    mask: Mask
+    confidence: float
+
+    @property
+    def box(self) -> Array:
+        """First and last column and row ``(4,)`` of the mask: u_min, v_min, u_max, v_max, pixels."""
+        u, v = np.flatnonzero(self.mask.any(0)), np.flatnonzero(self.mask.any(1))
+        return np.array([u[0], v[0], u[-1], v[-1]], float)
+
+
+class Segmenter(Protocol):
+    """Finds objects by phrase in the views of one moment.
+
+    What is found of a phrase does not depend on the other phrases that are asked for with it.
+    """
+
+    def segment(
+        self, views: Mapping[str, View], phrases: Sequence[str]
+    ) -> dict[str, dict[str, tuple[Segmentation, ...]]]:
+        """By phrase and camera: the instances seen, the most confident first.
+
+        Every phrase and every camera has an entry; it is empty where nothing is seen.
+
+        Raises:
+            PerceptionError: A phrase that this segmenter cannot know, or a view that lacks what it needs.
+            ObservationError: A view whose image does not fit its camera.
+        """
+        ...
+
+
+@dataclass(frozen=True)
+class ContactCue:
+    """Where the hand touched something, as mining saw it.
+
+    Attributes:
+        name: The noun phrase of the instruction, such as ``"bowl"``.
+        point_world: Point ``(3,)`` between the fingertips, in metres.
+        kind: ``"grasp"`` or ``"contact"``: part of the object was at this point in the first frame;
+            ``"release"``: the object lies below or around this point.
+        place: Hints of one place touched the same spot of the object, as far as one can know.
+    """
+
+    name: str
+    point_world: Array
+    kind: Literal["grasp", "release", "contact"]
+    place: str = ""
+
+
+@dataclass(frozen=True)
+class Scene:
+    """What learning sees of one demonstration.
+
+    Attributes:
+        views: First frame by camera name, the hand away from the objects.
+        hints: Places that were touched, for any number of objects.
+        later_views: A frame after the grasped object was carried off, by camera name; None if there is none.
+    """
+
+    views: dict[str, View]
+    hints: tuple[ContactCue, ...]
+    later_views: dict[str, View] | None = None
+
+
+@dataclass(frozen=True)
+class Support:
+    """What a pose estimate rests on: the grounds of the paper's observation covariance ``R_t``.
+
+    Attributes:
+        kind: How the object is known.
+        area_px: Pixels of the object that were used, over all views.
+        consistency: From 0 to 1: whether the views tell the same.
+        quality: From 0 to 1: how well the learned shape or patches explain the object's own demonstrations.
+    """
+
+    kind: Literal["shape", "patches"]
+    area_px: float
+    consistency: float
+    quality: float
+
+
+@dataclass(frozen=True)
+class PoseEstimate:
+    """Where an object is.
+
+    Attributes:
+        status: ``"ambiguous"`` when two places explain the images equally well; the pose is the better one.
+        T_world_obj: Upright pose ``(4, 4)``: origin at the footprint's centre on the support plane.
+        covariance: ``(4, 4)`` over x, y, z in metres and yaw in radians.
+        confidence: From 0 to 1; 1 is how well the object is typically found in its demonstrations.
+        masks: Foreground mask ``(H, W)`` by camera name.
+        visible: Share of the object that is in sight in the view that shows it best, where the hand is not in
+            the way: at its place if it was found, else where it was expected.
+        support: What the estimate rests on; None where the covariance says all.
+        others: Poses ``(4, 4)`` of further places that show such an object too, the surest first. Of objects
+            known by patches none are told.
+    """
+
+    status: Literal["found", "not_found", "ambiguous"]
+    T_world_obj: Array
+    covariance: Array
+    confidence: float
+    masks: dict[str, Mask]
+    visible: float = 1.0
+    support: Support | None = None
+    others: tuple[Array, ...] = ()

@@ -1,0 +1,80 @@
+import numpy as np
+import pytest
+
+from lerobot_openspm.geometry import se3
+from lerobot_openspm.geometry.camera import Camera
+from lerobot_openspm.perception.tracking.camera_health import CameraWatch
+from lerobot_openspm.types import View
+
+DOWN = np.diag([1.0, -1.0, -1.0])
+T_WORLD_CAM = se3.transform(DOWN, [0.0, 0.0, 1.0])  # looks down at the table
+CAMERA = Camera(64, 48, 60.0, 60.0, 31.5, 23.5, "world", T_WORLD_CAM)
+
+
+def hand(x=0.0, y=0.0):
+    return se3.transform(DOWN, [x, y, 0.2])
+
+
+def view(seed=0, mount="world", level=None):
+    image = np.random.default_rng(seed).integers(0, 255, (48, 64, 3)).astype(np.uint8)
+    if level is not None:
+        image[:] = level
+    camera = Camera(64, 48, 60.0, 60.0, 31.5, 23.5, mount, T_WORLD_CAM)
+    return View(image, camera, T_WORLD_CAM)
+
+
+@pytest.mark.parametrize("level", [0, 3, 255])
+def test_a_picture_without_contrast_shows_nothing(level):
+    faults = CameraWatch().check({"front": view(level=level), "side": view()}, {}, hand(), 0.0)
+    assert list(faults) == ["front"]
+    assert "black or blank" in faults["front"].reason
+
+
+def test_a_picture_that_does_not_change_while_the_hand_in_it_moves_is_frozen():
+    watch = CameraWatch()
+    assert watch.check({"front": view()}, {}, hand(), 0.0) == {}
+    assert watch.check({"front": view()}, {}, hand(0.01), 0.1) == {}, "a hand that hardly moved"
+    frozen = watch.check({"front": view()}, {}, hand(0.05), 0.2)
+    assert "frozen" in frozen["front"].reason
+    assert watch.check({"front": view(seed=1)}, {}, hand(0.05), 0.3) == {}
+
+
+def test_a_picture_that_the_hand_is_not_in_may_stay_as_it_is():
+    watch = CameraWatch()
+    for x in (2.0, 2.5, 3.0):
+        assert watch.check({"front": view()}, {}, hand(x), x) == {}
+    watch = CameraWatch()
+    watch.check({"wrist": view(mount="ee")}, {}, hand(2.0), 0.0)
+    assert "wrist" in watch.check({"wrist": view(mount="ee")}, {}, hand(2.5), 0.1), (
+        "a hand camera moves itself"
+    )
+
+
+def test_a_late_camera_that_repeats_a_frame_now_and_then_is_forgiven():
+    """Ten pictures a second for twenty steps of a slow hand."""
+    watch = CameraWatch()
+    for step in range(40):
+        assert watch.check({"front": view(seed=step // 2)}, {}, hand(0.008 * step), 0.05 * step) == {}
+
+
+def test_faults_are_timed_from_the_last_sound_picture():
+    watch = CameraWatch()
+    watch.check({"front": view()}, {}, hand(), 0.75)
+    seconds = [
+        watch.check({}, {"front": "is missing"}, hand(), time_s)["front"].seconds for time_s in (1.0, 1.5)
+    ]
+    assert seconds == [0.25, 0.75]
+    assert watch.check({"front": view(seed=1)}, {}, hand(), 1.75) == {}
+    assert watch.check({"front": view(level=0)}, {}, hand(), 2.0)["front"].seconds == 0.25
+
+
+def test_a_camera_that_never_worked_is_timed_from_the_start():
+    assert CameraWatch().check({"front": view(level=0)}, {}, hand(), 1.5)["front"].seconds == 1.5
+
+
+def test_a_frozen_picture_is_timed_from_when_the_hand_began_to_move():
+    watch = CameraWatch()
+    for time_s in (0.0, 1.0, 2.0):
+        assert watch.check({"front": view()}, {}, hand(), time_s) == {}
+    watch.check({"front": view()}, {}, hand(0.01), 2.25)
+    assert watch.check({"front": view()}, {}, hand(0.03), 2.5)["front"].seconds == 0.5
