@@ -59,7 +59,7 @@ def test_the_second_part_goes_where_the_first_one_has_put_things():
     assert one._part == 1
     assert not np.allclose(eyes.layout["bowl"], LAYOUT["bowl"])
     place = next(target for target in one.executor.plan if target.key_pose.phase == "place")
-    assert_allclose(place.T_world_ee, eyes.layout["bowl"] @ place.memory.T_obj_ee, atol=2e-3)
+    assert_allclose(place.T_world_ee, eyes.layout["bowl"] @ place.key_pose.T_obj_ee, atol=2e-3)
     assert [used.source for used in one.used_entries] == [PLATE.source, BOX.source]
     finish_part(one, eyes, hand)
     assert one.status is Status.DONE
@@ -165,7 +165,7 @@ def test_an_opened_drawer_looks_different_and_is_not_looked_for_again():
     assert one.status is Status.DONE
     assert not any("cabinet" in names for names in eyes.asked)
     place = next(target for target in one.executor.plan if target.key_pose.phase == "place")
-    assert_allclose(place.T_world_ee, cabinet @ place.memory.T_obj_ee)
+    assert_allclose(place.T_world_ee, cabinet @ place.key_pose.T_obj_ee)
 
 
 def test_what_an_opened_drawer_hides_is_not_lost():

@@ -132,7 +132,7 @@ def advanced(one, eyes, index):
     one.observe(HAND, eyes)
     one.executor.begin(one.executor.plan, HAND, index - 1)
     before = one.executor.plan[index - 1]
-    hand = Hand(before.T_world_ee, before.memory.opening)
+    hand = Hand(before.T_world_ee, before.key_pose.opening)
     eyes.asked.clear()
     one.observe(hand, eyes)
     assert one.executor.index == index
@@ -144,8 +144,8 @@ def grasping(one, eyes):
     one.observe(HAND, eyes)
     one.executor.begin(one.executor.plan, HAND, 2)
     grasp = one.executor.plan[2]
-    hand = Hand(grasp.T_world_ee, grasp.memory.opening)
-    watch(one, eyes, hand, grasp.memory.n_steps + 1)
+    hand = Hand(grasp.T_world_ee, grasp.key_pose.opening)
+    watch(one, eyes, hand, grasp.key_pose.n_steps + 1)
     assert one.executor.index == 3
     return hand
 
@@ -179,7 +179,7 @@ def test_key_poses_follow_an_object_that_has_moved(shift, follows):
     watch(one, eyes, HAND, 20)
     assert one.status is Status.RUNNING
     for old, new in zip(before, one.executor.plan, strict=True):
-        expected = shift if follows and new.memory.anchor.place == "plate" else 0.0
+        expected = shift if follows and new.key_pose.anchor.place == "plate" else 0.0
         # What is seen next to its place is averaged with what was seen before; what jumped is not.
         assert_allclose(new.T_world_ee[0, 3] - old.T_world_ee[0, 3], expected, atol=MOVED_M)
 

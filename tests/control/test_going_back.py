@@ -138,7 +138,7 @@ def carrying(opening):
     one.observe(HAND, eyes)
     one.executor.begin(one.executor.plan, HAND, 2)
     grasp = one.executor.plan[2]
-    watch(one, eyes, Hand(grasp.T_world_ee, grasp.memory.opening), grasp.memory.n_steps + 1)
+    watch(one, eyes, Hand(grasp.T_world_ee, grasp.key_pose.opening), grasp.key_pose.n_steps + 1)
     assert one.tracker.held == {"bowl"}
     eyes.visible = 0.0
     place = one.executor.plan[5].T_world_ee.copy()
@@ -166,7 +166,7 @@ def test_what_slipped_out_while_it_was_lifted_stands_where_it_stood_and_does_not
     first = one.executor.plan[0].T_world_ee
     one.executor.begin(one.executor.plan, HAND, 2)
     grasp, lift = one.executor.plan[2], one.executor.plan[3]
-    watch(one, eyes, Hand(grasp.T_world_ee, grasp.memory.opening), grasp.memory.n_steps + 1)
+    watch(one, eyes, Hand(grasp.T_world_ee, grasp.key_pose.opening), grasp.key_pose.n_steps + 1)
     assert one.tracker.held == {"bowl"}
     eyes.visible = 0.0  # the hand hides it
     watch(one, eyes, Hand(lift.T_world_ee, 0.0), 1)
@@ -182,7 +182,7 @@ def test_what_a_later_sub_task_grasps_again_stays_in_the_hand():
     one.observe(HAND, eyes)
     one.executor.begin(one.executor.plan, HAND, 2)
     grasp, lift = one.executor.plan[2], one.executor.plan[3]
-    watch(one, eyes, Hand(grasp.T_world_ee, 0.03), grasp.memory.n_steps + 1)
+    watch(one, eyes, Hand(grasp.T_world_ee, 0.03), grasp.key_pose.n_steps + 1)
     eyes.layout["bowl"] = lift.T_world_ee @ se3.inverse(grasp.T_world_ee) @ layout["bowl"]
     watch(one, eyes, Hand(lift.T_world_ee, 0.03), 1)
     assert one.executor.plan[one.executor.index].key_pose.phase == "pre-place"

@@ -58,7 +58,7 @@ def test_moving_one_object_moves_its_own_targets_alone():
     layout = memory.layout | {"plate": G @ memory.layout["plate"]}
     before, after = transfer(memory, memory.layout, {}, HOME), transfer(memory, layout, {}, HOME)
     for old, new in zip(before, after, strict=True):
-        moved = G if new.memory.anchor.place == "plate" else np.eye(4)
+        moved = G if new.key_pose.anchor.place == "plate" else np.eye(4)
         assert_allclose(new.T_world_ee, moved @ old.T_world_ee, atol=1e-9)
 
 
@@ -189,10 +189,10 @@ def test_a_demonstration_cut_with_the_object_in_the_hand_ends_with_letting_go():
     assert [target.key_pose.phase for target in targets[-3:]] == ["place", "release", "retreat"]
     release, retreat = targets[-2:]
     assert_allclose(release.T_world_ee, targets[5].T_world_ee)
-    assert release.memory.dwell
-    assert not release.memory.closed
-    assert not retreat.memory.closed
-    assert release.memory.n_steps == targets[2].key_pose.n_steps  # as long as the fingers took to close
+    assert release.key_pose.dwell
+    assert not release.key_pose.closed
+    assert not retreat.key_pose.closed
+    assert release.key_pose.n_steps == targets[2].key_pose.n_steps  # as long as the fingers took to close
 
 
 def test_what_is_not_to_be_put_anywhere_is_not_let_go():

@@ -240,7 +240,7 @@ def _retreat(targets: Sequence[Target]) -> tuple[Target, ...]:
     back = (se3.inverse(arrival.T_world_ee) @ before.T_world_ee)[:3, 3]
     step = se3.transform(np.eye(3), RETREAT_M * back / max(float(np.linalg.norm(back)), 1e-9))
     key_pose = replace(last.key_pose, phase="retreat", n_steps=1, dwell=False, confidence=0.5)
-    return (Target(contact.T_world_ee @ step, memory, precise=False),)
+    return (Target(contact.T_world_ee @ step, key_pose, precise=False),)
 
 
 def rise(last: Target, height: float) -> tuple[Target, ...]:
@@ -254,7 +254,7 @@ def rise(last: Target, height: float) -> tuple[Target, ...]:
         return ()
     T_world_ee[2, 3] = height
     key_pose = replace(last.key_pose, phase="retreat", n_steps=1, dwell=False, axis=None, confidence=0.5)
-    return (Target(T_world_ee, memory, precise=False),)
+    return (Target(T_world_ee, key_pose, precise=False),)
 
 
 def _nearest_equivalent(
