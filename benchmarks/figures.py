@@ -30,10 +30,14 @@ logger = logging.getLogger(__name__)
 PACKAGE = "src/lerobot_openspm"
 # What a policy does with its default options. Backends that need a download are not part of any figure.
 POLICY = (
-    *(f"{PACKAGE}/{room}" for room in ("control", "flow", "geometry", "memory", "mining", "perception")),
+    *(
+        f"{PACKAGE}/{room}"
+        for room in ("control", "flow", "geometry", "language", "memory", "mining", "perception")
+    ),
     f":(glob){PACKAGE}/*.py",
     f":(exclude){PACKAGE}/search.py",
-    f":(exclude,glob){PACKAGE}/perception/sam3d*.py",
+    f":(exclude){PACKAGE}/perception/objects/sam3d",
+    f":(exclude){PACKAGE}/mining/phase_labels",
     f":(exclude,glob){PACKAGE}/perception/segmentation/*sam*.py",
 )
 RECORDING = {
@@ -73,6 +77,7 @@ ALONG = (
 )
 KEY_POSES = (
     *(f"{PACKAGE}/{room}" for room in ("geometry", "mining")),
+    f"{PACKAGE}/types.py",
     f"{PACKAGE}/memory/robot.py",
     f"{PACKAGE}/envs/unsteady.py",
     *(
@@ -81,7 +86,8 @@ KEY_POSES = (
     ),
 )
 LANGUAGE = (
-    *(f"{PACKAGE}/{room}" for room in ("control", "geometry", "memory", "mining")),
+    *(f"{PACKAGE}/{room}" for room in ("control", "geometry", "language", "memory", "mining")),
+    f"{PACKAGE}/types.py",
     f"{PACKAGE}/bench/language.py",
     f"{PACKAGE}/bench/taught_words.py",
     f"{PACKAGE}/bench/instructions",
@@ -89,6 +95,7 @@ LANGUAGE = (
 ACCURACY = ("benchmarks/libero/accuracy.py", f"{PACKAGE}/bench/object_frames.py")
 CALIBRATION = (
     *(f"{PACKAGE}/{room}" for room in ("calibration", "geometry")),
+    f"{PACKAGE}/types.py",
     *(f"{PACKAGE}/mining/{name}.py" for name in ("columns", "dataset", "signals")),
     f"{PACKAGE}/memory/robot.py",
     *(f"{PACKAGE}/cli/{name}.py" for name in ("calibrate", "pipeline")),
@@ -156,7 +163,7 @@ FIGURES: dict[str, Figure] = {
     "language": _bench("language", "language", LANGUAGE),
     "memory": _bench(
         "memory", "memory",
-        (f"{PACKAGE}/memory", f"{PACKAGE}/geometry", f":(glob){PACKAGE}/memory*.py",
+        (f"{PACKAGE}/memory", f"{PACKAGE}/language", f"{PACKAGE}/geometry", f"{PACKAGE}/types.py",
          f":(glob){PACKAGE}/bench/synthetic_*.py", f"{PACKAGE}/bench/memory.py"),
     ),
     "measurement_noise": Figure(f"python -m {NOISE}", (*TABLETOP, *ALONG, *NOISE_PATHS), "openspm_tabletop"),
@@ -167,7 +174,9 @@ FIGURES: dict[str, Figure] = {
     "libero_accuracy": _libero("run", *ACCURACY, options=LIBERO_GOAL),
     "libero_few_shot_3": _libero("few_shot", options="--demos=3"),
     "libero_few_shot_1": _libero("few_shot", options="--demos=1 --states=10"),
-    "libero_ablations": _libero("ablations", "benchmarks/libero/geometric_guess.py", f"{PACKAGE}/judgement"),
+    "libero_ablations": _libero(
+        "ablations", "benchmarks/libero/geometric_guess.py", f"{PACKAGE}/mining/phase_labels"
+    ),
     **{f"libero_new_task_{task}_3": _libero("new_task", options=f"--task={task}") for task in NEW_TASKS},
     "libero_losses": _libero("losses"),
     "libero_latency": _libero("latency"),

@@ -28,7 +28,7 @@ from lerobot_openspm.errors import JudgementError, OpenSPMError
 from lerobot_openspm.geometry import se3
 from lerobot_openspm.geometry.se3 import Array
 from lerobot_openspm.language.instruction import parse_instruction
-from lerobot_openspm.memory.entry import WORLD, Anchor, MemoryEntry, MemoryKeyPose, RetrievalKey, SubTask
+from lerobot_openspm.memory.entry import WORLD, Anchor, MemoryEntry, MemoryKeyPose, RetrievalKey
 from lerobot_openspm.memory.memory import Memory, read_memory
 from lerobot_openspm.mining.phase_labels.endpoint import API_BASE, ChatEndpoint
 from lerobot_openspm.mining.phase_labels.qwen3vl import WEIGHTS, Qwen3VL
@@ -42,6 +42,7 @@ from lerobot_openspm.mining.phase_labels.zero_shot import (
 )
 from lerobot_openspm.modeling_openspm import OpenSPMPolicy
 from lerobot_openspm.perception.oracle import name_simulator_poses
+from lerobot_openspm.types import SubTask
 
 ABOVE_M = 0.12
 PULL_M = 0.15

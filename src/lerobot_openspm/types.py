@@ -1,4 +1,4 @@
-"""What perception takes and gives: views, hints from mining, scenes to learn from, pose estimates."""
+"""What crosses rooms: what an instruction says, what a camera shows, where objects are."""
 
 from __future__ import annotations
 
@@ -153,3 +153,55 @@ class PoseEstimate:
     visible: float = 1.0
     support: Support | None = None
     others: tuple[Array, ...] = ()
+
+
+@dataclass(frozen=True)
+class Reference:
+    """How an instruction tells an object from others of its name, to be resolved in the scene.
+
+    "the bowl between the plate and the ramekin" is ``Reference("between", ("plate", "ramekin"))``, "the left
+    plate" is ``Reference("left")``.
+
+    Attributes:
+        relation: Where the object is: "between", "next to", "on", "in", "left", "right", "front", "back" ...
+        landmarks: The objects it is there relative to; none where it is meant among those of its own name.
+    """
+
+    relation: str
+    landmarks: tuple[str, ...] = ()
+
+
+# The operation of an instruction in which the grammar reads none: what is done is what its words say.
+OWN_WORDS = "do"
+
+
+@dataclass(frozen=True)
+class SubTask:
+    """One thing to do, as an instruction says it.
+
+    Attributes:
+        operation: What is done: put, open, close, push, turn on, turn off; :data:`OWN_WORDS` where it is kept
+            by its words.
+        target: The object it is done to.
+        part: The part of the target that is meant ("top drawer"), or "".
+        relation: Where the target goes relative to the landmark ("on", "in", "front of"), or "".
+        landmark: The object it goes to, or "".
+        target_where: Which of several objects of the target's name is meant; None where it is not said.
+        landmark_where: Likewise for the landmark.
+        words: The instruction in its own words, without articles and courtesies, where the grammar cannot
+            read it; else "".
+    """
+
+    operation: str
+    target: str
+    part: str = ""
+    relation: str = ""
+    landmark: str = ""
+    target_where: Reference | None = None
+    landmark_where: Reference | None = None
+    words: str = ""
+
+    @property
+    def objects(self) -> tuple[str, ...]:
+        """The objects that are named: target, then landmark."""
+        return tuple(name for name in (self.target, self.landmark) if name)

@@ -20,11 +20,11 @@ PASSED_OVER = (
     # Backends that need a download, and what only asks one.
     *(
         "search.py",
-        "perception/sam3d",
+        "perception/objects/sam3d",
         "perception/segmentation/grounded_sam2",
         "perception/segmentation/sam3",
     ),
-    "judgement/",
+    "mining/phase_labels/",
     # It imports all measures; whose it runs say so in their paths.
     "cli/bench.py",
 )
@@ -32,8 +32,11 @@ PASSED_OVER = (
 OTHER_SIMULATOR = {
     "openspm_tabletop": ("envs/libero/", "bench/libero.py"),
     "libero": (
-        *(f"envs/{name}.py" for name in ("experts", "layout", "scene", "tasks")),
-        *("envs/tabletop_", "bench/tabletop.py"),
+        *(
+            f"envs/tabletop/{name}.py"
+            for name in ("experts", "placement", "scene", "tasks", "env", "recording")
+        ),
+        "bench/tabletop.py",
     ),
 }
 # What a figure imports for types alone, or of which it uses only what keeps its folder, or reads a dataset.

@@ -8,7 +8,7 @@ from tests.properties import examples
 from lerobot_openspm.control.reference import MARGIN_M, OPPOSITE_THE_ROBOT, choose
 from lerobot_openspm.errors import InstructionError
 from lerobot_openspm.geometry import se3
-from lerobot_openspm.memory.entry import Reference
+from lerobot_openspm.types import Reference
 
 PLACES = st.lists(st.tuples(st.floats(-0.5, 0.5), st.floats(-0.5, 0.5)), min_size=2, max_size=5)
 AMONG = ["left", "right", "front", "back"]

@@ -7,8 +7,8 @@ from tests.control.test_controller import knowledge
 from lerobot_openspm.control.referents import Referents, references
 from lerobot_openspm.geometry import se3
 from lerobot_openspm.memory.compose import Candidate
-from lerobot_openspm.memory.entry import MemoryEntry, Reference, RetrievalKey, SubTask
-from lerobot_openspm.types import PoseEstimate
+from lerobot_openspm.memory.entry import MemoryEntry, RetrievalKey
+from lerobot_openspm.types import PoseEstimate, Reference, SubTask
 
 NEXT_TO_RACK = Reference("next to", ("rack",))
 

@@ -9,7 +9,7 @@ from lerobot_openspm.errors import InstructionError
 from lerobot_openspm.language.instruction import parse_instruction, read_task
 from lerobot_openspm.language.meaning import same_meaning
 from lerobot_openspm.language.vocabulary import VERBS
-from lerobot_openspm.memory.entry import Reference, SubTask
+from lerobot_openspm.types import Reference, SubTask
 
 TABLETOP = {
     "bowl_on_plate": [SubTask("put", "bowl", "", "on", "plate")],

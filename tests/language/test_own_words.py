@@ -10,8 +10,8 @@ from lerobot_openspm.language.instruction import read_task, read_tasks
 from lerobot_openspm.language.meaning import semantic_score
 from lerobot_openspm.language.names import TABLE_NAMES
 from lerobot_openspm.language.own_words import normal_words, unread, words_similarity
-from lerobot_openspm.memory.entry import OWN_WORDS
 from lerobot_openspm.memory.retrieval import MIN_SEMANTIC, read_instruction
+from lerobot_openspm.types import OWN_WORDS
 
 
 @pytest.mark.parametrize(

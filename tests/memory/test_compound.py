@@ -11,7 +11,7 @@ from lerobot_openspm.errors import InstructionError
 from lerobot_openspm.geometry import se3
 from lerobot_openspm.language.instruction import parse_instruction
 from lerobot_openspm.memory.compose import parts, phrase, plan_parts, sub_task_index
-from lerobot_openspm.memory.entry import Reference, SubTask
+from lerobot_openspm.types import Reference, SubTask
 
 DRAWER = "open the top drawer and put the bowl inside"
 

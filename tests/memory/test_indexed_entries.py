@@ -9,7 +9,7 @@ from lerobot_openspm.errors import InstructionError
 from lerobot_openspm.language.instruction import parse_instruction
 from lerobot_openspm.memory import indexed_entries as module
 from lerobot_openspm.memory.columns import columns_of, key_digest
-from lerobot_openspm.memory.entry import RetrievalKey, SubTask
+from lerobot_openspm.memory.entry import RetrievalKey
 from lerobot_openspm.memory.indexed_entries import (
     ENTRIES_IN_ALL,
     ENTRIES_PER_KEY,
@@ -19,6 +19,7 @@ from lerobot_openspm.memory.indexed_entries import (
     near,
 )
 from lerobot_openspm.memory.retrieval import MIN_SEMANTIC, semantic_score
+from lerobot_openspm.types import SubTask
 
 BOWL, STOVE = "put the bowl on the plate", "turn on the stove"
 DIGEST_OF_BOWL = 13536161139241641483

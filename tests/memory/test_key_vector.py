@@ -8,8 +8,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from lerobot_openspm.language.instruction import parse_instruction
-from lerobot_openspm.memory.entry import Reference, SubTask
 from lerobot_openspm.memory.key_vector import DIMENSIONS, SCHEME, key_vector, key_vectors
+from lerobot_openspm.types import Reference, SubTask
 
 names = st.text("abc ", max_size=8).map(lambda text: " ".join(text.split()))
 references = st.none() | st.builds(Reference, names, st.tuples(names, names))

@@ -1,8 +1,8 @@
-"""Imports go one way: geometry <- calibration, perception, mining, memory, flow <- control <- policy.
+"""Imports go one way, over every room.
 
-judgement lies above mining, whose key poses it judges, and below policy.
-
-envs, bench and cli are leaves.
+geometry <- types <- language <- memory <- perception <- mining <- flow <- control <- policy <- cli, bench;
+calibration needs geometry alone, envs stand beside. "policy" is LeRobot's three modules and their helpers,
+which lie directly in the package.
 """
 
 import ast
@@ -15,22 +15,28 @@ SRC = Path(__file__).parents[2] / "src"
 PACKAGE = "lerobot_openspm"
 FACE = "lerobot_policy_openspm"
 BASICS = ("errors", "files")
-LEAVES = {"envs", "cli", "bench"}
-# What each part may import of ours besides itself and the basics: `errors`, and writing `files`. Modules
-# directly in the package (configuration_openspm, modeling_openspm, processor_openspm and their helpers) are
-# the part "policy".
+# What each room may import of ours besides itself and the basics.
 ALLOWED = {
     "geometry": set(),
+    "types": {"geometry"},
     "calibration": {"geometry"},
-    "perception": {"geometry"},
-    "memory": {"geometry"},
-    "mining": {"geometry", "perception", "memory"},
-    "flow": {"geometry", "memory", "mining"},
-    "judgement": {"geometry", "perception", "memory", "mining"},
-    "control": {"geometry", "perception", "memory", "flow"},
-    "policy": {"geometry", "perception", "memory", "mining", "judgement", "flow", "control"},
+    "language": {"geometry", "types"},
+    "memory": {"geometry", "types", "language"},
+    "perception": {"geometry", "types"},
+    "mining": {"geometry", "types", "perception", "memory"},
+    "flow": {"geometry", "types", "memory", "mining"},
+    "control": {"geometry", "types", "language", "perception", "memory", "flow"},
+    "policy": {"geometry", "types", "language", "perception", "memory", "mining", "flow", "control"},
 }
-PURE = ("geometry", "calibration", "perception", "memory", "control")
+LEAVES = {"envs", "cli", "bench"}
+# Still to be undone. A line whose import is gone has to go too.
+NOT_YET = {
+    ("perception", "control"),
+    ("perception", "memory"),
+    ("memory", "perception"),
+    ("mining", "language"),
+}
+PURE = ("geometry", "calibration", "language", "memory", "control")
 
 
 def part_of(module: str) -> str:
@@ -40,6 +46,8 @@ def part_of(module: str) -> str:
         return "face"
     if len(names) > 1 and (SRC / PACKAGE / names[1]).is_dir():
         return names[1]
+    if names[1:2] == ["types"]:
+        return "types"
     return "basics" if names[1:2] in ([name] for name in BASICS) else "policy"
 
 
@@ -94,13 +102,18 @@ def test_a_part_imports_only_what_lies_below_it(part: str):
         for module in MODULES
         if part_of(module) == part
         for name, target in ours(module)
-        if target not in ALLOWED[part]
+        if target not in ALLOWED[part] and (part, target) not in NOT_YET
     ]
     assert wrong == []
 
 
+def test_what_is_not_yet_undone_is_still_there():
+    found = {(part_of(module), target) for module in MODULES for _, target in ours(module)}
+    assert found >= NOT_YET
+
+
 def test_envs_bench_and_cli_are_leaves():
-    allowed = {(FACE + ".__init__", f"{PACKAGE}.envs.configuration_tabletop")}
+    allowed = {(FACE + ".__init__", f"{PACKAGE}.envs.tabletop.configuration")}
     wrong = [
         f"{module} imports {name}"
         for module in MODULES
@@ -135,7 +148,7 @@ def test_the_method_needs_neither_lerobot_nor_mujoco(part: str):
     ("code", "expected"),
     [
         ("from lerobot_openspm import control", ["lerobot_openspm.control"]),
-        ("from ..control import row", ["lerobot_openspm.control.controller"]),
+        ("from ..control import executor", ["lerobot_openspm.control.executor"]),
         ("def f():\n    import mujoco", []),
         ("try:\n    import mujoco\nexcept ImportError:\n    pass", ["mujoco"]),
     ],

@@ -19,7 +19,8 @@ from lerobot_openspm.language.instruction import parse_instruction
 from lerobot_openspm.language.meaning import same_meaning
 from lerobot_openspm.language.names import TABLE_NAMES, Model2VecNames, NameSimilarity
 from lerobot_openspm.memory.compose import plan_parts
-from lerobot_openspm.memory.entry import MemoryEntry, Reference, RetrievalKey, SubTask
+from lerobot_openspm.memory.entry import MemoryEntry, RetrievalKey
+from lerobot_openspm.types import Reference, SubTask
 
 # The instructions and their elements, which were checked by reading every line.
 KNOWN, PARAPHRASES, OUT_OF_DOMAIN = "known.json", "paraphrases.json", "out_of_domain.json"

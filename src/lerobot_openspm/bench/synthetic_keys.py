@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from lerobot_openspm.memory.entry import SubTask
+from lerobot_openspm.types import SubTask
 
 _THINGS = (
     "bowl", "plate", "mug", "cup", "bottle", "box", "can", "jar", "pot", "pan", "lid", "tray", "basket",

@@ -36,12 +36,12 @@ THREADS = 1
 DONE, LOG = "done.json", "output.log"
 # The package's files that make a simulator's demonstrations what they are.
 RECORDED_BY = {
-    "openspm_tabletop": ("cli/collect.py", "envs/*.py"),
+    "openspm_tabletop": ("cli/collect.py", "envs/*.py", "envs/tabletop/*.py"),
     "libero": (
         "cli/collect.py",
         *(
             f"envs/{name}.py"
-            for name in ("calibration", "gl_backend", "motions", "recording", "seeds", "simulator")
+            for name in ("calibration", "gl_backend", "motions", "recording", "seeds", "tabletop/simulator")
         ),
         "envs/libero/*.py",
     ),

@@ -22,11 +22,11 @@ from lerobot_openspm.flow.condition import Query
 from lerobot_openspm.geometry import se3
 from lerobot_openspm.geometry.se3 import Array
 from lerobot_openspm.memory.compose import Candidate, plan_parts
-from lerobot_openspm.memory.entry import WORLD, MemoryEntry, MemoryKeyPose, Outcome, SubTask
+from lerobot_openspm.memory.entry import WORLD, MemoryEntry, MemoryKeyPose, Outcome
 from lerobot_openspm.memory.retrieval import Scored
 from lerobot_openspm.perception.tracking.camera_health import Fault
 from lerobot_openspm.perception.tracking.tracker import Tracker, TrackStatus
-from lerobot_openspm.types import PoseEstimate
+from lerobot_openspm.types import PoseEstimate, SubTask
 
 logger = logging.getLogger(__name__)
 

@@ -14,7 +14,7 @@ import numpy as np
 
 from lerobot_openspm.errors import InstructionError
 from lerobot_openspm.geometry.se3 import Array
-from lerobot_openspm.memory.entry import Reference
+from lerobot_openspm.types import Reference
 
 # Where a person looks who stands opposite a robot that looks along the world's x.
 OPPOSITE_THE_ROBOT = np.array([-1.0, 0.0])

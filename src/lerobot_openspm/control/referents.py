@@ -11,8 +11,7 @@ import numpy as np
 from lerobot_openspm.control.reference import choose
 from lerobot_openspm.geometry.se3 import Array
 from lerobot_openspm.memory.compose import Candidate
-from lerobot_openspm.memory.entry import Reference
-from lerobot_openspm.types import PoseEstimate
+from lerobot_openspm.types import PoseEstimate, Reference
 
 logger = logging.getLogger(__name__)
 

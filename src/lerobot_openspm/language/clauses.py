@@ -9,7 +9,7 @@ from lerobot_openspm.language import vocabulary as v
 from lerobot_openspm.language.nouns import IMPLIED, Noun, read_noun, read_nouns
 from lerobot_openspm.language.prepositions import Preposition, match_preposition
 from lerobot_openspm.language.sentences import PREDICATES, Clause, Words
-from lerobot_openspm.memory.entry import Reference
+from lerobot_openspm.types import Reference
 
 # Words of a predicate that do not say what is to become of the subject.
 _AUXILIARIES = v.word_set(

@@ -21,7 +21,7 @@ from lerobot_openspm.language.nouns import Noun
 from lerobot_openspm.language.own_words import normal_words, unread
 from lerobot_openspm.language.sense import makes_sense, says_all
 from lerobot_openspm.language.sentences import MAX_CHARACTERS, Clause, read_clauses
-from lerobot_openspm.memory.entry import Reference, SubTask
+from lerobot_openspm.types import Reference, SubTask
 
 PICK = "pick"
 

@@ -18,7 +18,7 @@ from lerobot_openspm.language.nouns import Noun
 from lerobot_openspm.language.sense import MADE, OPENED, SWITCHED, is_said_again
 from lerobot_openspm.language.sentences import MAX_CHARACTERS, is_question, refuse_what_asks_for_nothing
 from lerobot_openspm.language.wording import plain_words
-from lerobot_openspm.memory.entry import Reference, SubTask
+from lerobot_openspm.types import Reference, SubTask
 
 
 def read_loosely(instruction: str, things: Collection[str] = THINGS) -> tuple[SubTask, ...]:

@@ -9,7 +9,7 @@ from itertools import permutations
 from lerobot_openspm.language import vocabulary as v
 from lerobot_openspm.language.names import TABLE_NAMES, NameSimilarity, canonical_name
 from lerobot_openspm.language.own_words import words_similarity
-from lerobot_openspm.memory.entry import Reference, SubTask
+from lerobot_openspm.types import Reference, SubTask
 
 # What is lost where the part is not said, or another one; where the thing would end elsewhere.
 PART_UNSAID, OTHER_PART, OTHER_RELATION = 0.9, 0.5, 0.6

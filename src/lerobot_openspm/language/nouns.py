@@ -7,7 +7,7 @@ from itertools import pairwise
 
 from lerobot_openspm.errors import InstructionError
 from lerobot_openspm.language import vocabulary as v
-from lerobot_openspm.memory.entry import Reference
+from lerobot_openspm.types import Reference
 
 Words = tuple[str, ...]
 

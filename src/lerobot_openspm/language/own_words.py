@@ -16,7 +16,7 @@ from lerobot_openspm.errors import InstructionError
 from lerobot_openspm.language import vocabulary as v
 from lerobot_openspm.language.names import NameSimilarity
 from lerobot_openspm.language.wording import plain_words
-from lerobot_openspm.memory.entry import OWN_WORDS, SubTask
+from lerobot_openspm.types import OWN_WORDS, SubTask
 
 # One phrase fewer than the demonstration's instruction has: "wipe the table" for "... with the sponge".
 PHRASE_UNSAID = 0.9

@@ -11,7 +11,7 @@ from lerobot_openspm.language.loose_words import FORMS, THINGS
 from lerobot_openspm.language.names import canonical_name
 from lerobot_openspm.language.prepositions import Preposition, match_preposition
 from lerobot_openspm.language.wording import plain_words
-from lerobot_openspm.memory.entry import SubTask
+from lerobot_openspm.types import SubTask
 
 # What is opened and closed, and what is switched.
 OPENED = v.word_set("cabinet microwave")

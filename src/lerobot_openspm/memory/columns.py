@@ -11,7 +11,8 @@ from typing import Protocol, runtime_checkable
 import numpy as np
 from numpy.typing import NDArray
 
-from lerobot_openspm.memory.entry import MemoryEntry, SubTask
+from lerobot_openspm.memory.entry import MemoryEntry
+from lerobot_openspm.types import SubTask
 
 Key = tuple[SubTask, ...]
 

@@ -16,9 +16,10 @@ from lerobot_openspm.errors import InstructionError
 from lerobot_openspm.language.meaning import semantic_score
 from lerobot_openspm.language.names import TABLE_NAMES, NameSimilarity
 from lerobot_openspm.language.own_words import normal_words
-from lerobot_openspm.memory.entry import MemoryEntry, MemoryKeyPose, Reference, RetrievalKey, SubTask
+from lerobot_openspm.memory.entry import MemoryEntry, MemoryKeyPose, RetrievalKey
 from lerobot_openspm.memory.indexed_entries import near
 from lerobot_openspm.memory.retrieval import candidates_for, read_instruction, why_unread
+from lerobot_openspm.types import Reference, SubTask
 
 # A sub-task takes hold of something and lets it go again.
 TRANSITIONS_PER_SUB_TASK = 2

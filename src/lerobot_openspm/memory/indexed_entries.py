@@ -14,9 +14,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lerobot_openspm.memory.columns import HasColumns, Key, key_digest
-from lerobot_openspm.memory.entry import MemoryEntry, SubTask
+from lerobot_openspm.memory.entry import MemoryEntry
 from lerobot_openspm.memory.index import make_index
 from lerobot_openspm.memory.key_vector import key_vectors
+from lerobot_openspm.types import SubTask
 
 logger = logging.getLogger(__name__)
 

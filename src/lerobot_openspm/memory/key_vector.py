@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from scipy.sparse import csr_array  # pyright: ignore[reportMissingTypeStubs]
 
 from lerobot_openspm.language.meaning import canonical
-from lerobot_openspm.memory.entry import Reference, SubTask
+from lerobot_openspm.types import Reference, SubTask
 
 Vectors = NDArray[np.float32]
 

@@ -11,8 +11,9 @@ from lerobot_openspm.language.instruction import parse_instruction, read_task
 from lerobot_openspm.language.meaning import means_the_same, semantic_score
 from lerobot_openspm.language.names import TABLE_NAMES, AmongKnown, NameSimilarity
 from lerobot_openspm.language.own_words import normal_words, unread
-from lerobot_openspm.memory.entry import MemoryEntry, SubTask
+from lerobot_openspm.memory.entry import MemoryEntry
 from lerobot_openspm.memory.indexed_entries import known_names, near
+from lerobot_openspm.types import SubTask
 
 # Below this semantic score an entry is about something else.
 MIN_SEMANTIC = 0.75

@@ -13,7 +13,6 @@ from lerobot_openspm.geometry import se3
 from lerobot_openspm.geometry.se3 import Array
 from lerobot_openspm.language.vocabulary import REFERENCES, RELATIONS, VERBS
 from lerobot_openspm.memory.entry import (
-    OWN_WORDS,
     PHASES,
     Anchor,
     Axis,
@@ -21,9 +20,7 @@ from lerobot_openspm.memory.entry import (
     MemoryEntry,
     MemoryKeyPose,
     Outcome,
-    Reference,
     RetrievalKey,
-    SubTask,
 )
 from lerobot_openspm.memory.fields import (
     LIMIT,
@@ -41,6 +38,7 @@ from lerobot_openspm.memory.fields import (
     texts,
 )
 from lerobot_openspm.memory.robot import RobotModel
+from lerobot_openspm.types import OWN_WORDS, Reference, SubTask
 
 ENTRY = frozenset(
     (

@@ -11,8 +11,9 @@ import numpy as np
 from lerobot_openspm.geometry import se3
 from lerobot_openspm.geometry.se3 import Array
 from lerobot_openspm.memory.compose import sub_task_index
-from lerobot_openspm.memory.entry import CONTACT_PHASES, WORLD, Anchor, SubTask
+from lerobot_openspm.memory.entry import CONTACT_PHASES, WORLD, Anchor
 from lerobot_openspm.mining.key_poses import KeyPose
+from lerobot_openspm.types import SubTask
 
 # An anchor other than the one the instruction suggests must explain the demonstrations better by this much,
 # shared among them: with one demonstration the instruction decides, with many the evidence does.

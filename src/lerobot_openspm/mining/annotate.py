@@ -29,12 +29,12 @@ from lerobot.utils.constants import OBS_STATE
 from lerobot_openspm.errors import DatasetError
 from lerobot_openspm.files import rename
 from lerobot_openspm.memory.compose import phrase
-from lerobot_openspm.memory.entry import SubTask
 from lerobot_openspm.mining.anchors import sub_task_of
 from lerobot_openspm.mining.columns import TARGET, TYPES, encode_key_poses, features
 from lerobot_openspm.mining.dataset import Demonstrations
 from lerobot_openspm.mining.key_poses import KeyPose
 from lerobot_openspm.mining.mined import MinedEpisode, MinedKeyPoses
+from lerobot_openspm.types import SubTask
 
 logger = logging.getLogger(__name__)
 

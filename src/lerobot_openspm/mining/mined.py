@@ -7,12 +7,13 @@ from dataclasses import dataclass
 
 from lerobot_openspm.geometry.camera import Camera
 from lerobot_openspm.geometry.se3 import Array
-from lerobot_openspm.memory.entry import Anchor, Axis, Outcome, SubTask
+from lerobot_openspm.memory.entry import Anchor, Axis, Outcome
 from lerobot_openspm.memory.robot import RobotModel
 from lerobot_openspm.mining.anchors import Demonstration, Role
 from lerobot_openspm.mining.key_poses import KeyPose
 from lerobot_openspm.mining.signals import Episode
 from lerobot_openspm.perception.objects.model import KnownObject
+from lerobot_openspm.types import SubTask
 
 
 @dataclass(frozen=True)

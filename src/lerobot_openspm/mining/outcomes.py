@@ -8,8 +8,9 @@ import numpy as np
 
 from lerobot_openspm.geometry import se3
 from lerobot_openspm.geometry.se3 import Array
-from lerobot_openspm.memory.entry import WORLD, Anchor, Outcome, SubTask
+from lerobot_openspm.memory.entry import WORLD, Anchor, Outcome
 from lerobot_openspm.mining.anchors import Demonstration, sub_task_of
+from lerobot_openspm.types import SubTask
 
 # How exactly an object is found again where it was put: what deviates by less is no miss.
 FOUND_AGAIN_M = 0.010

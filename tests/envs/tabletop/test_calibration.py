@@ -9,7 +9,7 @@ from lerobot_openspm.envs.calibration import calibration_document, camera_calibr
 from lerobot_openspm.envs.tabletop import scene
 from lerobot_openspm.geometry.camera import cameras_from_dict, project
 
-CAMERA_FILE = Path(__file__).parents[2] / "configs/cameras/openspm_tabletop.json"
+CAMERA_FILE = Path(__file__).parents[3] / "configs/cameras/openspm_tabletop.json"
 
 
 def _world_from_camera(env, camera: str) -> np.ndarray:

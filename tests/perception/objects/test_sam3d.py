@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 from tests.geometry.strategies import rotvecs, vectors
-from tests.perception import sam3d_scene as scene
+from tests.perception.objects import sam3d_scene as scene
 
 from lerobot_openspm.errors import PerceptionError
 from lerobot_openspm.geometry import se3

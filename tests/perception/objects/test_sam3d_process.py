@@ -7,7 +7,7 @@ import time
 
 import numpy as np
 import pytest
-from tests.perception import sam3d_scene as scene
+from tests.perception.objects import sam3d_scene as scene
 from tests.perception.objects.test_sam3d import client, told
 
 from lerobot_openspm.errors import PerceptionError

@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
-from tests.perception import sam3d_scene as scene
+from tests.perception.objects import sam3d_scene as scene
 
 from lerobot_openspm.errors import PerceptionError
 from lerobot_openspm.perception.objects.sam3d import worker as sam3d_worker
