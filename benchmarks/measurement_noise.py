@@ -82,10 +82,14 @@ def collect(config: BenchConfig) -> list[Sample]:
                 def note(
                     _: int, __: Observation, row: EpisodeController, truth=truth, scene=scene, seed=seed
                 ) -> None:
-                    if row.has_just_looked and row.seen is not None:
+                    if row.scene.has_just_looked and row.scene.detections is not None:
                         true = truth.now(scene.object_poses())
-                        for name, estimate in row.seen.estimates.items():
-                            if name in true and name not in row.tracker.held and estimate.support is not None:
+                        for name, estimate in row.scene.detections.estimates.items():
+                            if (
+                                name in true
+                                and name not in row.scene.tracker.held
+                                and estimate.support is not None
+                            ):
                                 round_ = 0 in (
                                     true_period(name, config.env.type), memory.yaw_periods[name]
                                 )  # fmt: skip

@@ -15,7 +15,8 @@ import torch
 
 from lerobot_openspm.cli.drawing import draw_key_poses, save_png
 from lerobot_openspm.configuration_openspm import OpenSPMConfig
-from lerobot_openspm.control.controller import EpisodeController, PlanningContext
+from lerobot_openspm.control.controller import EpisodeController
+from lerobot_openspm.control.planning_context import PlanningContext
 from lerobot_openspm.control.transfer import transfer
 from lerobot_openspm.envs.tabletop.env import ACTION_NAMES, STATE_NAMES, TabletopEnv
 from lerobot_openspm.memory.memory import read_memory
@@ -53,7 +54,7 @@ def main() -> None:
     row.observe(observation.hand, partial(Perception(memory, config.hand_radius_m).look, observation))
 
     print(f"{options.instruction!r}: {row.status.name.lower()}")
-    for name, T_world_obj in row.layout.items():
+    for name, T_world_obj in row.object_poses.items():
         print(f"  the {name} is at {T_world_obj[:3, 3].round(3).tolist()} m")
     print("  recalled              semantics  geometry  quality   score")
     for item in row.ranked:
@@ -64,9 +65,9 @@ def main() -> None:
 
     # 3. Draw where the hand is to go.
     best = row.ranked[0].entry
-    if any(name not in row.layout for name in best.objects):
+    if any(name not in row.object_poses for name in best.objects):
         raise SystemExit("not all of its objects were found in this scene; try another --seed")
-    targets = transfer(best, row.layout, memory.yaw_periods, observation.hand.T_world_ee)
+    targets = transfer(best, row.object_poses, memory.yaw_periods, observation.hand.T_world_ee)
     view = observation.views(memory.cameras)[CAMERA]
     picture = draw_key_poses(view, [t.T_world_ee for t in targets], [t.key_pose.phase for t in targets])
     save_png(picture, options.output / "key_poses.png")

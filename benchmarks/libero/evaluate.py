@@ -28,7 +28,8 @@ from benchmarks.libero.episode import Episode, initial_states, run_episode
 from tqdm import tqdm
 
 from lerobot_openspm.cli.pipeline import digest, rate
-from lerobot_openspm.control.executor import Execution, Status
+from lerobot_openspm.control.status import Status
+from lerobot_openspm.control.strategies import Execution
 from lerobot_openspm.envs.libero.simulator import LiberoSimulator, tasks
 from lerobot_openspm.envs.seeds import TUNING_SEED_START
 from lerobot_openspm.files import write_beside
@@ -149,7 +150,7 @@ def reason(episode: dict[str, Any]) -> str:
     match episode["status"]:
         case Status.DONE:
             return "every key pose was met, but the goal does not hold"
-        case Status.RUNNING:
+        case Status.RUNNING | Status.PAUSED:
             return f"time was up at {episode['phase']}"
         case Status.NO_PROGRESS:
             return f"gave up at {episode['phase']}"

@@ -15,11 +15,11 @@ from benchmarks.libero.stages import dataset, policy
 
 from lerobot_openspm.bench.episode import LazyImages
 from lerobot_openspm.bench.libero import LiberoWorld
-from lerobot_openspm.control.executor import Hand
 from lerobot_openspm.envs.libero.simulator import LiberoSimulator
 from lerobot_openspm.envs.seeds import TUNING_SEED_START
 from lerobot_openspm.modeling_openspm import OpenSPMPolicy
 from lerobot_openspm.perception.observation import Observation
+from lerobot_openspm.types import Hand
 
 TASK = "put_the_bowl_on_the_plate"
 CHUNKS, LOOKS, WARM_UP = 1000, 100, 20
@@ -38,7 +38,7 @@ def main() -> dict[str, Any]:
     observation = Observation(simulator.instruction, vector, hand, images, None)
     with torch.inference_mode():
         first = _times(lambda: (acting.reset(), acting.act([observation])), LOOKS)
-        row = acting.rows[0]
+        row = acting.episodes[0].controller
         chunk = _times(lambda: acting._chunk(row, row.query(hand)), CHUNKS)
     horizon = acting.config.chunk_size
     return write(

@@ -11,12 +11,12 @@ from lerobot.configs import NormalizationMode, PreTrainedConfig
 from lerobot.optim import AdamWConfig, CosineDecayWithWarmupSchedulerConfig
 from lerobot.utils.constants import ACTION, OBS_STATE
 
-from lerobot_openspm.control.executor import ControlSettings, Execution
-from lerobot_openspm.control.transfer import TransferLimits
+from lerobot_openspm.control.checks import TransferLimits
+from lerobot_openspm.control.strategies import ControlSettings, Execution
 from lerobot_openspm.flow.condition import Conditioning
 from lerobot_openspm.geometry.vector_layout import ROTATION_KINDS, VectorLayout, parse_layout
 from lerobot_openspm.memory.retrieval import ScoreWeights
-from lerobot_openspm.perception.objects.learning import Shape
+from lerobot_openspm.types import Segmenter, Shape
 
 PerceptionSource = Literal["demonstrations", "oracle"]
 Segmentation = Literal["demonstrations", "sam3", "grounded_sam2", "given"]
@@ -268,6 +268,19 @@ class OpenSPMConfig(PreTrainedConfig):
         """Take the layouts from the dataset's feature names where they were not given. Called by LeRobot."""
         self.state_layout = self.state_layout or feature_names(features.get(OBS_STATE, {}).get("names"))
         self.action_layout = self.action_layout or feature_names(features.get(ACTION, {}).get("names"))
+
+    def make_segmenter(self) -> Segmenter | None:
+        """What finds the objects' masks; None where the demonstrations teach objects' looks.
+
+        Raises:
+            PerceptionError: It cannot be used.
+        """
+        if self.segmentation == "demonstrations":
+            return None
+        from lerobot_openspm.perception.segmentation.make import make_segmenter
+
+        weights, labels = self.segmentation_weights or (), self.mask_labels or {}
+        return make_segmenter(self.segmentation, {}, labels, weights, str(self.device))
 
     def layouts(self) -> tuple[VectorLayout, VectorLayout]:
         """Layouts of state and action. Raises LayoutError when names are missing or make no sense."""

@@ -6,10 +6,10 @@ import logging
 from collections.abc import Generator, Sequence
 from contextlib import contextmanager
 from copy import deepcopy
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -32,9 +32,10 @@ from lerobot_openspm.memory.memory import Memory, write_memory
 from lerobot_openspm.perception.observation import Observation, split_batch
 from lerobot_openspm.perception.pipeline import Perception
 from lerobot_openspm.perception.tracking.tracker import TrackerSettings
-from lerobot_openspm.teaching import Lesson, teach
-from lerobot_openspm.training import dataset_processor, memory_of, segmenter_of, training_set
-from lerobot_openspm.types import Segmenter
+from lerobot_openspm.types import Hand, Segmenter
+
+if TYPE_CHECKING:
+    from lerobot_openspm.teaching import Lesson
 
 logger = logging.getLogger(__name__)
 
@@ -45,6 +46,15 @@ ON_ONE_MACHINE = (
 
 # Of checkpoints that do not say how often their robot acts.
 DEFAULT_CONTROL_HZ = 20.0
+
+
+@dataclass
+class RunningEpisode:
+    """One environment: what decides there, through what it looks, whether its outcome was reported."""
+
+    controller: EpisodeController
+    perception: Perception
+    is_reported: bool = False
 
 
 class OpenSPMPolicy(PreTrainedPolicy):
@@ -79,6 +89,8 @@ class OpenSPMPolicy(PreTrainedPolicy):
         if dataset_meta is not None:
             _ = self.names  # what cannot be used is an error now, not at the first observation
             config.control_hz = config.control_hz or float(dataset_meta.fps)
+            from lerobot_openspm.training import dataset_processor, memory_of, training_set
+
             mined = dataset_processor(dataset_meta, config, segmenter=self.segmenter).mine(held_out=True)
             self.memory = memory_of(mined, config)
             self._training_set = training_set(mined, mined.robot, config)
@@ -89,14 +101,12 @@ class OpenSPMPolicy(PreTrainedPolicy):
 
     def reset(self) -> None:
         """Forget the running episodes."""
-        self.rows: list[EpisodeController] = []
-        self._eyes: list[Perception] = []
-        self._rated: list[EpisodeController] = []
+        self.episodes: list[RunningEpisode] = []
 
     @property
     def outcomes(self) -> list[bool | None]:
         """Whether each running episode is seen to have done what was asked; None where that is not known."""
-        return [row.succeeded for row in self.rows]
+        return [episode.controller.succeeded for episode in self.episodes]
 
     def report_outcomes(self, successes: Sequence[bool | None] | None = None) -> None:
         """Tell how the running episodes ended, before the next :meth:`reset`; the memory learns from it.
@@ -113,16 +123,16 @@ class OpenSPMPolicy(PreTrainedPolicy):
             OpenSPMError: There are more or fewer environments.
         """
         successes = self.outcomes if successes is None else successes
-        if len(successes) != len(self.rows):
+        if len(successes) != len(self.episodes):
             raise OpenSPMError(
-                f"got {len(successes)} outcomes, but {len(self.rows)} episodes are running; report one for "
-                "every environment, after acting and before reset()"
+                f"got {len(successes)} outcomes, but {len(self.episodes)} episodes are running; report one "
+                "for every environment, after acting and before reset()"
             )
         outcomes = []
-        for row, success in zip(self.rows, successes, strict=True):
-            if success is not None and not any(row is rated for rated in self._rated):
-                self._rated.append(row)
-                outcomes += [(entry, success) for entry in row.used_entries]
+        for episode, success in zip(self.episodes, successes, strict=True):
+            if success is not None and not episode.is_reported:
+                episode.is_reported = True
+                outcomes += [(entry, success) for entry in episode.controller.used_entries]
         if outcomes:
             self.memory = self.require_memory().with_outcomes(outcomes)
 
@@ -136,13 +146,12 @@ class OpenSPMPolicy(PreTrainedPolicy):
         """Choose one canonical action ``(b, 7)`` for every environment; images are looked at when needed."""
         self.eval()
         actions = []
-        for row, observation in self._observe(observations):
-            action = row.next_action(observation.hand)
+        for controller, hand in self._observe(observations):
+            action = controller.next_action(hand)
             if action is None:
-                row.executor.push_chunk(
-                    self._chunk(row, row.query(observation.hand))[: self.config.n_action_steps]
-                )
-                action = row.next_action(observation.hand)
+                chunk = self._chunk(controller, controller.query(hand))
+                controller.executor.push_chunk(chunk[: self.config.n_action_steps])
+                action = controller.next_action(hand)
             actions.append(action)
         return np.stack(actions)
 
@@ -154,12 +163,12 @@ class OpenSPMPolicy(PreTrainedPolicy):
         """
         with self._looking_ahead():
             chunks = []
-            for row, observation in self._observe(split_batch(batch, self.config.layouts()[0])):
+            for controller, hand in self._observe(split_batch(batch, self.config.layouts()[0])):
                 chunk = []
                 while len(chunk) < self.config.chunk_size:
-                    action = row.next_action(observation.hand)
+                    action = controller.next_action(hand)
                     if action is None:
-                        row.executor.push_chunk(self._chunk(row, row.query(observation.hand)))
+                        controller.executor.push_chunk(self._chunk(controller, controller.query(hand)))
                     else:
                         chunk.append(action)
                 chunks.append(chunk)
@@ -168,78 +177,78 @@ class OpenSPMPolicy(PreTrainedPolicy):
     @contextmanager
     def _looking_ahead(self) -> Generator[None]:
         """Act on copies of the running episodes; at the end those that were running are back."""
-        rows, eyes, is_training = self.rows, self._eyes, self.training
+        running, is_training = self.episodes, self.training
         # Entries, models and a segmenter's weights are large and never change: the copies share them.
-        shared = [self.memory, self.segmenter, *(one.memory for one in eyes)]
-        for row in rows:
-            shared += [row.candidates, *row.used_entries, *(one.entry for one in row.ranked)]
+        shared = [self.memory, self.segmenter, *(one.perception.memory for one in running)]
+        for controller in (one.controller for one in running):
+            entries = [*controller.used_entries, *(one.entry for one in controller.ranked)]
+            shared += [controller.candidates, *entries]
         try:
-            self.rows, self._eyes = deepcopy((rows, eyes), {id(one): one for one in shared})
+            self.episodes = deepcopy(running, {id(one): one for one in shared})
             self.eval()
             yield
         finally:
-            self.rows, self._eyes = rows, eyes
+            self.episodes = running
             self.train(is_training)
 
-    def _observe(self, observations: Sequence[Observation]) -> list[tuple[EpisodeController, Observation]]:
-        """Each environment's state, brought up to its observation."""
-        rows = self._rows_of(observations)
-        for row, eyes, observation in zip(rows, self._eyes, observations, strict=True):
-            row.observe(observation.hand, partial(eyes.look, observation))
-        return list(zip(rows, observations, strict=True))
+    def _observe(self, observations: Sequence[Observation]) -> list[tuple[EpisodeController, Hand]]:
+        """Each environment's controller, brought up to its observation, and its hand."""
+        self._begin_episodes(observations)
+        for episode, observation in zip(self.episodes, observations, strict=True):
+            detect = partial(episode.perception.detect, observation)
+            episode.controller.observe(observation.hand, detect)
+        return [
+            (episode.controller, observation.hand)
+            for episode, observation in zip(self.episodes, observations, strict=True)
+        ]
 
     def _encode(self, actions: np.ndarray) -> Tensor:
         """Actions ``(..., 7)`` in the robot's own layout."""
         vectors = self.config.layouts()[1].encode_actions(actions)
         return torch.as_tensor(vectors, dtype=torch.float32, device=self.config.device)
 
-    def _rows_of(self, observations: Sequence[Observation]) -> list[EpisodeController]:
-        """The state of each environment; a new one where the episode or its instruction is new."""
-        if len(self.rows) != len(observations):
-            self.rows = [self._new_row(observation) for observation in observations]
-            self._eyes = [self._new_eyes() for _ in observations]
+    def _begin_episodes(self, observations: Sequence[Observation]) -> None:
+        """Begin an episode wherever there is none, or its instruction is new."""
+        if len(self.episodes) != len(observations):
+            self.episodes = [self._new_episode(observation) for observation in observations]
         for i, observation in enumerate(observations):
-            if self.rows[i].instruction != observation.instruction:
-                self.rows[i], self._eyes[i] = self._new_row(observation), self._new_eyes()
-        return self.rows
+            if self.episodes[i].controller.instruction != observation.instruction:
+                self.episodes[i] = self._new_episode(observation)
 
-    def _new_row(self, observation: Observation) -> EpisodeController:
-        memory = self.require_memory()
-        config = self.config
-        # Rows share the index, which is made anew when the memory was replaced.
+    def _new_episode(self, observation: Observation) -> RunningEpisode:
+        memory, config = self.require_memory(), self.config
+        # Episodes share the index, which is made anew when the memory was replaced.
         if self._entries is None or self._entries[0] is not memory.entries:
             self._entries = memory.entries, indexed(memory.entries)
-        knowledge = PlanningContext(
+        context = PlanningContext(
             self._entries[1], memory.yaw_periods, memory.robot, config.score_weights,
             config.transfer_limits, config.control_settings, TrackerSettings(), config.tracking,
             self.step_s, self.names,
         )  # fmt: skip
-        return EpisodeController(
-            knowledge, observation.instruction, observation.fingerprint(), config.noise_seed
+        controller = EpisodeController(
+            context, observation.instruction, observation.fingerprint(), config.noise_seed
         )
+        return RunningEpisode(controller, Perception(memory, config.hand_radius_m, self.segmenter))
 
     @property
     def step_s(self) -> float:
         """Seconds that a control step takes."""
         return 1 / (self.config.control_hz or DEFAULT_CONTROL_HZ)
 
-    def _new_eyes(self) -> Perception:
-        return Perception(self.require_memory(), self.config.hand_radius_m, self.segmenter)
-
     @cached_property
     def segmenter(self) -> Segmenter | None:
         """What finds the objects' masks, made when it is first needed; None where their colours do."""
-        return segmenter_of(self.config)
+        return self.config.make_segmenter()
 
     @cached_property
     def names(self) -> NameSimilarity:
         """What says which names mean the same thing: the table of words, or with embeddings beside it."""
         return names_from(self.config.name_embeddings)
 
-    def _chunk(self, row: EpisodeController, query: Query) -> np.ndarray:
-        """Generate one chunk ``(chunk_size, 7)`` in the world. Rows go one by one, so batches act alike."""
+    def _chunk(self, controller: EpisodeController, query: Query) -> np.ndarray:
+        """Generate a chunk ``(chunk_size, 7)`` in the world. Episodes go one by one, so batches act alike."""
         condition = encode(query, self.config.conditioning)
-        noise = row.noise((1, self.config.chunk_size, 7))
+        noise = controller.noise((1, self.config.chunk_size, 7))
         device = self.flow.action_scale.device
         chunk = self.flow.sample(
             torch.as_tensor(condition[None], dtype=torch.float32, device=device),
@@ -285,6 +294,8 @@ class OpenSPMPolicy(PreTrainedPolicy):
 
         Args and errors are those of :func:`lerobot_openspm.teaching.teach`; after one nothing has changed.
         """
+        from lerobot_openspm.teaching import teach
+
         known = self.require_memory()
         self.memory, lesson = teach(known, self.config, dataset_meta, episodes, self.segmenter)
         return lesson
@@ -343,6 +354,8 @@ class OpenSPMPolicy(PreTrainedPolicy):
 
     def _learn_on(self, memory: Memory, dataset_meta: Any) -> Memory:
         """Take up a dataset to train on, and update what is known by it as ``config.memory_update`` says."""
+        from lerobot_openspm.training import dataset_processor, memory_of, training_set
+
         known = None if self.config.memory_update == "rebuild" else memory
         processor = dataset_processor(dataset_meta, self.config, known, memory.cameras, self.segmenter)
         if self.config.memory_update == "keep":

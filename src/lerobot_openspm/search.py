@@ -145,7 +145,7 @@ def search_scene(policy: OpenSPMPolicy, observation: Observation) -> Found:
         return in_words
     policy.reset()
     policy.act([observation])
-    row = policy.rows[0]
+    row = policy.episodes[0].controller
     if row.refusal:
         return replace(in_words, parts=(), refusal=row.refusal, status=row.status.value)
     sources = {id(one.entry): one.source for one in row.candidates[0]}
@@ -153,7 +153,7 @@ def search_scene(policy: OpenSPMPolicy, observation: Observation) -> Found:
         Hit(one.entry, sources[id(one.entry)], one.semantic, one.geometric, one.total) for one in row.ranked
     )
     needed = dict.fromkeys(name for hit in ranked for name in hit.entry.objects)
-    seen = {name: name in row.layout for name in needed}
+    seen = {name: name in row.object_poses for name in needed}
     return replace(in_words, parts=(ranked, *in_words.parts[1:]), seen=seen, status=row.status.value)
 
 

@@ -32,7 +32,6 @@ from lerobot_openspm.mining.phase_labels.make import make_judge
 from lerobot_openspm.mining.processor import DatasetProcessor, MiningOptions
 from lerobot_openspm.perception.objects.object_shape import ShapeBackend
 from lerobot_openspm.perception.objects.sam3d.size import Sam3dShape, worker_command
-from lerobot_openspm.perception.segmentation.make import make_segmenter
 from lerobot_openspm.types import Segmenter
 
 logger = logging.getLogger(__name__)
@@ -78,7 +77,7 @@ def dataset_processor(
         known_names=known_names(known.entries) if known else (),
         known_robot=known.robot if known else None,
         judge=None if config.phase_judge == "none" else partial(judged, config=config),
-        segmenter=segmenter or segmenter_of(config),
+        segmenter=segmenter or config.make_segmenter(),
         shape=config.shape,
         open_shapes=partial(shapes_of, config),
         is_oracle=config.perception == "oracle",
@@ -132,18 +131,6 @@ def open_demonstrations(dataset_meta: Any, config: OpenSPMConfig) -> Demonstrati
     dataset = open_dataset(dataset_meta)
     _take_layouts(dataset_meta, config)
     return Demonstrations(dataset, *config.layouts())
-
-
-def segmenter_of(config: OpenSPMConfig) -> Segmenter | None:
-    """The segmenter that a configuration asks for; None where the demonstrations teach objects' looks.
-
-    Raises:
-        PerceptionError: It cannot be used.
-    """
-    if config.segmentation == "demonstrations":
-        return None
-    weights, labels = config.segmentation_weights or (), config.mask_labels or {}
-    return make_segmenter(config.segmentation, {}, labels, weights, str(config.device))
 
 
 def shapes_of(config: OpenSPMConfig) -> AbstractContextManager[ShapeBackend | None]:

@@ -13,6 +13,9 @@ from lerobot_openspm.geometry.camera import Camera
 from lerobot_openspm.geometry.se3 import Array
 
 Mask = NDArray[np.bool_]
+# What is learned of an object: its shape by the demonstrations' masks, the box around it, or a box of the
+# size that SAM 3D tells.
+Shape = Literal["demonstrations", "box", "sam3d"]
 
 # Standard deviation of a uniform angle: what is known of a yaw that cannot be seen.
 UNKNOWN_YAW_STD = float(np.pi / np.sqrt(3))
@@ -205,3 +208,32 @@ class SubTask:
     def objects(self) -> tuple[str, ...]:
         """The objects that are named: target, then landmark."""
         return tuple(name for name in (self.target, self.landmark) if name)
+
+
+@dataclass(frozen=True)
+class Fault:
+    """What is wrong with a camera, and seconds since its last sound picture."""
+
+    reason: str
+    seconds: float
+
+
+@dataclass(frozen=True)
+class Detections:
+    """What one look brought.
+
+    Attributes:
+        estimates: By name, for the objects that were looked for.
+        faults: Cameras whose pictures cannot be used.
+    """
+
+    estimates: Mapping[str, PoseEstimate]
+    faults: Mapping[str, Fault]
+
+
+@dataclass(frozen=True)
+class Hand:
+    """What proprioception says: pose ``T_world_ee`` ``(4, 4)``, and opening in the state's units."""
+
+    T_world_ee: Array
+    opening: float

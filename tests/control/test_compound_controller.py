@@ -9,9 +9,10 @@ from tests.control.test_controller import HAND, LOOK_AGAIN_STEPS, Perception, kn
 from tests.memory.builders import entry, hand_pose, key_pose
 
 from lerobot_openspm.control.controller import EpisodeController
-from lerobot_openspm.control.executor import Hand, Status
+from lerobot_openspm.control.status import Status
 from lerobot_openspm.geometry import se3
 from lerobot_openspm.memory.entry import Anchor
+from lerobot_openspm.types import Hand
 
 PLATE = entry("put the bowl on the plate", source="local/demos#0")
 BOX = entry("put the box in the bowl", source="local/demos#1")
@@ -43,7 +44,7 @@ def finish_part(one, eyes, hand=None):
         target = one.executor.target
         before = hand
         hand = Hand(target.T_world_ee, target.key_pose.opening)
-        for name in one.tracker.held:
+        for name in one.scene.tracker.held:
             eyes.layout[name] = hand.T_world_ee @ se3.inverse(before.T_world_ee) @ eyes.layout[name]
         watch(one, eyes, hand, 1)
     pytest.fail(f"the part did not end: {one.status} at key pose {one.executor.index}")
@@ -79,13 +80,13 @@ def test_what_is_not_recognised_any_more_is_where_the_hand_let_it_go():
     blind = Blind(LAYOUT)
     hand = finish_part(one, blind, HAND)
     assert one._part == 1
-    assert_allclose(one.layout["bowl"], blind.layout["bowl"], atol=1e-9)
-    assert not np.allclose(one.layout["bowl"], LAYOUT["bowl"])
+    assert_allclose(one.object_poses["bowl"], blind.layout["bowl"], atol=1e-9)
+    assert not np.allclose(one.object_poses["bowl"], LAYOUT["bowl"])
     index = next(i for i, pose in enumerate(one.executor.plan) if pose.key_pose.anchor.place == "bowl")
     one.executor.begin(one.executor.plan, hand, index)  # the box in the hand, on its way
     watch(one, blind, hand, 100)  # five seconds in which it is in sight and not recognised
     assert one.status is not Status.OBJECT_LOST
-    assert_allclose(one.layout["bowl"], blind.layout["bowl"], atol=1e-9)
+    assert_allclose(one.object_poses["bowl"], blind.layout["bowl"], atol=1e-9)
 
 
 def test_a_part_ends_as_high_as_the_episode_began_but_the_last_one_does_not():
@@ -107,7 +108,7 @@ def test_another_object_of_the_same_name_is_not_taken_to_be_where_the_first_one_
     eyes, one = Perception(LAYOUT), row(PLATE, instruction=asked)
     one.observe(HAND, eyes)
     del eyes.layout["bowl"]
-    one.tracker.release(one.tracker.held, HAND.T_world_ee)
+    one.scene.tracker.release(one.scene.tracker.held, HAND.T_world_ee)
     one.executor.begin(one.executor.plan, HAND, len(one.executor.plan) - 1)
     watch(one, eyes, Hand(one.executor.plan[-1].T_world_ee, HAND.opening), 12)
     assert one._part == 1
@@ -178,7 +179,7 @@ def test_what_an_opened_drawer_hides_is_not_lost():
     away = Hand(hand_pose(-0.4, -0.4, 0.5), HAND.opening)
     watch(one, eyes, away, 100)
     assert one.status is Status.RUNNING
-    assert not one.is_paused
+    assert one.status is not Status.PAUSED
     eyes.layout["bowl"] = LAYOUT["bowl"]
     watch(one, eyes, away, 12)
     del eyes.layout["bowl"]

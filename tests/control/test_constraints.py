@@ -4,10 +4,12 @@ import numpy as np
 from numpy.testing import assert_allclose
 from tests.memory.builders import OPEN_WIDTH, entry, hand_pose, key_pose, robot
 
-from lerobot_openspm.control.executor import ControlSettings, Executor, Hand
+from lerobot_openspm.control.executor import Executor
+from lerobot_openspm.control.strategies import ControlSettings
 from lerobot_openspm.control.transfer import transfer
 from lerobot_openspm.geometry import se3
 from lerobot_openspm.memory.entry import Axis
+from lerobot_openspm.types import Hand
 
 HOME = hand_pose(0.0, 0.0, 0.3)
 ROBOT = robot()

@@ -7,10 +7,13 @@ from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 from tests.memory.builders import OPEN_WIDTH, entry, hand_pose, key_pose, robot
 
-from lerobot_openspm.control.executor import ControlSettings, Executor, Hand, Status
+from lerobot_openspm.control.executor import Executor
+from lerobot_openspm.control.status import Status
+from lerobot_openspm.control.strategies import ControlSettings
 from lerobot_openspm.control.transfer import transfer
 from lerobot_openspm.errors import OpenSPMError
 from lerobot_openspm.geometry import se3
+from lerobot_openspm.types import Hand
 
 HOME = hand_pose(0.0, 0.0, 0.3)
 ROBOT = robot()
@@ -182,7 +185,7 @@ def test_a_correction_contracts_the_error_whatever_the_flow_model_says():
 def test_a_corrective_action_points_straight_at_the_key_pose_and_is_bounded(offset):
     executor = make(key_poses=[key_pose("bowl", np.eye(4), "place")])
     T = se3.apply_increment(executor.plan[0].T_world_ee, np.array(offset))
-    action = executor._toward(Hand(T, OPEN_WIDTH))
+    action = executor.strategy.toward(executor.plan[0], Hand(T, OPEN_WIDTH))
     residual = se3.increment(T, executor.plan[0].T_world_ee) / GAINS
     assert np.abs(action[:6]).max() <= 1 + 1e-12
     assert float(action[:6] @ residual) >= 0
@@ -209,14 +212,14 @@ def test_corrections_are_counted_once_time_is_up_and_forgotten_at_the_next_key_p
     executor = make(ControlSettings(max_corrections=3))
     world = World(stuck=blocked_at_the_bowl(executor))
     run(executor, world, until=lambda e: e.index == 1)
-    assert executor.corrections == 0
-    run(executor, world, until=lambda e: e.corrections == 3)
+    assert executor.present.corrections == 0
+    run(executor, world, until=lambda e: e.present.corrections == 3)
     assert executor.index == 1
     assert executor.attempts == 0
     # One more chunk makes it four, more than the three that are allowed.
     run(executor, world, until=lambda e: e.attempts == 1)
     assert executor.index == 0
-    assert executor.corrections == 0
+    assert executor.present.corrections == 0
 
 
 def test_a_via_point_that_is_blocked_is_left_behind():
@@ -355,13 +358,13 @@ def test_a_correction_that_gets_nowhere_pushes_harder():
     world = World(stuck=blocked_at_the_bowl(executor))
     run(executor, world, until=lambda e: e.index == 1)
     pushes = {}
-    while executor.corrections < 6 and executor.attempts == 0:
+    while executor.present.corrections < 6 and executor.attempts == 0:
         action = executor.next_action(world.hand)
         if action is None:
             executor.push_chunk(toward(executor.query(world.hand)))
             continue
-        if executor.corrections:
-            pushes.setdefault(executor.corrections, float(np.abs(action[:3]).max()))
+        if executor.present.corrections:
+            pushes.setdefault(executor.present.corrections, float(np.abs(action[:3]).max()))
         world.step(action)
         executor.advance(world.hand)
     values = [pushes[i] for i in sorted(pushes)]

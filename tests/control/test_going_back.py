@@ -8,11 +8,11 @@ from numpy.testing import assert_allclose
 from tests.control.test_controller import HAND, Perception, row, watch
 from tests.memory.builders import entry, hand_pose, key_pose, pick_and_place
 
-from lerobot_openspm.control.controller import GIVE_UP_S, Detections
-from lerobot_openspm.control.executor import Hand, Status
+from lerobot_openspm.control.scene import GIVE_UP_S
+from lerobot_openspm.control.status import Status
 from lerobot_openspm.geometry import se3
 from lerobot_openspm.memory.entry import Anchor, Axis, Outcome
-from lerobot_openspm.perception.tracking.camera_health import Fault
+from lerobot_openspm.types import Detections, Fault, Hand
 
 OPEN = "open the top drawer"
 CABINET = {"cabinet": se3.from_yaw([0.1, 0.0, 0.0], 0.5)}
@@ -139,7 +139,7 @@ def carrying(opening):
     one.executor.begin(one.executor.plan, HAND, 2)
     grasp = one.executor.plan[2]
     watch(one, eyes, Hand(grasp.T_world_ee, grasp.key_pose.opening), grasp.key_pose.n_steps + 1)
-    assert one.tracker.held == {"bowl"}
+    assert one.scene.tracker.held == {"bowl"}
     eyes.visible = 0.0
     place = one.executor.plan[5].T_world_ee.copy()
     place[2, 3] += 0.02
@@ -151,13 +151,13 @@ def test_what_is_still_in_the_hand_is_not_fetched_again_but_set_down_once_more()
     one = carrying(opening=0.03)
     assert one.status is Status.RUNNING
     assert one.executor.plan[one.executor.index].key_pose.phase == "pre-place"
-    assert one.tracker.held == {"bowl"}
+    assert one.scene.tracker.held == {"bowl"}
 
 
 def test_what_is_no_more_in_the_hand_is_fetched():
     one = carrying(opening=0.0)
     assert one.executor.plan[one.executor.index].key_pose.phase == "approach"
-    assert one.tracker.held == frozenset()
+    assert one.scene.tracker.held == frozenset()
 
 
 def test_what_slipped_out_while_it_was_lifted_stands_where_it_stood_and_does_not_hang_in_the_air():
@@ -167,7 +167,7 @@ def test_what_slipped_out_while_it_was_lifted_stands_where_it_stood_and_does_not
     one.executor.begin(one.executor.plan, HAND, 2)
     grasp, lift = one.executor.plan[2], one.executor.plan[3]
     watch(one, eyes, Hand(grasp.T_world_ee, grasp.key_pose.opening), grasp.key_pose.n_steps + 1)
-    assert one.tracker.held == {"bowl"}
+    assert one.scene.tracker.held == {"bowl"}
     eyes.visible = 0.0  # the hand hides it
     watch(one, eyes, Hand(lift.T_world_ee, 0.0), 1)
     assert one.executor.index == 0
@@ -189,7 +189,7 @@ def test_what_a_later_sub_task_grasps_again_stays_in_the_hand():
     eyes.layout["plate"] = layout["plate"] @ se3.from_yaw([0.05, 0.05, 0.0], 0.0)
     watch(one, eyes, Hand(lift.T_world_ee, 0.03), 15)
     assert one.executor.attempts == 0
-    assert one.tracker.held == {"bowl"}
+    assert one.scene.tracker.held == {"bowl"}
 
 
 ON_PLATE = Outcome(0, "bowl", Anchor("plate", "plate"), np.zeros(3), np.zeros(3), 0.02)
@@ -279,7 +279,7 @@ def test_an_outcome_that_no_key_pose_leads_to_is_not_tried_again():
 
 def test_of_a_whole_of_which_a_part_was_not_seen_nothing_is_said():
     one, _ = ended([0.01, 0.0, 0.0])
-    one._parts_known = False
+    one._earlier_parts_known = False
     assert one.succeeded is None
 
 

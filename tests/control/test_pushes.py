@@ -9,12 +9,16 @@ from numpy.testing import assert_allclose
 from tests.control.test_controller import HAND, Perception, row, shifted, watch
 from tests.memory.builders import entry, hand_pose, key_pose, robot
 
-from lerobot_openspm.control.controller import LEFT_BEHIND_M, OUTRUN_M
-from lerobot_openspm.control.executor import ControlSettings, Executor, Hand, Status
-from lerobot_openspm.control.transfer import Target, push_ways, transfer
+from lerobot_openspm.control.contact import LEFT_BEHIND_M, OUTRUN_M
+from lerobot_openspm.control.executor import Executor
+from lerobot_openspm.control.pushes import push_ways
+from lerobot_openspm.control.status import Status
+from lerobot_openspm.control.strategies import ControlSettings
+from lerobot_openspm.control.transfer import Target, transfer
 from lerobot_openspm.geometry import se3
 from lerobot_openspm.memory.entry import Anchor, Outcome
 from lerobot_openspm.perception.tracking.tracker import TrackStatus
+from lerobot_openspm.types import Hand
 
 INSTRUCTION = "push the plate to the front of the stove"
 LAYOUT = {"plate": se3.from_yaw([0.3, 0.1, 0.0], 0.0), "stove": se3.from_yaw([-0.1, 0.0, 0.0], 0.0)}
@@ -146,7 +150,7 @@ def test_a_plate_goes_along_around_the_turn_of_a_push_and_is_let_go_at_its_end()
     for index, is_held in ((1, True), (2, True), (3, False)):
         watch(one, eyes, Hand(ends[index], 0.0), 1)
         assert one.executor.index == index + 1
-        assert (one.tracker.held == {"plate"}) is is_held, index
+        assert (one.scene.tracker.held == {"plate"}) is is_held, index
         assert_allclose(one.executor.plan[2].T_world_ee, ends[2], atol=1e-9)
 
 
@@ -161,7 +165,7 @@ def test_what_is_pushed_goes_along_and_not_what_the_hand_began_relative_to():
     one.observe(HAND, eyes)
     one.executor.begin(one.executor.plan, HAND, 1)
     watch(one, eyes, Hand(one.executor.plan[1].T_world_ee, 0.0), 1)
-    assert one.tracker.held == {"plate"}
+    assert one.scene.tracker.held == {"plate"}
 
 
 def test_a_plate_that_the_hand_has_not_reached_yet_is_not_left_behind():
@@ -171,7 +175,7 @@ def test_a_plate_that_the_hand_has_not_reached_yet_is_not_left_behind():
         contact = one.executor.plan[1].T_world_ee
         one.executor.begin(one.executor.plan, HAND, 1)
         watch(one, eyes, Hand(contact, 0.0), 1)
-        assert one.tracker.held == {"plate"}
+        assert one.scene.tracker.held == {"plate"}
         ahead = contact.copy()
         ahead[1, 3] += gone
         watch(one, eyes, Hand(ahead, 0.0), 12)
@@ -187,7 +191,7 @@ def test_a_hand_that_is_on_its_way_to_the_plate_has_not_outrun_it():
     met = one.executor.plan[1].T_world_ee
     one.executor.begin(one.executor.plan, HAND, 1)
     watch(one, eyes, Hand(met, 0.0), 1)
-    assert one.tracker.held == {"plate"}
+    assert one.scene.tracker.held == {"plate"}
     nearer = met.copy()
     nearer[1, 3] += 1.5 * OUTRUN_M
     watch(one, eyes, Hand(nearer, 0.0), 12)
@@ -212,7 +216,7 @@ def test_what_a_push_leads_to_is_watched_beyond_a_turn():
     here = Hand(one.executor.plan[2].T_world_ee, 0.0)
     shown = one.executor.plan[3].T_world_ee
     one.executor.begin(one.executor.plan, here, 3)
-    one.tracker.hold("plate", here.T_world_ee)
+    one.scene.tracker.hold("plate", here.T_world_ee)
     eyes.layout["stove"] = shifted(LAYOUT["stove"], 0.04)
     del eyes.layout["plate"]
     watch(one, eyes, here, 10)
@@ -236,10 +240,10 @@ def test_the_plate_goes_along_from_where_the_hand_meets_its_rim():
     eyes, one = Perception(LAYOUT), row(push(), instruction=INSTRUCTION)
     hand = pushing(one, eyes, 0.5 * (LEAD_M - 0.03))
     watch(one, eyes, hand, 1)
-    assert one.tracker.held == frozenset()
+    assert one.scene.tracker.held == frozenset()
     hand = pushing(one, eyes, LEAD_M - 0.03 + 0.001)
     watch(one, eyes, hand, 1)
-    assert one.tracker.held == {"plate"}
+    assert one.scene.tracker.held == {"plate"}
 
 
 def test_a_plate_that_slides_under_the_hand_is_pushed_on_and_one_left_behind_is_fetched():
@@ -261,7 +265,7 @@ def done(one, eyes, end):
     one.observe(HAND, eyes)
     last = one.executor.plan[-1]
     eyes.layout["plate"] = end
-    one.tracker.forget(["plate"])
+    one.scene.tracker.forget(["plate"])
     one.executor.begin(one.executor.plan, HAND, len(one.executor.plan) - 1)
     hand = Hand(last.T_world_ee, 0.0)
     watch(one, eyes, hand, 1)
@@ -301,7 +305,7 @@ def test_what_cannot_be_seen_in_the_end_is_done_and_not_known():
     watch(one, eyes, Hand(one.executor.plan[-1].T_world_ee, 0.0), 40)
     assert one.status is Status.DONE
     assert one.succeeded is None
-    assert one.tracker.status("plate") is TrackStatus.HIDDEN
+    assert one.scene.tracker.status("plate") is TrackStatus.HIDDEN
     asked = len(eyes.asked)
     watch(one, eyes, Hand(one.executor.plan[-1].T_world_ee, 0.0), 40)
     assert len(eyes.asked) == asked, "it is not looked for on and on"

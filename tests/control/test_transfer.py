@@ -6,15 +6,8 @@ from numpy.testing import assert_allclose
 from tests.geometry.strategies import transforms
 from tests.memory.builders import entry, hand_pose, key_pose, robot
 
-from lerobot_openspm.control.transfer import (
-    RETREAT_M,
-    TransferLimits,
-    check_transfer,
-    geometric_score,
-    shape_deviation,
-    transfer,
-    transfer_pose,
-)
+from lerobot_openspm.control.checks import TransferLimits, check_transfer, geometric_score, shape_deviation
+from lerobot_openspm.control.transfer import RETREAT_M, transfer, transfer_pose
 from lerobot_openspm.geometry import se3
 from lerobot_openspm.memory.entry import WORLD
 

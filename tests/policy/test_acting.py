@@ -94,9 +94,9 @@ def test_a_chunk_is_predicted_without_changing_anything(policy: OpenSPMPolicy, r
         assert torch.equal(policy.select_action(batch), expected)
     # Neither is another instruction taken up, nor are other environments.
     other = batch_of([recorded[3][0], recorded[1][len(unasked) - 1], recorded[4][0]])
-    rows = list(policy.rows)
+    rows = list(policy.episodes)
     assert policy.predict_action_chunk(other).shape == (3, policy.config.chunk_size, 7)
-    assert policy.rows == rows
+    assert policy.episodes == rows
 
 
 def test_a_chunk_that_cannot_be_predicted_changes_nothing(policy: OpenSPMPolicy, recorded: list[list[Frame]]):

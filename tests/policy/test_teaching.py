@@ -31,17 +31,17 @@ def test_a_running_policy_can_be_taught(
 ):
     running, asked = batch_of([recorded[0][0]]), batch_of([recorded[0][0] | {"task": PUSH}])
     policy.select_action(asked)
-    assert "it knows" in policy.rows[0].refusal
+    assert "it knows" in policy.episodes[0].controller.refusal
     policy.select_action(running)
-    row, weights = policy.rows[0], {k: v.clone() for k, v in policy.state_dict().items()}
+    row, weights = policy.episodes[0].controller, {k: v.clone() for k, v in policy.state_dict().items()}
     lesson = policy.teach(push_meta, [0])
     assert lesson.instructions == (PUSH,)
     assert (lesson.known_before, lesson.skipped, lesson.objects_learned) == ({PUSH: 0}, (), ())
     assert all(torch.equal(value, weights[key]) for key, value in policy.state_dict().items())
     policy.select_action(running)
-    assert policy.rows[0] is row  # the running episode goes on
+    assert policy.episodes[0].controller is row  # the running episode goes on
     assert torch.isfinite(policy.select_action(asked)).all()
-    assert policy.rows[0].instruction == PUSH
+    assert policy.episodes[0].controller.instruction == PUSH
 
 
 def test_a_taught_memory_travels_with_the_checkpoint(
@@ -130,5 +130,5 @@ def test_any_wording_is_taught_and_acted_on(
     for said in (told, asked):
         policy.reset()
         policy.select_action(batch_of([{**frame, "task": said}, frame]))
-        assert [row.status.value for row in policy.rows] == ["running", "running"]
-        assert [row.ranked[0].entry.language for row in policy.rows] == [told, frame["task"]]
+        assert [one.controller.status.value for one in policy.episodes] == ["running", "running"]
+        assert [one.controller.ranked[0].entry.language for one in policy.episodes] == [told, frame["task"]]

@@ -12,10 +12,10 @@ import numpy as np
 import torch
 
 from lerobot_openspm.control.controller import EpisodeController
-from lerobot_openspm.control.executor import Hand
 from lerobot_openspm.envs.recording import pose_vector
 from lerobot_openspm.modeling_openspm import OpenSPMPolicy
 from lerobot_openspm.perception.observation import Observation
+from lerobot_openspm.types import Hand
 
 IMAGES = "observation.images."
 
@@ -118,7 +118,7 @@ def run_episode(
         with torch.inference_mode():
             action = action_layout.encode_actions(policy.act([observation])[0]).astype(np.float32)
         if note is not None:
-            note(len(actions), observation, policy.rows[0])
+            note(len(actions), observation, policy.episodes[0].controller)
         over, success = world.step(action)
         actions.append(action)
-    return Episode(success, np.stack(actions), policy.rows[0])
+    return Episode(success, np.stack(actions), policy.episodes[0].controller)

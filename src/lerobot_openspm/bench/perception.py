@@ -148,12 +148,12 @@ def measure_episode(
         true = truth.now(world.object_poses())
         shadow.follow(observation, row)
         known = {
-            "filtered": row.tracker.poses(T_world_ee),
+            "filtered": row.scene.tracker.poses(T_world_ee),
             "unfiltered": shadow.seen,
             "one_view": shadow.tracker.poses(T_world_ee),
         }
         for name in (name for name in row.ranked[0].entry.objects if name in offsets):
-            held = name in row.tracker.held
+            held = name in row.scene.tracker.held
             for variant, poses in known.items():
                 error: tuple[float | None, float | None] = (None, None)
                 if name in poses:
@@ -181,15 +181,15 @@ class _Shadow:
         self._time_s += self._step_s
         self.tracker.predict(self._step_s)
         hand = observation.hand.T_world_ee
-        if row.has_just_looked and row.seen is not None:
-            estimates = row.seen.estimates
+        if row.scene.has_just_looked and row.scene.detections is not None:
+            estimates = row.scene.detections.estimates
             self.seen |= {name: e.T_world_obj for name, e in estimates.items() if e.status == "found"}
-            seen = self._eyes.look(observation, list(estimates), self.tracker.poses(hand), self._time_s)
+            seen = self._eyes.detect(observation, list(estimates), self.tracker.poses(hand), self._time_s)
             self.tracker.look(seen.estimates, hand, self._time_s - self._looked_at_s)
             self._looked_at_s = self._time_s
-        for name in row.tracker.held - self.tracker.held:
+        for name in row.scene.tracker.held - self.tracker.held:
             self.tracker.hold(name, hand)
-        self.tracker.release(self.tracker.held - row.tracker.held, hand)
+        self.tracker.release(self.tracker.held - row.scene.tracker.held, hand)
 
 
 def summary(samples: Sequence[Sample]) -> dict[str, Any]:

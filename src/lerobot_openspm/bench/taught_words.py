@@ -12,9 +12,9 @@ from functools import partial
 
 import numpy as np
 
-from lerobot_openspm.control.executor import ControlSettings
+from lerobot_openspm.control.checks import TransferLimits
 from lerobot_openspm.control.planning_context import PlanningContext
-from lerobot_openspm.control.transfer import TransferLimits
+from lerobot_openspm.control.strategies import ControlSettings
 from lerobot_openspm.errors import InstructionError, OpenSPMError
 from lerobot_openspm.geometry import se3
 from lerobot_openspm.geometry.se3 import Array

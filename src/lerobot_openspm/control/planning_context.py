@@ -7,14 +7,9 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from lerobot_openspm.control.executor import ControlSettings
-from lerobot_openspm.control.transfer import (
-    Target,
-    TransferLimits,
-    check_transfer,
-    geometric_score,
-    transfer,
-)
+from lerobot_openspm.control.checks import TransferLimits, check_transfer, geometric_score
+from lerobot_openspm.control.strategies import ControlSettings
+from lerobot_openspm.control.transfer import Target, transfer
 from lerobot_openspm.geometry import se3
 from lerobot_openspm.geometry.se3 import Array
 from lerobot_openspm.language.names import TABLE_NAMES, NameSimilarity

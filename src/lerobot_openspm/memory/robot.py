@@ -56,6 +56,11 @@ class RobotModel:
         middle = (self.close_command + self.open_command) / 2
         return np.asarray((gripper_commands - middle) * (self.close_command - middle) > 0)
 
+    @property
+    def gains(self) -> Array:
+        """How far the hand moves per unit of each of the six numbers ``(6,)`` of an action."""
+        return np.array([self.metres_per_action] * 3 + [self.radians_per_action] * 3)
+
     def command(self, closed: bool) -> float:
         """The gripper command that closes or opens."""
         return self.close_command if closed else self.open_command

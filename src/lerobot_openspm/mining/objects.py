@@ -16,12 +16,12 @@ from lerobot_openspm.mining.dataset import Demonstrations
 from lerobot_openspm.mining.key_poses import KeyPose
 from lerobot_openspm.mining.mined import MinedEpisode
 from lerobot_openspm.mining.outcomes import carried_to
-from lerobot_openspm.perception.objects.learning import Shape, learn_objects
+from lerobot_openspm.perception.objects.learning import learn_objects
 from lerobot_openspm.perception.objects.localise import localise_all
 from lerobot_openspm.perception.objects.model import KnownObject
 from lerobot_openspm.perception.objects.object_shape import ShapeBackend
 from lerobot_openspm.perception.oracle import name_simulator_poses
-from lerobot_openspm.types import ContactCue, PoseEstimate, Scene, Segmenter
+from lerobot_openspm.types import ContactCue, PoseEstimate, Scene, Segmenter, Shape
 
 logger = logging.getLogger(__name__)
 

@@ -12,14 +12,13 @@ import torch
 from lerobot.utils.constants import OBS_STATE
 from numpy.typing import NDArray
 
-from lerobot_openspm.control.executor import Hand
 from lerobot_openspm.errors import ObservationError
 from lerobot_openspm.geometry import se3
 from lerobot_openspm.geometry.camera import Camera
 from lerobot_openspm.geometry.se3 import Array
 from lerobot_openspm.geometry.vector_layout import VectorLayout
 from lerobot_openspm.perception.layers import depth_of, find_layers, labels_of
-from lerobot_openspm.types import View
+from lerobot_openspm.types import Hand, View
 
 # Named by the environment that gives them: position and quat_wxyz per object (oracle ablation only).
 OBJECT_POSES = "observation.object_poses"

@@ -7,7 +7,6 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from lerobot_openspm.control.controller import Detections
 from lerobot_openspm.geometry.se3 import Array
 from lerobot_openspm.memory.memory import Memory
 from lerobot_openspm.perception.objects.localise import localise_all
@@ -15,7 +14,7 @@ from lerobot_openspm.perception.observation import Observation
 from lerobot_openspm.perception.occlusion import hand_mask
 from lerobot_openspm.perception.oracle import name_simulator_poses
 from lerobot_openspm.perception.tracking.camera_health import CameraWatch
-from lerobot_openspm.types import PoseEstimate, Segmenter, View
+from lerobot_openspm.types import Detections, PoseEstimate, Segmenter, View
 
 # How exact the simulator's poses are taken to be (oracle ablation only): metres and radians.
 ORACLE_STD = 1e-4
@@ -38,7 +37,7 @@ class Perception:
     _has_looked: bool = False
     _labelled: set[str] = field(default_factory=set)
 
-    def look(
+    def detect(
         self, observation: Observation, names: Sequence[str], expected: Mapping[str, Array], time_s: float
     ) -> Detections:
         """Look for objects.

@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
-from typing import Literal, get_args
+from typing import get_args
 
 import numpy as np
 from numpy.random import Generator
@@ -41,7 +41,7 @@ from lerobot_openspm.perception.objects.shape.fitting import (
 )
 from lerobot_openspm.perception.objects.shape.shape import Posed, Votes
 from lerobot_openspm.perception.objects.yaw import search_range, yaw_range
-from lerobot_openspm.types import Scene, Segmenter
+from lerobot_openspm.types import Scene, Segmenter, Shape
 
 log = logging.getLogger(__name__)
 
@@ -67,7 +67,6 @@ NEAR_YAWS = np.deg2rad([-30.0, -10.0, 10.0, 30.0])
 TURN_GAIN = 0.008
 
 
-Shape = Literal["demonstrations", "box", "sam3d"]
 SHAPES: tuple[Shape, ...] = get_args(Shape)
 
 

@@ -11,7 +11,7 @@ import numpy as np
 from lerobot_openspm.geometry import se3
 from lerobot_openspm.geometry.camera import project
 from lerobot_openspm.geometry.se3 import Array
-from lerobot_openspm.types import View
+from lerobot_openspm.types import Fault, View
 
 # A picture with less contrast than this, in levels of 255, shows nothing.
 MIN_CONTRAST = 2.0
@@ -19,14 +19,6 @@ MIN_CONTRAST = 2.0
 MOVED_M = 0.02
 # ... and one that moved less than this need not have.
 STILL_M = 0.001
-
-
-@dataclass(frozen=True)
-class Fault:
-    """What is wrong with a camera, and seconds since its last sound picture."""
-
-    reason: str
-    seconds: float
 
 
 @dataclass

@@ -5,7 +5,7 @@ from hypothesis import assume, given
 from hypothesis import strategies as st
 from tests.properties import examples
 
-from lerobot_openspm.control.reference import MARGIN_M, OPPOSITE_THE_ROBOT, choose
+from lerobot_openspm.control.spatial_relations import MARGIN_M, OPPOSITE_THE_ROBOT, choose
 from lerobot_openspm.errors import InstructionError
 from lerobot_openspm.geometry import se3
 from lerobot_openspm.types import Reference

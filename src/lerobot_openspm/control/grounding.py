@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from lerobot_openspm.control.reference import choose
+from lerobot_openspm.control.spatial_relations import choose
 from lerobot_openspm.geometry.se3 import Array
 from lerobot_openspm.memory.compose import Candidate
 from lerobot_openspm.types import PoseEstimate, Reference
@@ -40,7 +40,7 @@ def references(candidate: Candidate, object_meant: Callable[[str], str]) -> dict
 
 
 @dataclass
-class Referents:
+class Grounding:
     """Tells objects of one name apart, in one environment.
 
     Attributes:

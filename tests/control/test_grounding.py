@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from tests.control.test_controller import knowledge
 
-from lerobot_openspm.control.referents import Referents, references
+from lerobot_openspm.control.grounding import Grounding, references
 from lerobot_openspm.geometry import se3
 from lerobot_openspm.memory.compose import Candidate
 from lerobot_openspm.memory.entry import MemoryEntry, RetrievalKey
@@ -33,32 +33,32 @@ def look(referents, bowl, layout=None):
 
 @pytest.mark.parametrize("bowl", [seen(NEAR, FAR), seen(FAR, NEAR), seen(FAR, NEAR, status="found")])
 def test_the_one_that_the_instruction_tells_is_meant(bowl):
-    meant = look(Referents({"bowl": NEXT_TO_RACK}), bowl)
+    meant = look(Grounding({"bowl": NEXT_TO_RACK}), bowl)
     assert meant.status == "found"
     np.testing.assert_array_equal(meant.T_world_obj, NEAR)
 
 
 def test_a_landmark_may_have_been_seen_before():
     estimates = {"bowl": seen(FAR, NEAR)}
-    meant = Referents({"bowl": NEXT_TO_RACK}).sort_out(estimates, {"rack": RACK})["bowl"]
+    meant = Grounding({"bowl": NEXT_TO_RACK}).sort_out(estimates, {"rack": RACK})["bowl"]
     np.testing.assert_array_equal(meant.T_world_obj, NEAR)
 
 
 def test_without_a_word_about_it_or_its_landmark_it_stays_ambiguous():
-    assert look(Referents(), seen(FAR, NEAR)).status == "ambiguous"
-    assert look(Referents(), seen(FAR, NEAR, status="found")).status == "ambiguous"
-    assert look(Referents(), seen(FAR)).status == "found"
+    assert look(Grounding(), seen(FAR, NEAR)).status == "ambiguous"
+    assert look(Grounding(), seen(FAR, NEAR, status="found")).status == "ambiguous"
+    assert look(Grounding(), seen(FAR)).status == "found"
     estimates = {"bowl": seen(FAR, NEAR)}
-    assert Referents({"bowl": NEXT_TO_RACK}).sort_out(estimates, {})["bowl"].status == "ambiguous"
+    assert Grounding({"bowl": NEXT_TO_RACK}).sort_out(estimates, {})["bowl"].status == "ambiguous"
 
 
 def test_two_that_fit_as_well_as_one_another_stay_ambiguous():
     mirrored = at(0.3, 0.42)
-    assert look(Referents({"bowl": NEXT_TO_RACK}), seen(NEAR, mirrored)).status == "ambiguous"
+    assert look(Grounding({"bowl": NEXT_TO_RACK}), seen(NEAR, mirrored)).status == "ambiguous"
 
 
 def test_the_other_one_is_never_taken_for_it_afterwards():
-    referents = Referents({"bowl": NEXT_TO_RACK})
+    referents = Grounding({"bowl": NEXT_TO_RACK})
     look(referents, seen(NEAR, FAR))
     assert look(referents, seen(FAR)).status == "not_found"  # the meant one is behind the hand
     moved = at(0.1, 0.1)
@@ -69,7 +69,7 @@ def test_the_other_one_is_never_taken_for_it_afterwards():
 
 
 def test_what_the_next_part_means_is_told_anew():
-    referents = Referents()
+    referents = Grounding()
     assert referents.hear({"bowl": NEXT_TO_RACK}) == frozenset()
     look(referents, seen(NEAR, FAR))
     assert referents.hear({"bowl": NEXT_TO_RACK}) == frozenset()
@@ -105,7 +105,7 @@ def test_the_objects_that_others_are_told_by_may_go_by_other_names():
 
 
 def test_the_center_of_the_table_is_the_middle_of_where_the_hand_was():
-    referents = Referents({"bowl": Reference("center", ("table",))})
+    referents = Grounding({"bowl": Reference("center", ("table",))})
     low, high = KNOWLEDGE.robot.workspace
     middle, side = at(*(low + high)[:2] / 2 + 0.03), at(*high[:2])
     estimates = {"bowl": seen(side, middle)}

@@ -1,0 +1,116 @@
+"""Whether the hand can follow transferred key poses, and how like the demonstration that would be."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from lerobot_openspm.control.transfer import Target, transfer
+from lerobot_openspm.geometry import se3
+from lerobot_openspm.geometry.se3 import Array
+from lerobot_openspm.memory.entry import MemoryEntry
+from lerobot_openspm.memory.robot import RobotModel
+
+# Phases in which an object follows the hand along a constraint.
+CONSTRAINED_PHASES = ("push", "open", "turn")
+# How much a different way through free space counts beside a different way in contact.
+FREE_SPACE_SHARE = 0.2
+# An entry whose key poses lie this much differently to one another here counts as 1/e alike.
+SHAPE_SCALE_M = 0.1
+# An entry that can be executed at all scores at least this.
+MIN_USABLE_SCORE = 1e-3
+
+
+@dataclass(frozen=True)
+class TransferLimits:
+    """Bounds of the checks on transferred key poses.
+
+    Attributes:
+        reach_margin_m: How far outside the box that the demonstrations covered the hand may go.
+        max_jump_m: Longest way between consecutive key poses.
+        max_jump_rad: Largest turn between consecutive key poses.
+        min_clearance_m: How far below the lowest demonstrated hand position the hand may go.
+    """
+
+    reach_margin_m: float = 0.10
+    max_jump_m: float = 0.8
+    max_jump_rad: float = 2.8
+    min_clearance_m: float = 0.01
+
+
+def check_transfer(
+    targets: Sequence[Target], T_world_ee: Array, robot: RobotModel, limits: TransferLimits
+) -> list[str]:
+    """The paper's checks: reachability, pose jump, minimum distance. Returns what is wrong, in words.
+
+    Minimum distance is kept from the support surface: the lowest point that the hand reached in the
+    demonstrations bounds how low it may be sent.
+    """
+    problems: list[str] = []
+    low, high = robot.workspace
+    before = T_world_ee
+    for i, target in enumerate(targets):
+        where = f"key pose {i} ({target.key_pose.phase} at {target.key_pose.anchor.place})"
+        p = target.T_world_ee[:3, 3]
+        outside = np.maximum(np.maximum(low - p, p - high), 0.0)
+        if (beyond := float(np.linalg.norm(outside[:2]))) > limits.reach_margin_m or (
+            p[2] - high[2] > limits.reach_margin_m
+        ):
+            problems.append(
+                f"{where} is {max(beyond, p[2] - high[2]):.3f} m outside the demonstrated workspace"
+            )
+        if low[2] - p[2] > limits.min_clearance_m:
+            problems.append(f"{where} is {low[2] - p[2]:.3f} m below the lowest demonstrated hand position")
+        metres, radians = se3.distances(before, target.T_world_ee)
+        if metres > limits.max_jump_m or radians > limits.max_jump_rad:
+            problems.append(f"{where} is {metres:.2f} m and {radians:.2f} rad from the one before")
+        before = target.T_world_ee
+    return problems
+
+
+def geometric_score(
+    entry: MemoryEntry,
+    layout: Mapping[str, Array],
+    yaw_periods: Mapping[str, float],
+    T_world_ee: Array,
+    robot: RobotModel,
+    limits: TransferLimits,
+) -> float:
+    """``S_geo`` in 0..1: whether an entry can be executed here, and how like its demonstration it would be.
+
+    0 where an object of its key poses was not found or the transferred key poses fail the checks. Else what
+    :func:`shape_deviation` makes of the arrangement: where the objects lie to one another as in the entry's
+    own layout, wherever that is, it is 1. Objects that no key pose is relative to make no difference.
+
+    Args:
+        entry: The entry.
+        layout: Present poses ``T_world_obj`` ``(4, 4)`` of the objects that were found.
+        yaw_periods: Angle by object that turns it into itself, radians; 0 for a body of revolution.
+        T_world_ee: Present hand pose ``(4, 4)``.
+        robot: The robot.
+        limits: Bounds of the checks.
+    """
+    if any(name not in layout for name in entry.objects):
+        return 0.0
+    targets = transfer(entry, layout, yaw_periods, T_world_ee)
+    if check_transfer(targets, T_world_ee, robot, limits):
+        return 0.0
+    return max(float(np.exp(-shape_deviation(entry, targets) / SHAPE_SCALE_M)), MIN_USABLE_SCORE)
+
+
+def shape_deviation(entry: MemoryEntry, targets: Sequence[Target]) -> float:
+    """How differently the hand has to move here from how the demonstration moved, in metres.
+
+    Compared are the ways between consecutive key poses, seen from the later one. Between key poses of one
+    anchor nothing differs. Where the hand pushes, pulls or turns something, a different way does different
+    things to the object, so those count in full; in free space it hardly matters.
+    """
+    shown = [pose.anchor.frame(entry.layout) @ pose.T_obj_ee for pose in entry.key_poses]
+    now = [target.T_world_ee for target in targets]
+    constrained, free = [0.0], [0.0]
+    for i, pose in enumerate(entry.key_poses[1:], start=1):  # a retreat of ours has nothing to compare with
+        ways = [se3.inverse(poses[i]) @ poses[i - 1] for poses in (shown, now)]
+        (constrained if pose.phase in CONSTRAINED_PHASES else free).append(float(se3.distance(*ways)))
+    return max(constrained) + FREE_SPACE_SHARE * float(np.mean(free))
