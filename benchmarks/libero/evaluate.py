@@ -186,7 +186,7 @@ def _move_hand(simulator: LiberoSimulator, rng: np.random.Generator) -> None:
 
 def _told(episode: Episode) -> dict[str, Any]:
     """An episode as a line of JSON."""
-    executor, ranked = episode.row.executor, episode.row.ranked
+    executor, ranked = episode.row.executor, episode.row.planner.ranked
     return {
         "steps": len(episode.actions),
         "success": episode.success,

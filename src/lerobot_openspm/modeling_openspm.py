@@ -89,11 +89,9 @@ class OpenSPMPolicy(PreTrainedPolicy):
         if dataset_meta is not None:
             _ = self.names  # what cannot be used is an error now, not at the first observation
             config.control_hz = config.control_hz or float(dataset_meta.fps)
-            from lerobot_openspm.training import dataset_processor, memory_of, training_set
+            from lerobot_openspm.training import learn
 
-            mined = dataset_processor(dataset_meta, config, segmenter=self.segmenter).mine(held_out=True)
-            self.memory = memory_of(mined, config)
-            self._training_set = training_set(mined, mined.robot, config)
+            self.memory, self._training_set = learn(dataset_meta, config, None, self.segmenter)
             self.flow.action_scale.copy_(self._training_set.action_scale)
         self.reset()
 
@@ -132,7 +130,7 @@ class OpenSPMPolicy(PreTrainedPolicy):
         for episode, success in zip(self.episodes, successes, strict=True):
             if success is not None and not episode.is_reported:
                 episode.is_reported = True
-                outcomes += [(entry, success) for entry in episode.controller.used_entries]
+                outcomes += [(entry, success) for entry in episode.controller.planner.used]
         if outcomes:
             self.memory = self.require_memory().with_outcomes(outcomes)
 
@@ -181,8 +179,8 @@ class OpenSPMPolicy(PreTrainedPolicy):
         # Entries, models and a segmenter's weights are large and never change: the copies share them.
         shared = [self.memory, self.segmenter, *(one.perception.memory for one in running)]
         for controller in (one.controller for one in running):
-            entries = [*controller.used_entries, *(one.entry for one in controller.ranked)]
-            shared += [controller.candidates, *entries]
+            entries = [*controller.planner.used, *(one.entry for one in controller.planner.ranked)]
+            shared += [controller.planner.parts, *entries]
         try:
             self.episodes = deepcopy(running, {id(one): one for one in shared})
             self.eval()
@@ -350,23 +348,9 @@ class OpenSPMPolicy(PreTrainedPolicy):
         self.memory = load_memory(directory, self.config, is_kept)
         _ = self.segmenter, self.names  # what cannot be used is an error now, not at the first observation
         if dataset_meta is not None:
-            self.memory = self._learn_on(self.memory, dataset_meta)
+            from lerobot_openspm.training import learn
 
-    def _learn_on(self, memory: Memory, dataset_meta: Any) -> Memory:
-        """Take up a dataset to train on, and update what is known by it as ``config.memory_update`` says."""
-        from lerobot_openspm.training import dataset_processor, memory_of, training_set
-
-        known = None if self.config.memory_update == "rebuild" else memory
-        processor = dataset_processor(dataset_meta, self.config, known, memory.cameras, self.segmenter)
-        if self.config.memory_update == "keep":
-            mined = processor.key_poses(held_out=True)
-        else:
-            mined = processor.mine(held_out=True)
-            newer = memory_of(mined, self.config)
-            memory = newer if known is None else known.appended(newer)
-        logger.info("memory_update=%s: %d entries", self.config.memory_update, len(memory.entries))
-        self._training_set = training_set(mined, memory.robot, self.config)
-        return memory
+            self.memory, self._training_set = learn(dataset_meta, self.config, self.memory, self.segmenter)
 
     def require_memory(self) -> Memory:
         """What was mined. Raises MemoryFormatError when nothing was."""

@@ -148,12 +148,13 @@ def search_scene(policy: OpenSPMPolicy, observation: Observation) -> Found:
     row = policy.episodes[0].controller
     if row.refusal:
         return replace(in_words, parts=(), refusal=row.refusal, status=row.status.value)
-    sources = {id(one.entry): one.source for one in row.candidates[0]}
+    sources = {id(one.entry): one.source for one in row.planner.parts[0]}
     ranked = tuple(
-        Hit(one.entry, sources[id(one.entry)], one.semantic, one.geometric, one.total) for one in row.ranked
+        Hit(one.entry, sources[id(one.entry)], one.semantic, one.geometric, one.total)
+        for one in row.planner.ranked
     )
     needed = dict.fromkeys(name for hit in ranked for name in hit.entry.objects)
-    seen = {name: name in row.object_poses for name in needed}
+    seen = {name: name in row.planner.object_poses for name in needed}
     return replace(in_words, parts=(ranked, *in_words.parts[1:]), seen=seen, status=row.status.value)
 
 

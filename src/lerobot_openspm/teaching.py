@@ -28,7 +28,7 @@ class Lesson:
     """What a memory was taught.
 
     Attributes:
-        learned: The new entries, and the models of their objects: what is appended to an memory.
+        learned: The new entries, and the models of their objects: what is appended to a memory.
         known_before: How many entries each taught instruction had in the memory before.
         skipped: Episodes that gave no entry.
         objects_learned: Objects that were not known before.
@@ -59,7 +59,7 @@ def teach(
     episodes: Sequence[int] | None = None,
     segmenter: Segmenter | None = None,
 ) -> tuple[Memory, Lesson]:
-    """Append a dataset's demonstrations to an memory.
+    """Append a dataset's demonstrations to a memory.
 
     Objects that are known are recognised by what is known of them; others are learned from these episodes.
     Where the configuration names no calibration, the dataset's own is used, else the memory's.
@@ -101,16 +101,22 @@ def teach(
     learned = replace(mined, entries=added, objects=objects)
     result = memory.appended(learned)
     check_labels(result, config.mask_labels, f"the checkpoint of {config.type}")
-    before = Counter(entry.language for entry in memory.entries)
     used = {entry.source for entry in added}
-    lesson = Lesson(
+    skipped = tuple(i for i in wanted if f"{dataset_meta.repo_id}#{i}" not in used)
+    return result, _lesson(memory, learned, skipped)
+
+
+def _lesson(memory: Memory, learned: Memory, skipped: tuple[int, ...]) -> Lesson:
+    """What is new beside a memory."""
+    named = dict.fromkeys(name for entry in learned.entries for name in entry.layout)
+    before = Counter(entry.language for entry in memory.entries)
+    return Lesson(
         learned=learned,
-        known_before={task: before[task] for task in dict.fromkeys(entry.language for entry in added)},
-        skipped=tuple(i for i in wanted if f"{dataset_meta.repo_id}#{i}" not in used),
+        known_before={task: before[task] for task in dict.fromkeys(one.language for one in learned.entries)},
+        skipped=skipped,
         objects_learned=tuple(name for name in named if name not in memory.objects),
         objects_recognised=tuple(name for name in named if name in memory.objects),
     )
-    return result, lesson
 
 
 def _episodes(dataset_meta: Any, episodes: Sequence[int] | None) -> list[int]:

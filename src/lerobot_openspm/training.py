@@ -1,7 +1,6 @@
 """What a policy's configuration makes of a dataset: what was mined, the memory, and the flow samples.
 
-dataset -> dataset_processor(...).mine() -> MinedDataset -> memory_of(...)
--> training_set(...)
+learn(...): dataset -> dataset_processor(...).mine() -> MinedDataset -> memory_of(...), training_set(...)
 """
 
 from __future__ import annotations
@@ -40,6 +39,31 @@ logger = logging.getLogger(__name__)
 PERTURBED_COPIES = 3
 
 
+def learn(
+    dataset_meta: Any, config: OpenSPMConfig, memory: Memory | None, segmenter: Segmenter | None
+) -> tuple[Memory, TrainingSet]:
+    """Mine a dataset once, and make the memory and the flow samples of it.
+
+    Args:
+        dataset_meta: LeRobot's metadata of the dataset.
+        config: The policy's configuration; ``memory_update`` says what becomes of a memory that is there.
+        memory: What is known so far; None for a new policy.
+        segmenter: Finds the objects' masks; None where the demonstrations teach what objects look like.
+    """
+    update = "rebuild" if memory is None else config.memory_update
+    known = None if update == "rebuild" else memory
+    cameras = None if memory is None else memory.cameras
+    processor = dataset_processor(dataset_meta, config, known, cameras, segmenter)
+    if update == "keep" and memory is not None:
+        mined = processor.key_poses(held_out=True)
+    else:
+        mined = processor.mine(held_out=True)
+        newer = memory_of(mined, config)
+        memory = newer if known is None else known.appended(newer)
+    logger.info("memory_update=%s: %d entries", update, len(memory.entries))
+    return memory, training_set(mined, memory.robot, config)
+
+
 def dataset_processor(
     dataset: Any,
     config: OpenSPMConfig,
@@ -53,7 +77,7 @@ def dataset_processor(
         dataset: A LeRobotDataset, or LeRobot's metadata of one.
         config: The policy's configuration; learns from the dataset how state and action are laid out, where
             it does not say.
-        known: An memory whose objects are recognised by what is known of them.
+        known: A memory whose objects are recognised by what is known of them.
         cameras: Calibration to use where the configuration names no file.
         segmenter: Finds the objects' masks; made as the configuration says if not given.
 

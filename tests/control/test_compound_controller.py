@@ -37,9 +37,9 @@ def row(*entries, instruction=BOTH, **options):
 
 def finish_part(one, eyes, hand=None):
     """Bring the hand to every key pose of the present part in turn, and what it carries along with it."""
-    part = one._part
+    part = one.planner.part
     for _ in range(400):
-        if one.status is not Status.RUNNING or one._part != part:
+        if one.status is not Status.RUNNING or one.planner.part != part:
             return hand
         target = one.executor.target
         before = hand
@@ -53,15 +53,17 @@ def finish_part(one, eyes, hand=None):
 def test_the_second_part_goes_where_the_first_one_has_put_things():
     eyes, one = Perception(LAYOUT), row(PLATE, BOX)
     one.observe(HAND, eyes)
-    assert one.used_entries == (PLATE,)
+    assert one.planner.used == [
+        PLATE,
+    ]
     assert sorted(eyes.asked[0]) == ["bowl", "box", "plate"], "what comes later is looked for at once"
     hand = finish_part(one, eyes, HAND)
     assert one.status is Status.RUNNING
-    assert one._part == 1
+    assert one.planner.part == 1
     assert not np.allclose(eyes.layout["bowl"], LAYOUT["bowl"])
     place = next(target for target in one.executor.plan if target.key_pose.phase == "place")
     assert_allclose(place.T_world_ee, eyes.layout["bowl"] @ place.key_pose.T_obj_ee, atol=2e-3)
-    assert [used.source for used in one.used_entries] == [PLATE.source, BOX.source]
+    assert [used.source for used in one.planner.used] == [PLATE.source, BOX.source]
     finish_part(one, eyes, hand)
     assert one.status is Status.DONE
 
@@ -79,14 +81,14 @@ def test_what_is_not_recognised_any_more_is_where_the_hand_let_it_go():
 
     blind = Blind(LAYOUT)
     hand = finish_part(one, blind, HAND)
-    assert one._part == 1
-    assert_allclose(one.object_poses["bowl"], blind.layout["bowl"], atol=1e-9)
-    assert not np.allclose(one.object_poses["bowl"], LAYOUT["bowl"])
+    assert one.planner.part == 1
+    assert_allclose(one.planner.object_poses["bowl"], blind.layout["bowl"], atol=1e-9)
+    assert not np.allclose(one.planner.object_poses["bowl"], LAYOUT["bowl"])
     index = next(i for i, pose in enumerate(one.executor.plan) if pose.key_pose.anchor.place == "bowl")
     one.executor.begin(one.executor.plan, hand, index)  # the box in the hand, on its way
     watch(one, blind, hand, 100)  # five seconds in which it is in sight and not recognised
     assert one.status is not Status.OBJECT_LOST
-    assert_allclose(one.object_poses["bowl"], blind.layout["bowl"], atol=1e-9)
+    assert_allclose(one.planner.object_poses["bowl"], blind.layout["bowl"], atol=1e-9)
 
 
 def test_a_part_ends_as_high_as_the_episode_began_but_the_last_one_does_not():
@@ -111,7 +113,7 @@ def test_another_object_of_the_same_name_is_not_taken_to_be_where_the_first_one_
     one.scene.tracker.release(one.scene.tracker.held, HAND.T_world_ee)
     one.executor.begin(one.executor.plan, HAND, len(one.executor.plan) - 1)
     watch(one, eyes, Hand(one.executor.plan[-1].T_world_ee, HAND.opening), 12)
-    assert one._part == 1
+    assert one.planner.part == 1
     assert one.status is Status.OBJECT_NOT_FOUND
 
 
@@ -128,7 +130,7 @@ def test_the_second_of_two_like_things_is_looked_for_after_the_first_was_opened(
         hand = Hand(target.T_world_ee, target.key_pose.opening)
         one.executor.begin(one.executor.plan, hand, index)
         watch(one, eyes, hand, target.key_pose.n_steps + 2)
-    assert one._part == 1
+    assert one.planner.part == 1
     assert "box" in eyes.asked[-1]
     assert one.status is Status.RUNNING
 
@@ -137,7 +139,9 @@ def test_the_whole_is_preferred_where_it_was_demonstrated():
     whole = entry(BOTH, PLATE.key_poses, LAYOUT, source="local/demos#9")
     one = row(PLATE, BOX, whole)
     one.observe(HAND, Perception(LAYOUT))
-    assert one.used_entries == (whole,)
+    assert one.planner.used == [
+        whole,
+    ]
     assert len(one.executor.plan) == len(whole.key_poses)
 
 
@@ -147,9 +151,9 @@ def test_a_part_of_an_entry_is_used_in_the_name_of_the_entry():
     one = row(whole, instruction="open the top drawer")
     one.observe(HAND, Perception({"cabinet": LAYOUT["plate"]}))
     assert one.status is Status.RUNNING
-    assert one.ranked[0].entry.language == "open the top drawer of the cabinet"
-    assert len(one.used_entries) == 1
-    assert one.used_entries[0] is whole
+    assert one.planner.ranked[0].entry.language == "open the top drawer of the cabinet"
+    assert len(one.planner.used) == 1
+    assert one.planner.used[0] is whole
 
 
 def test_an_opened_drawer_looks_different_and_is_not_looked_for_again():
@@ -159,7 +163,7 @@ def test_an_opened_drawer_looks_different_and_is_not_looked_for_again():
               instruction="open the top drawer and put the bowl on the cabinet")  # fmt: skip
     one.observe(HAND, eyes)
     hand = finish_part(one, eyes, HAND)
-    assert one._part == 1
+    assert one.planner.part == 1
     eyes.asked.clear()
     eyes.layout["cabinet"] = shifted(cabinet, 0.08)  # what its looks seem to say now
     finish_part(one, eyes, hand)
@@ -175,7 +179,7 @@ def test_what_an_opened_drawer_hides_is_not_lost():
     one.observe(HAND, eyes)
     del eyes.layout["bowl"]  # it should be in sight, and is not recognised
     finish_part(one, eyes, HAND)
-    assert one._part == 1
+    assert one.planner.part == 1
     away = Hand(hand_pose(-0.4, -0.4, 0.5), HAND.opening)
     watch(one, eyes, away, 100)
     assert one.status is Status.RUNNING
@@ -225,12 +229,14 @@ def test_a_part_that_cannot_be_found_is_waited_for():
     one.observe(HAND, eyes)
     hand = finish_part(one, eyes, HAND)
     assert one.status is Status.OBJECT_NOT_FOUND
-    assert one.used_entries == (PLATE,)
+    assert one.planner.used == [
+        PLATE,
+    ]
     assert not one.next_action(hand)[:6].any()
     eyes.layout["box"] = LAYOUT["box"]
     watch(one, eyes, hand, LOOK_AGAIN_STEPS)
     assert one.status is Status.RUNNING
-    assert one.used_entries == (PLATE, BOX)
+    assert one.planner.used == [PLATE, BOX]
 
 
 def test_a_part_out_of_reach_is_infeasible():
@@ -246,7 +252,7 @@ def test_every_part_has_attempts_of_its_own():
     one.observe(HAND, eyes)
     one.executor.attempts = 3
     finish_part(one, eyes, HAND)
-    assert one._part == 1
+    assert one.planner.part == 1
     assert one.executor.attempts == 0
 
 
@@ -263,5 +269,5 @@ def test_without_tracking_every_part_is_still_planned_from_a_look(off):
     eyes, one = Perception(LAYOUT), row(PLATE, BOX, **off)
     one.observe(HAND, eyes)
     finish_part(one, eyes, HAND)
-    assert one._part == 1
+    assert one.planner.part == 1
     assert len(eyes.asked) == 2

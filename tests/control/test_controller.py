@@ -6,7 +6,8 @@ from numpy.testing import assert_allclose
 from tests.memory.builders import OPEN_WIDTH, entry, hand_pose, robot
 
 from lerobot_openspm.control.checks import TransferLimits
-from lerobot_openspm.control.controller import MOVED_M, EpisodeController
+from lerobot_openspm.control.controller import EpisodeController
+from lerobot_openspm.control.planner import MOVED_M
 from lerobot_openspm.control.planning_context import PlanningContext
 from lerobot_openspm.control.scene import BLIND_S, GIVE_UP_S, LOOK_AGAIN_S
 from lerobot_openspm.control.status import Status
@@ -105,7 +106,7 @@ def test_a_feasible_entry_is_preferred_to_a_better_one_that_is_not():
     one = row(bad, good)
     one.observe(HAND, Perception(entry().layout))
     assert one.status is Status.RUNNING
-    assert [scored.entry.source for scored in one.ranked] == ["good", "bad"]
+    assert [scored.entry.source for scored in one.planner.ranked] == ["good", "bad"]
 
 
 def test_a_missed_grasp_looks_again_and_goes_to_where_the_object_is_now():

@@ -31,7 +31,7 @@ def test_a_name_that_only_embeddings_know_is_acted_on(
     policy = load(name_embeddings=str(model))
     action = policy.select_action(batch)
     assert torch.isfinite(action).all()
-    assert policy.episodes[0].controller.ranked[0].entry.language == "put the bowl on the plate"
+    assert policy.episodes[0].controller.planner.ranked[0].entry.language == "put the bowl on the plate"
     # The folder exists on this machine alone, so that it does not travel with the checkpoint.
     policy.save_pretrained(tmp_path / "saved")
     assert OpenSPMConfig.from_pretrained(tmp_path / "saved").name_embeddings is None

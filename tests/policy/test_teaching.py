@@ -131,4 +131,7 @@ def test_any_wording_is_taught_and_acted_on(
         policy.reset()
         policy.select_action(batch_of([{**frame, "task": said}, frame]))
         assert [one.controller.status.value for one in policy.episodes] == ["running", "running"]
-        assert [one.controller.ranked[0].entry.language for one in policy.episodes] == [told, frame["task"]]
+        assert [one.controller.planner.ranked[0].entry.language for one in policy.episodes] == [
+            told,
+            frame["task"],
+        ]

@@ -14,28 +14,22 @@ import numpy as np
 
 from lerobot_openspm.control.contact import Contact
 from lerobot_openspm.control.executor import Executor
-from lerobot_openspm.control.grounding import references
 from lerobot_openspm.control.outcomes import LOOKS_AT_OUTCOME, PartProgress, expected_outcomes, is_met
-from lerobot_openspm.control.plan import Plan, until
+from lerobot_openspm.control.planner import Planner
 from lerobot_openspm.control.planning_context import PlanningContext
 from lerobot_openspm.control.scene import GIVE_UP_S, Detect, SceneState
 from lerobot_openspm.control.status import Status
-from lerobot_openspm.control.transfer import rise
+from lerobot_openspm.control.transfer import Target
 from lerobot_openspm.errors import InstructionError
 from lerobot_openspm.flow.condition import Query
-from lerobot_openspm.geometry import se3
 from lerobot_openspm.geometry.se3 import Array
-from lerobot_openspm.memory.compose import Candidate, plan_parts
-from lerobot_openspm.memory.entry import MemoryEntry, Outcome
-from lerobot_openspm.memory.retrieval import Scored
+from lerobot_openspm.memory.entry import Outcome
 from lerobot_openspm.types import Hand
 
 logger = logging.getLogger(__name__)
 
 # A handle that has come along for less than this share of its way was not in the fingers.
 LEAST_TRAVEL = 0.05
-# An object that is this far from where the key poses took it to be takes them along; less is noise.
-MOVED_M, MOVED_RAD = 0.002, 0.05
 
 
 class EpisodeController:
@@ -45,10 +39,7 @@ class EpisodeController:
         instruction: What is to be done.
         executor: Follows the plan, and holds the episode's status.
         scene: Where the objects are.
-        ranked: The entries of the last retrieval with their scores, best first; where a part of the
-            instruction is carried out, those parts of entries that are about it.
-        object_poses: Poses ``T_world_obj`` that the plan was made with: of what the hand has touched, from
-            before.
+        planner: What is acted by, and where.
         refusal: Why the instruction is not acted on; "" unless the status is NOT_UNDERSTOOD.
     """
 
@@ -58,17 +49,10 @@ class EpisodeController:
         self.executor = Executor(context.settings, context.robot)
         self.scene = SceneState(context)
         self._contact = Contact(self.executor, self.scene)
-        self.ranked: list[Scored] = []
-        self.object_poses: dict[str, Array] = {}
+        self.planner = Planner(context, self.scene, instruction)
         self.refusal = ""
-        # What the instruction is carried out by; made at the first look, because it may be refused.
-        self._parts: tuple[tuple[Candidate, ...], ...] = ()
-        self._part = 0
         self._progress = PartProgress()
         self._earlier_parts_known = True  # whether all parts before the present one were seen to be done
-        self._used: list[MemoryEntry] = []
-        self._start_height = np.inf
-        self._planned_from = np.eye(4)  # the hand's pose when the plan was made
         # Told by what the episode shows first, so that it does not matter in which batch or row it runs.
         self._noise_key = (noise_seed, zlib.crc32(instruction.encode()), fingerprint)
 
@@ -85,21 +69,6 @@ class EpisodeController:
         if self.status is Status.NO_PROGRESS:
             return False
         return self._progress.verdict if self.status is Status.DONE and self._earlier_parts_known else None
-
-    @property
-    def used_entries(self) -> tuple[MemoryEntry, ...]:
-        """The entries of the memory that were acted by so far, each once, in order."""
-        return tuple(self._used)
-
-    @property
-    def candidates(self) -> tuple[tuple[Candidate, ...], ...]:
-        """For each part of the instruction, in order, what it can be carried out by; none before a look."""
-        return self._parts
-
-    @property
-    def plan(self) -> Plan:
-        """What is acted by, and where."""
-        return Plan(self.ranked[0].entry, self.object_poses, self._planned_from)
 
     # One control step: observe, then act.
 
@@ -146,7 +115,7 @@ class EpisodeController:
         """Go on to the next key pose where one is reached; look where it is time to."""
         index = self.executor.index
         is_to_retry = self.status is Status.RUNNING and self.executor.advance(hand)
-        self._contact.update(self.plan, index, hand)
+        self._contact.update(self.planner.plan, index, hand)
         if self.executor.status is Status.DONE:
             self._check_outcomes(hand, detect)
         elif is_to_retry:
@@ -158,66 +127,34 @@ class EpisodeController:
 
     def _plan(self, hand: Hand, detect: Detect) -> None:
         """Plan the part that is to be carried out now, once its objects are found."""
-        if not self._parts:
-            self._parts = plan_parts(self.instruction, self._context.entries, self._context.names)
-            self._ground()
-            self._start_height = float(hand.T_world_ee[2, 3])
-        self._look(self._sought(), hand, detect)
+        planner = self.planner
+        if not planner.parts:
+            planner.read(hand)
+        self._look(planner.sought(), hand, detect)
         if self.status is Status.CAMERA_FAULT:
             return
-        self.object_poses |= self.scene.tracker.poses(hand.T_world_ee)
-        candidates = self._parts[self._part]
-        self.ranked = self._context.rank(candidates, self.object_poses, hand.T_world_ee)
-        best = self.ranked[0].entry
-        if missing := [name for name in best.objects if name not in self.object_poses]:
+        best = planner.choose(hand)
+        if missing := [name for name in best.objects if name not in planner.object_poses]:
             logger.info("%r: cannot find %s", self.instruction, missing)
             self.executor.go(Status.OBJECT_NOT_FOUND)
-        elif problems := self._context.problems(best, self.object_poses, hand.T_world_ee):
+        elif problems := planner.problems(hand):
             logger.warning("%r: %s", self.instruction, "; ".join(problems))
             self.executor.go(Status.INFEASIBLE)
         else:
-            source = next(one.source for one in candidates if one.entry is best)
-            if not any(used is source for used in self._used):
-                self._used.append(source)
+            planner.note_use()
             self._begin(0, hand)
             if self._is_tracking:  # else nothing is looked at any more that could end the waiting
                 self._wait_for_what_is_needed(hand)
 
-    def _ground(self) -> None:
-        """Take in which of several like objects this part is about."""
-        meant = self._context.object_meant
-        said = {k: where for one in self._parts[self._part] for k, where in references(one, meant).items()}
-        others = self.scene.grounding.hear(said)
-        self.scene.tracker.forget(others)
-        self.object_poses = {name: T for name, T in self.object_poses.items() if name not in others}
-        self.scene.altered -= set(others)
-
-    def _sought(self) -> list[str]:
-        """Objects of this part, and of those to come, which it may hide; not what looks different now."""
-        entries = [one.entry for part in self._parts[self._part :] for one in part]
-        needed = [name for entry in entries for name in entry.objects]
-        names = dict.fromkeys([*needed, *self.scene.grounding.landmarks])
-        return [name for name in names if name not in self.scene.altered]
-
     def _begin(self, index: int, hand: Hand) -> None:
         """Go to a key pose; what is grasped or pushed from there on is not in the hand any more."""
-        self._planned_from = hand.T_world_ee
+        self.planner.T_world_ee = hand.T_world_ee
         tracker = self.scene.tracker
-        tracker.drop(tracker.held & self.plan.regrasped(index), hand.T_world_ee)
-        self._transfer_from(index, hand)
+        tracker.drop(tracker.held & self.planner.plan.regrasped(index), hand.T_world_ee)
+        self.executor.begin(self._targets(), hand, index)
 
-    def _transfer_from(self, index: int | None, hand: Hand) -> None:
-        """Carry the key poses over to where the objects are; begin at one, or go on with the present one."""
-        entry = self.ranked[0].entry
-        if self._progress.repeated is not None:
-            entry = until(entry, self._progress.repeated)
-        targets = self._context.transfer(entry, self.object_poses, self._planned_from, self._progress.gone)
-        if self._part + 1 < len(self._parts):
-            targets = (*targets, *rise(targets[-1], self._start_height))
-        if index is None:
-            self.executor.change(targets)
-        else:
-            self.executor.begin(targets, hand, index)
+    def _targets(self) -> tuple[Target, ...]:
+        return self.planner.targets(self._progress.gone, self._progress.repeated)
 
     # Looking.
 
@@ -249,12 +186,12 @@ class EpisodeController:
 
     def _look_around(self, hand: Hand, detect: Detect) -> None:
         """Look at what the remaining key poses need and what is in the hand; act on what has changed."""
-        tracker, untouched = self.scene.tracker, self._untouched()
+        tracker, plan, untouched = self.scene.tracker, self.planner.plan, self._untouched()
         held = tracker.held
         moved = self._look([*untouched, *(held - set(untouched))], hand, detect)
         if self.status is Status.CAMERA_FAULT:
             return
-        dropped = {name for name in moved & held if self._contact.is_left_behind(self.plan, name, hand)}
+        dropped = {name for name in moved & held if self._contact.is_left_behind(plan, name, hand)}
         for name in (moved & held) - dropped:  # it goes along from where it is
             tracker.hold(name, hand.T_world_ee)
         if dropped:
@@ -263,9 +200,9 @@ class EpisodeController:
             if self._contact.is_pushing and not self.executor.try_again("what is pushed was left behind"):
                 return
             index = self.executor.retry_index()
-            self._update(self.plan.anchors(index, self.scene.altered), hand)
+            self.planner.update(self.planner.plan.anchors(index, self.scene.altered), hand)
             self._begin(index, hand)
-        elif changed := self._update(untouched, hand):
+        elif changed := self.planner.update(untouched, hand):
             logger.info("%r: moved: %s", self.instruction, ", ".join(sorted(changed)))
             self._go_along(bool(moved & set(self._now_needed())), hand)
         self._wait_for_what_is_needed(hand)
@@ -275,7 +212,7 @@ class EpisodeController:
         if jumped and self.executor.target is not None:
             self._begin(self.executor.entry_index(), hand)
         else:
-            self._transfer_from(None, hand)
+            self.executor.change(self._targets())
 
     def _wait_for_what_is_needed(self, hand: Hand) -> None:
         """Hold still without sound pictures, and while what the hand is on its way to is not to be seen."""
@@ -292,7 +229,7 @@ class EpisodeController:
 
     def _untouched(self) -> list[str]:
         """Objects of the key poses to come that still are where they were seen."""
-        plan, index = self.plan, self.executor.index
+        plan, index = self.planner.plan, self.executor.index
         touched = plan.touched(self.executor.plan[:index]) | self.scene.tracker.held
         return [name for name in plan.anchors(index, self.scene.altered) if name not in touched]
 
@@ -302,37 +239,20 @@ class EpisodeController:
         anchor = self.executor.plan[self.executor.index].key_pose.anchor
         return [name for name in anchor.objects if name in untouched]
 
-    def _update(self, names: Sequence[str], hand: Hand) -> set[str]:
-        """Take over where objects are now, unless the hand could not follow key poses there.
-
-        Returns:
-            Those that are elsewhere than before.
-        """
-        poses, planned = self.scene.tracker.poses(hand.T_world_ee), self.object_poses
-        changed = {name for name in names if name in poses and _is_moved(poses[name], planned[name])}
-        if not changed:
-            return changed
-        poses = {**planned, **{name: poses[name] for name in changed}}
-        if problems := self._context.problems(self.ranked[0].entry, poses, self._planned_from):
-            logger.info("%r: not believed: %s", self.instruction, "; ".join(problems))
-            return set()
-        self.object_poses = poses
-        return changed
-
     # Trying again.
 
     def _try_again(self, hand: Hand, detect: Detect) -> None:
         """Find the objects of the remaining key poses again and go back to where this contact begins."""
         index = self._retry_index(hand)
-        self._planned_from = hand.T_world_ee
+        self.planner.T_world_ee = hand.T_world_ee
         if self._context.tracking:
             # What should be in the hand is not, or what was to be met is not there: it may be anywhere.
             attempted = self.executor.plan[index : self.executor.index + 1]
             places = {target.key_pose.anchor.place for target in attempted}
             self.scene.tracker.doubt(places - self.scene.altered, hand.T_world_ee)
-            ahead = self.plan.anchors(index, self.scene.altered)
+            ahead = self.planner.plan.anchors(index, self.scene.altered)
             self._look(ahead, hand, detect)
-            self._update(ahead, hand)
+            self.planner.update(ahead, hand)
         if self.status is Status.RUNNING:
             self._begin(index, hand)
 
@@ -366,12 +286,12 @@ class EpisodeController:
         progress.looks_left = 0
         if missed:
             self._go_back(missed[0], hand)
-        elif self._part + 1 < len(self._parts):
+        elif not self.planner.is_last_part:
             self._begin_next_part(hand, detect)
 
     def _missed(self, hand: Hand, detect: Detect) -> tuple[Outcome, ...] | None:
         """Look at what was moved: the outcomes that are not met, in order; None where that is not seen."""
-        entry, progress = self.ranked[0].entry, self._progress
+        entry, progress = self.planner.plan.entry, self._progress
         expected = expected_outcomes(entry)
         progress.followed |= self.executor.followed_sub_tasks()
         names = dict.fromkeys(name for one in expected for name in one.objects)
@@ -396,22 +316,15 @@ class EpisodeController:
         if not self.executor.try_again(f"the {missed.target} is not where it should be"):
             return
         self._progress.look_again(missed.sub_task)
-        poses = self.ranked[0].entry.key_poses
+        poses = self.planner.plan.entry.key_poses
         index = next(i for i, pose in enumerate(poses) if pose.sub_task == missed.sub_task)
-        self._update(self.plan.anchors(index, self.scene.altered), hand)
+        self.planner.update(self.planner.plan.anchors(index, self.scene.altered), hand)
         self._begin(index, hand)
 
     def _begin_next_part(self, hand: Hand, detect: Detect) -> None:
         """Look at what the hand has left behind, and go on from there."""
-        self._part += 1
-        self._ground()
-        logger.info("%r: part %d of %d", self.instruction, self._part + 1, len(self._parts))
+        self.planner.begin_next_part()
         self.executor.finish_subtask()
         self._earlier_parts_known &= self._progress.verdict is True
         self._progress = PartProgress()
         self._plan(hand, detect)
-
-
-def _is_moved(T: Array, other: Array) -> bool:
-    metres, radians = se3.distances(T, other)
-    return bool(metres > MOVED_M or radians > MOVED_RAD)

@@ -75,25 +75,32 @@ def transfer(
         ways = pushes.get(pose.sub_task)
         if ways is not None:
             before = se3.transform(before[:3, :3], ways.position(pose, entry.layout))
-        after = entry.key_poses[i + 1] if i + 1 < len(entry.key_poses) else None
-        # The arrival before the fingers move, or before a push, is where the contact is decided. Where a push
-        # turns, the hand only passes by.
-        turns = pose.phase == "push" and after is not None and after.phase == "push"
-        precise = not turns and (
-            pose.phase in CONTACT_PHASES or (after is not None and (after.dwell or after.phase == "push"))
-        )
         axis = pose.axis
         if axis is not None:
             axis = replace(axis, direction=T_world_anchor[:3, :3] @ axis.direction)
         # Where a push turns, the hand meets its target elsewhere than where the way ends.
         is_straight = sum(p.phase == "push" and p.sub_task == pose.sub_task for p in entry.key_poses) == 1
         push = ways if pose.phase == "push" and is_straight else None
-        targets.append(Target(before, pose, precise, axis, push))
+        targets.append(Target(before, pose, _is_precise(entry, i), axis, push))
     for sub_task, amount in (gone or {}).items():
         targets = _gone_on(targets, sub_task, amount)
     if targets and entry.key.sub_tasks[-1].operation == "put":
         targets += _release(targets)
     return tuple(targets) + _retreat(targets)
+
+
+def _is_precise(entry: MemoryEntry, i: int) -> bool:
+    """Whether a key pose is met precisely: in contact, and before the fingers move or a push begins.
+
+    Where a push turns, the hand only passes by.
+    """
+    pose = entry.key_poses[i]
+    after = entry.key_poses[i + 1] if i + 1 < len(entry.key_poses) else None
+    if after is None:
+        return pose.phase in CONTACT_PHASES
+    if pose.phase == after.phase == "push":
+        return False
+    return pose.phase in CONTACT_PHASES or after.dwell or after.phase == "push"
 
 
 def _gone_on(targets: Sequence[Target], sub_task: int, amount: float) -> list[Target]:

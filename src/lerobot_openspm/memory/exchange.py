@@ -56,7 +56,7 @@ def digest(model: KnownObject) -> str:
 
 
 def write_entries_file(memory: Memory, path: Path) -> None:
-    """Write the entries of an memory as one JSON file, an entry on every line."""
+    """Write the entries of a memory as one JSON file, an entry on every line."""
     names = anchored_objects(memory.entries) & memory.objects.keys()
     fields = header_to_fields(header_of(memory, []))
     fields["format"] = FORMAT

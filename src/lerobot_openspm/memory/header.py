@@ -32,7 +32,7 @@ class Header:
     """The header of a memory.
 
     Attributes:
-        perception: As in an memory, like the four that follow.
+        perception: As in a memory, like the four that follow.
         segmentation: What found the objects' pixels.
         shape: What was learned of the objects.
         simulator_objects: Objects in the order of the simulator's pose vector.
