@@ -64,9 +64,9 @@ def main() -> None:
             )
 
     # 4. Keep. The memory is JSON that a person can read, and arrays beside it.
-    memory = options.output / "memory"
-    write_memory(memory, memory)
-    print(f"\nsaved to {memory}; `openspm inspect --path={memory}` shows it")
+    directory = options.output / "memory"
+    write_memory(memory, directory)
+    print(f"\nsaved to {directory}; `openspm inspect --path={directory}` shows it")
 
 
 if __name__ == "__main__":

@@ -46,28 +46,30 @@ def main() -> None:
 
     # 2. Observing plans: find the objects in the images, rank the entries, carry the best one over.
     memory = read_memory(options.memory)
-    knowledge = PlanningContext(
+    context = PlanningContext(
         memory.entries, memory.yaw_periods, memory.robot, config.score_weights,
         config.transfer_limits, config.control_settings,
     )  # fmt: skip
-    row = EpisodeController(knowledge, options.instruction, observation.fingerprint(), noise_seed=0)
-    row.observe(observation.hand, partial(Perception(memory, config.hand_radius_m).look, observation))
+    controller = EpisodeController(context, options.instruction, observation.fingerprint(), noise_seed=0)
+    controller.observe(
+        observation.hand, partial(Perception(memory, config.hand_radius_m).detect, observation)
+    )
 
-    print(f"{options.instruction!r}: {row.status.name.lower()}")
-    for name, T_world_obj in row.planner.object_poses.items():
+    print(f"{options.instruction!r}: {controller.status.name.lower()}")
+    for name, T_world_obj in controller.planner.object_poses.items():
         print(f"  the {name} is at {T_world_obj[:3, 3].round(3).tolist()} m")
     print("  recalled              semantics  geometry  quality   score")
-    for item in row.planner.ranked:
+    for item in controller.planner.ranked:
         where = item.entry.source.split("/")[-1]
         print(
             f"  {where:20s} {item.semantic:10.2f} {item.geometric:9.2f} {item.quality:8.2f} {item.total:7.2f}"
         )
 
     # 3. Draw where the hand is to go.
-    best = row.planner.ranked[0].entry
-    if any(name not in row.planner.object_poses for name in best.objects):
+    best = controller.planner.ranked[0].entry
+    if any(name not in controller.planner.object_poses for name in best.objects):
         raise SystemExit("not all of its objects were found in this scene; try another --seed")
-    targets = transfer(best, row.planner.object_poses, memory.yaw_periods, observation.hand.T_world_ee)
+    targets = transfer(best, controller.planner.object_poses, memory.yaw_periods, observation.hand.T_world_ee)
     view = observation.views(memory.cameras)[CAMERA]
     picture = draw_key_poses(view, [t.T_world_ee for t in targets], [t.key_pose.phase for t in targets])
     save_png(picture, options.output / "key_poses.png")
