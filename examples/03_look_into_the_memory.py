@@ -51,19 +51,16 @@ def main() -> None:
         config.transfer_limits, config.control_settings,
     )  # fmt: skip
     controller = EpisodeController(context, options.instruction, observation.fingerprint(), noise_seed=0)
-    controller.observe(
-        observation.hand, partial(Perception(memory, config.hand_radius_m).detect, observation)
-    )
+    perception = Perception(memory, config.hand_radius_m)
+    controller.observe(observation.hand, partial(perception.detect, observation))
 
     print(f"{options.instruction!r}: {controller.status.name.lower()}")
     for name, T_world_obj in controller.planner.object_poses.items():
         print(f"  the {name} is at {T_world_obj[:3, 3].round(3).tolist()} m")
     print("  recalled              semantics  geometry  quality   score")
     for item in controller.planner.ranked:
-        where = item.entry.source.split("/")[-1]
-        print(
-            f"  {where:20s} {item.semantic:10.2f} {item.geometric:9.2f} {item.quality:8.2f} {item.total:7.2f}"
-        )
+        scores = (item.semantic, item.geometric, item.quality, item.total)
+        print(f"  {item.entry.source.split('/')[-1]:20s}", *(f"{score:9.2f}" for score in scores))
 
     # 3. Draw where the hand is to go.
     best = controller.planner.ranked[0].entry
