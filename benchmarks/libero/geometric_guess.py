@@ -65,7 +65,7 @@ class GuessConfig:
         oracle: Checkpoint trained with perception=oracle; everything but its memory is kept.
         output: Folder of the checkpoint to write.
         source: "geometric", or a multimodal model: "openai" behind an endpoint, "qwen3vl" in this process.
-        model_id: The model, as --policy.phase_judge_model_id names it.
+        model_id: The model, as --policy.judge.model_id names it.
         api_base: Where the endpoint is.
         device: Where "qwen3vl" runs.
     """
@@ -103,7 +103,6 @@ def guessing_policy(oracle: Path, folder: Path, source: KeyPoseSource | None = N
     policy.memory = replace(memory, entries=tuple(entries))
     # A guess may well lie outside what the demonstrations reached.
     policy.config.reach_margin_m = policy.config.min_clearance_m = 1.0
-    policy.config.max_jump_m = 2.0
     policy.save_pretrained(folder)
     return folder
 

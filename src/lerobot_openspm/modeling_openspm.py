@@ -6,7 +6,7 @@ import logging
 from collections.abc import Generator, Sequence
 from contextlib import contextmanager
 from copy import deepcopy
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -19,8 +19,10 @@ from torch import Tensor
 
 from lerobot_openspm.checkpoint import checkpoint_folder, load_memory
 from lerobot_openspm.configuration_openspm import OpenSPMConfig
+from lerobot_openspm.control.checks import TransferLimits
 from lerobot_openspm.control.controller import EpisodeController
 from lerobot_openspm.control.planning_context import PlanningContext
+from lerobot_openspm.control.strategies import ControlSettings
 from lerobot_openspm.errors import DatasetError, MemoryFormatError, OpenSPMError
 from lerobot_openspm.flow.condition import CONDITION_DIM, Query, encode, to_world_frame
 from lerobot_openspm.flow.network import VelocityField
@@ -31,18 +33,12 @@ from lerobot_openspm.memory.indexed_entries import indexed
 from lerobot_openspm.memory.memory import Memory, write_memory
 from lerobot_openspm.perception.observation import Observation, split_batch
 from lerobot_openspm.perception.pipeline import Perception
-from lerobot_openspm.perception.tracking.tracker import TrackerSettings
 from lerobot_openspm.types import Hand, Segmenter
 
 if TYPE_CHECKING:
     from lerobot_openspm.teaching import Lesson
 
 logger = logging.getLogger(__name__)
-
-# Options that mean nothing on another machine; a checkpoint is saved without them.
-ON_ONE_MACHINE = (
-    "cameras", "sam3d_python", "sam3d_checkout", "phase_judge_api_base", "phase_judge_cache",
-)  # fmt: skip
 
 # Of checkpoints that do not say how often their robot acts.
 DEFAULT_CONTROL_HZ = 20.0
@@ -82,7 +78,7 @@ class OpenSPMPolicy(PreTrainedPolicy):
         super().__init__(config)
         config.validate_features()
         self.config: OpenSPMConfig = config
-        self.flow = VelocityField(CONDITION_DIM[config.conditioning], config.chunk_size, 7, config.hidden_dim)
+        self.flow = VelocityField(CONDITION_DIM[config.conditioning], config.chunk_size, 7)
         self.memory: Memory | None = None
         self._training_set: TrainingSet | None = None
         self._entries: tuple[Sequence[MemoryEntry], Sequence[MemoryEntry]] | None = None
@@ -219,9 +215,10 @@ class OpenSPMPolicy(PreTrainedPolicy):
         if self._entries is None or self._entries[0] is not memory.entries:
             self._entries = memory.entries, indexed(memory.entries)
         context = PlanningContext(
-            self._entries[1], memory.yaw_periods, memory.robot, config.score_weights,
-            config.transfer_limits, config.control_settings, TrackerSettings(), config.tracking,
-            self.step_s, self.names,
+            self._entries[1], memory.yaw_periods, memory.robot,
+            limits=TransferLimits(config.reach_margin_m, config.min_clearance_m),
+            settings=ControlSettings(config.execution),
+            tracking=config.tracking, step_s=self.step_s, names=self.names,
         )  # fmt: skip
         controller = EpisodeController(
             context, observation.instruction, observation.fingerprint(), config.noise_seed
@@ -303,11 +300,8 @@ class OpenSPMPolicy(PreTrainedPolicy):
     def _save_pretrained(self, save_directory: Path, state_dict: dict[str, Tensor] | None = None) -> None:
         memory = self.require_memory()  # before anything is written
         super()._save_pretrained(save_directory, state_dict=state_dict)
-        # What exists on one machine alone stays there; the calibration travels as a file of the checkpoint.
-        here: dict[str, None] = dict.fromkeys(ON_ONE_MACHINE)
-        if self.config.name_embeddings and Path(self.config.name_embeddings).is_dir():
-            here["name_embeddings"] = None
-        replace(self.config, **here)._save_pretrained(Path(save_directory))
+        # The calibration travels as a file of the checkpoint.
+        self.config.without_places()._save_pretrained(Path(save_directory))
         write_memory(memory, Path(save_directory))
 
     @classmethod

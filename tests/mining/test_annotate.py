@@ -16,7 +16,7 @@ from lerobot.datasets.language import language_feature_info
 from tests.memory.builders import robot
 from tests.mining.test_dataset_layers import dataset as image_dataset
 
-from lerobot_openspm.configuration_openspm import OpenSPMConfig
+from lerobot_openspm.configuration_openspm import JudgeConfig, OpenSPMConfig
 from lerobot_openspm.errors import DatasetError
 from lerobot_openspm.language.instruction import parse_instruction
 from lerobot_openspm.memory.entry import PHASES
@@ -62,12 +62,8 @@ def test_reading_it_gives_what_was_mined_and_mines_nothing(
 
 
 def test_nobody_is_asked_about_phases_that_stand_there(annotated_dataset: Path):
-    judge = {
-        "phase_judge": "openai",
-        "phase_judge_model_id": "m",
-        "phase_judge_api_base": "http://nowhere.test/v1",
-    }
-    assert len(processor_of(annotated_dataset, **judge).key_poses().episodes) == 6
+    judge = JudgeConfig("openai", "http://nowhere.test/v1", "m")
+    assert len(processor_of(annotated_dataset, judge=judge).key_poses().episodes) == 6
 
 
 def test_lerobot_reads_it_with_everything_that_was_there(tiny_dataset: Path, annotated_dataset: Path):

@@ -41,9 +41,9 @@ class PlanningContext:
     entries: Sequence[MemoryEntry]
     yaw_periods: Mapping[str, float]
     robot: RobotModel
-    weights: ScoreWeights
-    limits: TransferLimits
-    settings: ControlSettings
+    weights: ScoreWeights = field(default_factory=ScoreWeights)
+    limits: TransferLimits = field(default_factory=TransferLimits)
+    settings: ControlSettings = field(default_factory=ControlSettings)
     tracker: TrackerSettings = field(default_factory=TrackerSettings)
     tracking: bool = True
     step_s: float = 0.05

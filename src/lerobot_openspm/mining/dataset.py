@@ -204,9 +204,9 @@ class Demonstrations:
         """
         if LANGUAGE_PERSISTENT not in self._dataset.features:
             raise DatasetError(
-                f"dataset {self.name} has no column {LANGUAGE_PERSISTENT!r}, which phase_judge=annotations "
+                f"dataset {self.name} has no column {LANGUAGE_PERSISTENT!r}, which judge.type=annotations "
                 f"reads; write it with lerobot-annotate --root={self._dataset.root}, or leave "
-                "--policy.phase_judge out"
+                "--policy.judge.type out"
             )
         # An episode's rows stand beside each of its frames.
         meta: Any = self._dataset.meta.episodes

@@ -39,8 +39,8 @@ def make_judge(
     if kind == "openai":
         if not model_id:
             raise JudgementError(
-                f"no model to ask at {api_base or API_BASE}; pass --policy.phase_judge_model_id=NAME, one of "
-                "those that its /models lists"
+                f"no model to ask at {api_base or API_BASE}; pass --policy.judge.model_id=NAME, one of those "
+                "that its /models lists"
             )
         return EndpointJudge(ChatEndpoint(api_base or API_BASE, model_id, Patience(timeout_s)))
     if kind == "qwen3vl":
