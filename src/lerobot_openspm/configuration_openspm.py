@@ -15,14 +15,15 @@ from lerobot.utils.constants import ACTION, OBS_STATE
 from lerobot_openspm.geometry.vector_layout import RotationKind, VectorLayout, parse_layout
 from lerobot_openspm.types import Conditioning, Execution, Segmenter, Shape
 
-Perception = Literal["demonstrations", "sam3", "grounded_sam2", "given", "oracle"]
+PerceptionSource = Literal["demonstrations", "sam3", "grounded_sam2", "given", "oracle"]
 MemoryUpdate = Literal["keep", "append", "rebuild"]
-Judge = Literal["none", "openai", "qwen3vl", "annotations"]
+JudgeType = Literal["none", "openai", "qwen3vl", "annotations"]
 
-# Perceptions with masks.
-SEGMENTERS = ("sam3", "grounded_sam2", "given")
+# Perceptions with weights of their own, and all with masks.
+PRETRAINED = ("sam3", "grounded_sam2")
+SEGMENTERS = (*PRETRAINED, "given")
 CHOICES = {
-    "perception": Perception,
+    "perception": PerceptionSource,
     "memory_update": MemoryUpdate,
     "conditioning": Conditioning,
     "execution": Execution,
@@ -87,16 +88,15 @@ class JudgeConfig:
         timeout_s: How long to wait for the endpoint's answer about one episode, in seconds.
     """
 
-    type: Judge = "none"
+    type: JudgeType = "none"
     api_base: str | None = None
     model_id: str | None = None
     confidence: float = 0.6
     timeout_s: float = 60.0
 
     def __post_init__(self) -> None:
-        _require_choice("judge.type", self.type, get_args(Judge))
-        if not 0 <= self.confidence <= 1:
-            raise ValueError(f"judge.confidence is {self.confidence}, expected 0 to 1")
+        _require_choice("judge.type", self.type, get_args(JudgeType))
+        _require("judge.confidence", self.confidence, 0 <= self.confidence <= 1, "0 to 1")
         _require("judge.timeout_s", self.timeout_s, self.timeout_s > 0, "more than 0")
         if self.type == "openai" and not self.model_id:
             raise ValueError(
@@ -140,8 +140,8 @@ class OpenSPMConfig(PreTrainedConfig):
             "quat" or "euler"; "none" ignores the rotation. Where the two differ, name them in the layouts.
         control_hz: Actions per second that the robot takes; the dataset's frame rate if not given. Motions
             are counted in steps; only how long an object or a camera was not seen is counted in seconds.
-        hand_radius_m: Radius of a ball around the hand, in metres. What lies behind it is hidden from a
-            camera and tells nothing about where objects are.
+        hand_radius_m: Radius of the hand, in metres. It hides from the cameras what is behind it: those
+            pixels say nothing about where objects are.
         perception: What finds objects. "demonstrations": the colours and patches that the demonstrations
             showed. "sam3" and "grounded_sam2": pretrained segmenters that take any phrase. "given": the
             masks in ``observation.masks.<camera>``. "oracle": the simulator's poses, for ablations only.
@@ -184,7 +184,7 @@ class OpenSPMConfig(PreTrainedConfig):
     hand_radius_m: float = 0.08
 
     # Perception.
-    perception: Perception = "demonstrations"
+    perception: PerceptionSource = "demonstrations"
     tracking: bool = True
     segmentation: SegmentationConfig = field(default_factory=SegmentationConfig)
 
@@ -228,7 +228,12 @@ class OpenSPMConfig(PreTrainedConfig):
         if not has_masks and self.segmentation.shape != "demonstrations":
             raise ValueError(
                 f"segmentation.shape is {self.segmentation.shape!r}, but perception {self.perception!r} has "
-                f"no masks; pass --policy.perception=sam3, grounded_sam2 or given"
+                "no masks; pass --policy.perception=sam3, grounded_sam2 or given"
+            )
+        if self.segmentation.weights and self.perception not in PRETRAINED:
+            raise ValueError(
+                f"segmentation.weights are for perception {' and '.join(PRETRAINED)}, got "
+                f"{self.perception!r}; pass --policy.perception=sam3 too, or leave them out"
             )
         if (self.perception == "given") != (labels is not None):
             raise ValueError(

@@ -44,6 +44,7 @@ def masks(**options: Any) -> dict[str, Any]:
         ({"perception": "given"}, "segmentation.labels is None.*--policy.segmentation.labels='"),
         ({"perception": "sam3", **masks(labels=LABELS)}, "'sam3', segmentation.labels is {'bowl'"),
         (masks(labels=LABELS), "'demonstrations', segmentation.labels is {'bowl'"),
+        (masks(weights=["one"]), "are for perception sam3 and grounded_sam2, got 'demonstrations'"),
     ],
 )
 def test_options_that_make_no_sense_together_are_refused(options: dict[str, Any], words: str):
