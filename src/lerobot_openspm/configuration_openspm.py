@@ -75,7 +75,7 @@ class OpenSPMConfig(PreTrainedConfig):
         phase_judge_confidence: What a judge says with less confidence changes nothing.
         phase_judge_timeout_s: How long to wait for the endpoint's answer about one episode.
         phase_judge_cache: Folder to keep answers in, so that nothing is asked twice;
-            ``openspm/phase_judgements`` in LeRobot's cache if not given.
+            ``openspm/phase_labels`` in LeRobot's cache if not given.
         chunk_size: Actions per chunk, the paper's H.
         n_action_steps: Actions executed before the next chunk.
         conditioning: "equivariant" tells the flow model the relative pose in the frame of the target key

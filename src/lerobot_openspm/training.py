@@ -25,9 +25,7 @@ from lerobot_openspm.memory.robot import RobotModel
 from lerobot_openspm.mining.dataset import Demonstrations, open_dataset
 from lerobot_openspm.mining.entries import build_entries
 from lerobot_openspm.mining.mined import MinedDataset, MinedEpisode, MinedKeyPoses
-from lerobot_openspm.mining.phase_labels.cache import AnswerCache
-from lerobot_openspm.mining.phase_labels.judging import judge_episodes
-from lerobot_openspm.mining.phase_labels.make import make_judge
+from lerobot_openspm.mining.phase_labels.labelling import LabelCache, label_phases, make_judge
 from lerobot_openspm.mining.processor import DatasetProcessor, MiningOptions
 from lerobot_openspm.perception.objects.object_shape import ShapeBackend
 from lerobot_openspm.perception.objects.sam3d.size import Sam3dShape, worker_command
@@ -100,7 +98,7 @@ def dataset_processor(
         known_objects=known.objects if known else {},
         known_names=known_names(known.entries) if known else (),
         known_robot=known.robot if known else None,
-        judge=None if config.phase_judge == "none" else partial(judged, config=config),
+        judge=None if config.phase_judge == "none" else partial(labelled, config=config),
         segmenter=segmenter or config.make_segmenter(),
         shape=config.shape,
         open_shapes=partial(shapes_of, config),
@@ -174,13 +172,13 @@ def shapes_of(config: OpenSPMConfig) -> AbstractContextManager[ShapeBackend | No
     return Sam3dShape(worker_command(Path(config.sam3d_python), Path(config.sam3d_checkout)))
 
 
-def judged(
+def labelled(
     demonstrations: Demonstrations, mined: tuple[MinedEpisode, ...], robot: RobotModel, config: OpenSPMConfig
 ) -> tuple[MinedEpisode, ...]:
-    """Episodes with what the configuration's judge of phases says of their key poses.
+    """Episodes with the phase labels of the configuration's judge merged into their key poses.
 
     Raises:
-        JudgementError: There is nothing to ask.
+        PhaseLabelError: The judge's model is not named.
         PerceptionError: A model's package or weights are missing.
         DatasetError: The dataset was never annotated, and its annotations are the judge.
     """
@@ -188,9 +186,9 @@ def judged(
         config.phase_judge, demonstrations, config.phase_judge_model_id, config.phase_judge_api_base,
         config.phase_judge_timeout_s, str(config.device),
     )  # fmt: skip
-    folder = config.phase_judge_cache or HF_LEROBOT_HOME / "openspm" / "phase_judgements"
-    cache = AnswerCache(Path(folder))
-    return judge_episodes(demonstrations, mined, robot, judge, config.phase_judge_confidence, cache)
+    folder = config.phase_judge_cache or HF_LEROBOT_HOME / "openspm" / "phase_labels"
+    cache = LabelCache(Path(folder))
+    return label_phases(demonstrations, mined, robot, judge, config.phase_judge_confidence, cache)
 
 
 def _take_layouts(dataset_meta: Any, config: OpenSPMConfig) -> None:

@@ -19,13 +19,13 @@ from tests.mining.test_dataset_layers import dataset as image_dataset
 from lerobot_openspm.configuration_openspm import OpenSPMConfig
 from lerobot_openspm.errors import DatasetError
 from lerobot_openspm.language.instruction import parse_instruction
+from lerobot_openspm.language.phase_words import phases_of
 from lerobot_openspm.memory.entry import PHASES
 from lerobot_openspm.mining import annotate, processor
 from lerobot_openspm.mining.annotate import sub_task_words, write_annotated
 from lerobot_openspm.mining.columns import IS_KEY_POSE, KEY_POSE, PHASE, TARGET, TYPES
 from lerobot_openspm.mining.key_poses import KeyPose
 from lerobot_openspm.mining.mined import MinedEpisode, MinedKeyPoses
-from lerobot_openspm.mining.phase_labels.annotations import phases_of
 from lerobot_openspm.mining.processor import DatasetProcessor
 from lerobot_openspm.training import dataset_processor, open_demonstrations
 

@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from benchmarks.libero.guessed_key_poses import check_sequence
 from lerobot.annotations.steerable_pipeline.executor import Executor
 from lerobot.annotations.steerable_pipeline.reader import iter_episodes
 from lerobot.annotations.steerable_pipeline.staging import EpisodeStaging
@@ -28,9 +29,8 @@ from lerobot_openspm.mining.dataset import Demonstrations
 from lerobot_openspm.mining.key_poses import KeyPose
 from lerobot_openspm.mining.mined import MinedEpisode
 from lerobot_openspm.mining.phase_labels import question
-from lerobot_openspm.mining.phase_labels.judging import MAX_FAILURES
-from lerobot_openspm.mining.phase_labels.structure import check_sequence
-from lerobot_openspm.training import dataset_processor, judged, memory_of, training_set
+from lerobot_openspm.mining.phase_labels.labelling import MAX_FAILURES
+from lerobot_openspm.training import dataset_processor, labelled, memory_of, training_set
 
 NAME = "local/openspm_tabletop"
 
@@ -71,7 +71,7 @@ class Mined:
         self.demonstrations.pictures = pictures
 
     def judged(self, first: int = 4, **options) -> tuple[MinedEpisode, ...]:
-        return judged(self.demonstrations, self.episodes[:first], self.robot, config(**options))
+        return labelled(self.demonstrations, self.episodes[:first], self.robot, config(**options))
 
 
 @pytest.fixture(scope="module")
@@ -125,7 +125,7 @@ def test_agreement_makes_every_key_pose_surer(mined: Mined, asked, caplog: pytes
     assert len(chat.requests) == len(mined.episodes) == 4
     pictures = [p for p in chat.requests[0]["messages"][0]["content"] if p["type"] == "image_url"]
     assert len(pictures) == 3
-    assert "openai tiny-vl v1 judged the phases of 4 of 4 episodes" in caplog.text
+    assert "openai tiny-vl v1 labelled the phases of 4 of 4 episodes" in caplog.text
 
 
 def test_nothing_is_asked_twice(mined: Mined, asked):
@@ -229,10 +229,10 @@ def test_qwen3vl_judges_in_this_process(
     )
     (kept,) = (json.loads(path.read_text()) for path in tmp_path.rglob("*.json"))
     assert kept["judge"] == f"qwen3vl {tiny_qwen3vl_folder} v1"
-    assert len(kept["answers"]) == len(found[0].key_poses)
-    assert {answer["phase"] for answer in kept["answers"]} <= set(PHASES)
+    assert len(kept["labels"]) == len(found[0].key_poses)
+    assert {answer["phase"] for answer in kept["labels"]} <= set(PHASES)
     # Random weights are sure of nothing, so there is nothing that they could change.
-    assert all(answer["confidence"] < 0.5 for answer in kept["answers"])
+    assert all(answer["confidence"] < 0.5 for answer in kept["labels"])
     assert found == mined.episodes[:1]
 
 
