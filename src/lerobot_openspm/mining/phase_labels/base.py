@@ -114,7 +114,11 @@ class PhaseLabel:
         """Read a label from JSON that may hold anything. Raises PhaseLabelError where it is no label."""
         fields: dict[str, Any] = data if isinstance(data, dict) else {}
         phase, confidence = fields.get("phase"), fields.get("confidence")
-        if not isinstance(phase, str) or not isinstance(confidence, int | float) or confidence is True:
+        if (
+            not isinstance(phase, str)
+            or not isinstance(confidence, int | float)
+            or isinstance(confidence, bool)
+        ):
             raise PhaseLabelError(f"got {str(data)[:80]}, expected an object with a phase and a confidence")
         return cls(phase, confidence)
 
