@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
-from lerobot_openspm.language.phase_words import phases_of
+from lerobot_openspm.language.descriptions import phases_of
 from lerobot_openspm.mining.phase_labels.base import PhaseLabel, PhaseLabels, PhaseQuestion
 from lerobot_openspm.mining.phase_labels.merge import SIBLINGS
 
