@@ -25,9 +25,7 @@ from lerobot_openspm.memory.robot import RobotModel
 from lerobot_openspm.mining.dataset import Demonstrations, open_dataset
 from lerobot_openspm.mining.entries import build_entries
 from lerobot_openspm.mining.mined import MinedDataset, MinedEpisode, MinedKeyPoses
-from lerobot_openspm.mining.phase_labels.cache import AnswerCache
-from lerobot_openspm.mining.phase_labels.judging import judge_episodes
-from lerobot_openspm.mining.phase_labels.make import make_judge
+from lerobot_openspm.mining.phase_labels.labelling import LabelCache, label_phases, make_judge
 from lerobot_openspm.mining.processor import DatasetProcessor, MiningOptions
 from lerobot_openspm.perception.objects.object_shape import ShapeBackend
 from lerobot_openspm.perception.objects.sam3d.size import Sam3dShape, worker_command
@@ -36,7 +34,7 @@ from lerobot_openspm.types import Segmenter
 logger = logging.getLogger(__name__)
 
 # Where a judge's answers are kept, so that nothing is asked twice.
-ANSWERS = HF_LEROBOT_HOME / "openspm" / "phase_judgements"
+LABELS = HF_LEROBOT_HOME / "openspm" / "phase_labels"
 # Copies of every frame with different perturbations, beside the frame itself. Their spread is that of the
 # hand's error on the way: somewhat more than the tolerance at a contact key pose.
 PERTURBED_COPIES = 3
@@ -104,7 +102,7 @@ def dataset_processor(
         known_objects=known.objects if known else {},
         known_names=known_names(known.entries) if known else (),
         known_robot=known.robot if known else None,
-        judge=None if config.judge.type == "none" else partial(judged, config=config),
+        judge=None if config.judge.type == "none" else partial(labelled, config=config),
         segmenter=segmenter or config.make_segmenter(),
         shape=config.segmentation.shape,
         open_shapes=partial(shapes_of, config),
@@ -181,13 +179,13 @@ def shapes_of(config: OpenSPMConfig) -> AbstractContextManager[ShapeBackend | No
     return Sam3dShape(worker_command(Path(python), Path(checkout)))
 
 
-def judged(
+def labelled(
     demonstrations: Demonstrations, mined: tuple[MinedEpisode, ...], robot: RobotModel, config: OpenSPMConfig
 ) -> tuple[MinedEpisode, ...]:
-    """Episodes with what the configuration's judge of phases says of their key poses.
+    """Episodes with the phase labels of the configuration's judge merged into their key poses.
 
     Raises:
-        JudgementError: There is nothing to ask.
+        PhaseLabelError: The judge's model is not named.
         PerceptionError: A model's package or weights are missing.
         DatasetError: The dataset was never annotated, and its annotations are the judge.
     """
@@ -195,7 +193,7 @@ def judged(
     judge = make_judge(
         asked.type, demonstrations, asked.model_id, asked.api_base, asked.timeout_s, str(config.device)
     )
-    return judge_episodes(demonstrations, mined, robot, judge, asked.confidence, AnswerCache(ANSWERS))
+    return label_phases(demonstrations, mined, robot, judge, asked.confidence, LabelCache(LABELS))
 
 
 def _take_layouts(dataset_meta: Any, config: OpenSPMConfig) -> None:

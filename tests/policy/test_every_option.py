@@ -82,7 +82,7 @@ def trained(
 ) -> Trained:
     """Also an empty current folder with a calibration whose front camera stands elsewhere."""
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(training, "ANSWERS", tmp_path / "answers")
+    monkeypatch.setattr(training, "LABELS", tmp_path / "answers")
     document = json.loads(CALIBRATION.read_text())
     pose = document["cameras"]["observation.images.front"]["T_mount_cam"]
     pose[0][3] += 0.03

@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from benchmarks.libero.guessed_key_poses import check_sequence
 from lerobot.annotations.steerable_pipeline.executor import Executor
 from lerobot.annotations.steerable_pipeline.reader import iter_episodes
 from lerobot.annotations.steerable_pipeline.staging import EpisodeStaging
@@ -29,9 +30,8 @@ from lerobot_openspm.mining.dataset import Demonstrations
 from lerobot_openspm.mining.key_poses import KeyPose
 from lerobot_openspm.mining.mined import MinedEpisode
 from lerobot_openspm.mining.phase_labels import question
-from lerobot_openspm.mining.phase_labels.judging import MAX_FAILURES
-from lerobot_openspm.mining.phase_labels.structure import check_sequence
-from lerobot_openspm.training import dataset_processor, judged, memory_of, training_set
+from lerobot_openspm.mining.phase_labels.labelling import MAX_FAILURES
+from lerobot_openspm.training import dataset_processor, labelled, memory_of, training_set
 
 NAME = "local/openspm_tabletop"
 
@@ -73,14 +73,14 @@ class Mined:
 
     def judged(self, *judge, first: int = 4, **options) -> tuple[MinedEpisode, ...]:
         chosen = config(judge=JudgeConfig(*judge, **options))
-        return judged(self.demonstrations, self.episodes[:first], self.robot, chosen)
+        return labelled(self.demonstrations, self.episodes[:first], self.robot, chosen)
 
 
 @pytest.fixture(autouse=True)
 def answers(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """An empty folder of answers for each test."""
-    monkeypatch.setattr(training, "ANSWERS", tmp_path / "answers")
-    return training.ANSWERS
+    monkeypatch.setattr(training, "LABELS", tmp_path / "answers")
+    return training.LABELS
 
 
 @pytest.fixture(scope="module")
@@ -132,7 +132,7 @@ def test_agreement_makes_every_key_pose_surer(mined: Mined, asked, caplog: pytes
     assert len(chat.requests) == len(mined.episodes) == 4
     pictures = [p for p in chat.requests[0]["messages"][0]["content"] if p["type"] == "image_url"]
     assert len(pictures) == 3
-    assert "openai tiny-vl v1 judged the phases of 4 of 4 episodes" in caplog.text
+    assert "openai tiny-vl v1 labelled the phases of 4 of 4 episodes" in caplog.text
 
 
 def test_nothing_is_asked_twice(mined: Mined, asked):
@@ -229,10 +229,10 @@ def test_qwen3vl_judges_in_this_process(
     found = mined.judged("qwen3vl", None, str(tiny_qwen3vl_folder), confidence=0.0, first=1)
     (kept,) = (json.loads(path.read_text()) for path in answers.rglob("*.json"))
     assert kept["judge"] == f"qwen3vl {tiny_qwen3vl_folder} v1"
-    assert len(kept["answers"]) == len(found[0].key_poses)
-    assert {answer["phase"] for answer in kept["answers"]} <= set(PHASES)
+    assert len(kept["labels"]) == len(found[0].key_poses)
+    assert {answer["phase"] for answer in kept["labels"]} <= set(PHASES)
     # Random weights are sure of nothing, so there is nothing that they could change.
-    assert all(answer["confidence"] < 0.5 for answer in kept["answers"])
+    assert all(answer["confidence"] < 0.5 for answer in kept["labels"])
     assert found == mined.episodes[:1]
 
 
