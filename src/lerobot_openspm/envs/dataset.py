@@ -55,7 +55,9 @@ def create_dataset(
 
 def _features(suite: Suite, size: tuple[int, int]) -> dict[str, dict[str, Any]]:
     video = {"dtype": "video", "shape": (*size, 3), "names": ["height", "width", "channels"]}
-    features = {f"observation.images.{name}": dict(video) for name in suite.cameras}
+    features: dict[str, dict[str, Any]] = {
+        f"observation.images.{name}": dict(video) for name in suite.cameras
+    }
     for key, names in suite.names.items():
         count = sum(map(len, names.values())) if isinstance(names, Mapping) else len(names)
         features[key] = {"dtype": "float32", "shape": (count,), "names": names}

@@ -95,8 +95,8 @@ class LiberoGoal:
         """See `Suite`. LeRobot turns robosuite's images by 180 degrees, which leaves them mirrored."""
         simulator = LiberoSimulator(next(iter(tasks())))
         simulator.reset(0)
-        model, data = simulator.sim.model._model, simulator.sim.data._data
-        cameras = {image: (name, CAMERA_MOUNTS[image]) for image, name in CAMERAS.items()}
-        found = calibration(model, data, cameras, simulator.ee_pose(), (height, width), mirrored=True)
+        model, data, T_world_ee = simulator.sim.model._model, simulator.sim.data._data, simulator.ee_pose()
+        size = height, width
+        found = calibration(model, data, CAMERAS, CAMERA_MOUNTS, T_world_ee, size, mirrored=True)
         simulator.close()
         return found

@@ -1,5 +1,8 @@
 """The tabletop as a suite to record."""
 
+# mujoco ships no stubs for its compiled part.
+# pyright: reportAttributeAccessIssue=false
+
 from collections.abc import Mapping
 from typing import Any
 
@@ -82,5 +85,6 @@ class Tabletop:
         # Where the bodies and cameras are is all that is needed: nothing was placed yet, so all overlap.
         mujoco.mj_kinematics(simulator.model, simulator.data)
         mujoco.mj_camlight(simulator.model, simulator.data)
-        cameras = {name: (name, mount) for name, mount in CAMERA_MOUNTS.items()}
-        return calibration(simulator.model, simulator.data, cameras, simulator.ee_pose(), (height, width))
+        names = {name: name for name in CAMERA_NAMES}
+        model, data, T_world_ee = simulator.model, simulator.data, simulator.ee_pose()
+        return calibration(model, data, names, CAMERA_MOUNTS, T_world_ee, (height, width))
