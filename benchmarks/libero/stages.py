@@ -10,8 +10,8 @@ from typing import Any
 from benchmarks.common import known
 from benchmarks.libero.evaluate import EvaluationConfig, evaluate
 
-from lerobot_openspm.cli.collect import SUMMARY_FILE
 from lerobot_openspm.cli.pipeline import collect_dataset, train
+from lerobot_openspm.envs.collection import SUMMARY_FILE
 from lerobot_openspm.envs.libero.simulator import tasks
 from lerobot_openspm.types import Execution
 

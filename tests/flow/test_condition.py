@@ -52,7 +52,7 @@ def test_an_answer_of_the_equivariant_model_turns_with_the_scene(G, T_target, sh
 @given(transforms(), transforms(), st.sampled_from(list(CONDITION_DIM)))
 def test_executing_a_turned_answer_in_a_turned_scene_leads_to_the_turned_place(G, T_ee, conditioning):
     """The whole loop: what the model answers in its frame moves the hand alike, wherever the scene is."""
-    T_target = T_ee @ se3.from_position_rotvec([0.1, 0.2, 0.3], [0.2, 0.1, 0.4])
+    T_target = T_ee @ se3.transform(se3.exp_so3([0.2, 0.1, 0.4]), [0.1, 0.2, 0.3])
     answer = to_model_frame(np.append(se3.increment(T_ee, T_target), 1.0), T_target, "equivariant")
     step = to_world_frame(answer, G @ T_target, "equivariant")[:6]
     assert_allclose(se3.apply_increment(G @ T_ee, step), G @ T_target, atol=1e-7)
@@ -104,7 +104,7 @@ def test_the_papers_condition_by_hand():
 @pytest.mark.parametrize("batch", [(), (1,), (4,), (2, 3)])
 def test_conditions_are_batched(conditioning, batch):
     rng = np.random.default_rng(0)
-    T = se3.from_position_rotvec(rng.normal(size=(2, *batch, 3)), rng.normal(size=(2, *batch, 3)))
+    T = se3.transform(se3.exp_so3(rng.normal(size=(2, *batch, 3))), rng.normal(size=(2, *batch, 3)))
     numbers = rng.uniform(size=(3, *batch))
     whole = Query(T[0], T[1], *numbers, rng.integers(len(PHASES), size=batch))
     out = encode(whole, conditioning)

@@ -7,8 +7,8 @@ import pytest
 from tests.policy.lerobot_commands import REPOSITORY
 
 from lerobot_openspm.cli import pipeline
-from lerobot_openspm.cli.collect import CollectConfig, SimulatorConfig, collect
 from lerobot_openspm.configuration_openspm import OpenSPMConfig
+from lerobot_openspm.envs.collection import CollectConfig, SimulatorConfig, collect
 from lerobot_openspm.envs.seeds import TUNING_SEED_START
 
 # Something carried, and something turned. Nobody is tuned on these seeds.
