@@ -109,11 +109,12 @@ def actions(trained: Trained, options: Options) -> Any:
 def actions_after_a_change(trained: Trained, options: Options) -> Any:
     """... when the pictures show another layout from the second observation on."""
     before, after = trained.recorded[:2]
-    mixed = [before[0]] + [
+    moved = [
         {key: later[key] if "images" in key else frame[key] for key in frame}
         for frame, later in zip(before[1:], after[1:], strict=True)
     ]
-    return act(trained.with_options(options), [mixed]).tolist()
+    # What has jumped aside is believed at the second look.
+    return act(trained.with_options(options), [[before[0], *moved, *moved]]).tolist()
 
 
 def refusal(trained: Trained, options: Options) -> Any:
@@ -131,7 +132,7 @@ def status_far_away(trained: Trained, options: Options) -> Any:
     policy = trained.with_options(options)
     memory = policy.require_memory()
     (name,) = options
-    shift = [0, 0, 0.5] if name == "min_clearance_m" else [0.5, 0, 0]
+    shift = [0, 0, 2] if name == "min_clearance_m" else [2, 0, 0]
     robot = replace(memory.robot, workspace=memory.robot.workspace + shift)
     policy.memory = replace(memory, robot=robot)
     act(policy, trained.recorded[:1])
@@ -278,8 +279,8 @@ CASES = {
     "samples_per_frame": Case(loss, 1, 2),
     "noise_seed": Case(actions, 0, 1),
     "execution": Case(actions, "closed_loop_trc", "open_loop"),
-    "reach_margin_m": Case(status_far_away, 0.1, 2.0),
-    "min_clearance_m": Case(status_far_away, 0.01, 2.0),
+    "reach_margin_m": Case(status_far_away, 0.1, 3.0),
+    "min_clearance_m": Case(status_far_away, 0.01, 3.0),
 }
 
 
