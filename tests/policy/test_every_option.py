@@ -219,7 +219,7 @@ def judgement(trained: Trained, options: Options) -> Any:
         base = second.api_base if second_is_asked else chat.api_base
         asked = {"judge.type": "openai", "judge.model_id": "tiny-vl", **options, "judge.api_base": base}
         demonstrations, robot = processor.demonstrations, trained.mined.robot
-        (found,) = training.judged(demonstrations, (unsure,), robot, config(asked))
+        (found,) = training.labelled(demonstrations, (unsure,), robot, config(asked))
     models = [[request["model"] for request in server.requests] for server in (chat, second)]
     return models, [pose.confidence for pose in found.key_poses]
 
