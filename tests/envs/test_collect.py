@@ -84,6 +84,40 @@ def test_an_interrupted_recording_goes_on_where_it_stopped(tmp_path, monkeypatch
     assert [e["task"] for e in recorded["episodes"]] == ["turn_on_stove", "bowl_on_plate"]
 
 
+def test_an_interrupted_task_goes_on_with_the_next_episode(tmp_path, monkeypatch):
+    from lerobot.datasets.lerobot_dataset import LeRobotDataset
+
+    root, seeds = tmp_path / "demos", []
+    config = CollectConfig(
+        SimulatorConfig(task="turn_on_stove"), 2, str(root), height=128, width=128, workers=0
+    )
+
+    def interrupted_once(scene, task, seed):
+        seeds.append(seed)
+        if len(seeds) == 2:
+            raise KeyboardInterrupt
+        return record(scene, task, seed)
+
+    monkeypatch.setattr(collection, "record", interrupted_once)
+    with pytest.raises(KeyboardInterrupt):
+        collect(config)
+    assert collect(config)["episodes"] == 2
+    first = seeds[0]
+    assert seeds == [first, first + 1, first + 1]
+    recorded = json.loads((root / "meta/openspm_collect.json").read_text())
+    assert [e["seed"] for e in recorded["episodes"]] == [first, first + 1]
+
+    dataset = LeRobotDataset("local/openspm_tabletop", root=root)
+    assert dataset.num_episodes == 2
+    for number, seed in enumerate((first, first + 1)):
+        frame = dataset[dataset.meta.episodes[number]["dataset_from_index"] + 5]
+        episode = stove_episode(seed)
+        assert frame["episode_index"] == number
+        np.testing.assert_array_equal(frame["action"], episode.columns["action"][5])
+        shown = frame["observation.images.front"].numpy().transpose(1, 2, 0) * 255
+        assert np.abs(shown - episode.images["front"][5]).mean() < 1.5
+
+
 @pytest.mark.slow  # each process imports LeRobot
 def test_two_processes_record_what_one_does(tmp_path, tiny_dataset):
     def recorded(root):

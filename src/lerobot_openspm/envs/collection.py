@@ -17,7 +17,14 @@ from typing import Any
 
 from tqdm import tqdm
 
-from lerobot_openspm.envs.dataset import create_dataset, merge, quiet_libraries, write_episode
+from lerobot_openspm.envs.dataset import (
+    create_dataset,
+    merge,
+    quiet_libraries,
+    resume_dataset,
+    video_encoder,
+    write_episode,
+)
 from lerobot_openspm.envs.recording import record
 from lerobot_openspm.envs.seeds import DEMO_SEED_START, require_demo_seeds
 from lerobot_openspm.envs.suites import find_suite
@@ -26,8 +33,9 @@ from lerobot_openspm.files import write_json
 logger = logging.getLogger(__name__)
 
 SUMMARY_FILE = "meta/openspm_collect.json"
-# Marks a task's part as complete, and what a folder of parts is being made for.
-PART_FILE, PARTS_FILE = "meta/openspm_part.json", "openspm_collect.json"
+# Marks a task's part as complete, or as interrupted between two episodes; what a folder of parts is made for.
+PART_FILE, INTERRUPTED_FILE = "meta/openspm_part.json", "meta/openspm_interrupted.json"
+PARTS_FILE = "openspm_collect.json"
 # Every task has its own stretch of seeds, so that no two tasks show the same initial states.
 SEEDS_PER_TASK = 10_000
 # An expert that fails more often than this is broken, and collecting on would only hide it.
@@ -92,8 +100,9 @@ def collect(config: CollectConfig) -> dict[str, Any]:
     """Record the demonstrations and return {"episodes", "frames", "discarded", "root", "seconds"}.
 
     Every task is recorded as a dataset of its own beside `root`; when all are there they are merged and moved
-    to their place. An interrupted recording goes on with the tasks that were not complete. A complete one
-    with the same settings is left alone.
+    to their place. A recording that Ctrl-C interrupted goes on with the episode that was being recorded; one
+    that was killed goes on with the tasks that were not complete. A complete one with the same settings is
+    left alone.
 
     Raises:
         FileExistsError: `root` holds something that this command did not write, or wrote with other settings.
@@ -209,15 +218,28 @@ def record_part(config: CollectConfig, task: str, root: Path, done: Callable[[st
         RuntimeError: The expert failed too often.
     """
     suite, size = find_suite(config.env.type), (config.height, config.width)
-    seed = config.seed + SEEDS_PER_TASK * suite.tasks("all").index(task)
-    shutil.rmtree(root, ignore_errors=True)
-    kept: list[dict[str, Any]] = []
-    discarded: list[dict[str, Any]] = []
+    encoder = video_encoder(config.vcodec, config.pix_fmt, config.crf)
+    interrupted, attempts = root / INTERRUPTED_FILE, {"episodes": [], "discarded": []}
     with quiet_libraries(), contextlib.closing(suite.scene(task, *size)) as scene:
-        dataset = create_dataset(suite, config.repo_id, root, size, config.vcodec, config.pix_fmt, config.crf)
+        if interrupted.is_file():
+            attempts = json.loads(interrupted.read_text(encoding="utf-8"))
+            dataset = resume_dataset(config.repo_id, root, encoder)
+            interrupted.unlink()
+        else:
+            shutil.rmtree(root, ignore_errors=True)
+            dataset = create_dataset(suite, config.repo_id, root, size, encoder)
+        kept, discarded = attempts["episodes"], attempts["discarded"]
+        first_seed = config.seed + SEEDS_PER_TASK * suite.tasks("all").index(task)
+        for _ in kept:
+            done(task)
         while len(kept) < config.episodes:
-            episode = record(scene, task, seed)
-            seed += 1
+            try:
+                episode = record(scene, task, first_seed + len(kept) + len(discarded))
+            except KeyboardInterrupt:
+                if kept:
+                    dataset.finalize()
+                    write_json(interrupted, attempts)
+                raise
             (kept if episode.success else discarded).append(episode.about())
             if episode.success:
                 write_episode(dataset, episode)
@@ -228,4 +250,4 @@ def record_part(config: CollectConfig, task: str, root: Path, done: Callable[[st
                     "were wanted; this task was not kept"
                 )
         dataset.finalize()
-    write_json(root / PART_FILE, {"episodes": kept, "discarded": discarded})
+    write_json(root / PART_FILE, attempts)

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 from lerobot_openspm.envs.recording import RecordedEpisode, Suite
 
 if TYPE_CHECKING:
+    from lerobot.configs.video import RGBEncoderConfig
     from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
 FPS = 20
@@ -19,21 +20,35 @@ FPS = 20
 PRESETS: dict[str, str | int] = {"h264": "veryfast", "libsvtav1": 10}
 
 
+# Nothing is read back while recording, but naming a decoder spares the search for another one. A full queue
+# drops frames; one that holds the longest episode never is.
+WRITING: dict[str, Any] = {
+    "video_backend": "pyav",
+    "streaming_encoding": True,
+    "encoder_queue_maxsize": 1000,
+    "encoder_threads": 1,
+}
+
+
+def video_encoder(vcodec: str, pix_fmt: str, crf: int) -> RGBEncoderConfig:
+    """How videos are encoded: codec, pixel format, constant rate factor."""
+    from lerobot.configs.video import RGBEncoderConfig
+
+    return RGBEncoderConfig(vcodec=vcodec, pix_fmt=pix_fmt, crf=crf, preset=PRESETS.get(vcodec))
+
+
 def create_dataset(
-    suite: Suite, repo_id: str, root: Path, size: tuple[int, int], vcodec: str, pix_fmt: str, crf: int
+    suite: Suite, repo_id: str, root: Path, size: tuple[int, int], encoder: RGBEncoderConfig
 ) -> LeRobotDataset:
-    """Begin a dataset of a suite's episodes.
+    """Begin a dataset of a suite's episodes in a folder that does not exist.
 
     Args:
         suite: What is recorded.
         repo_id: The dataset's name.
-        root: Its folder, which must not exist.
+        root: Its folder.
         size: Height and width of the images.
-        vcodec: The videos' codec.
-        pix_fmt: Their pixel format.
-        crf: Their constant rate factor.
+        encoder: How its videos are encoded.
     """
-    from lerobot.configs.video import RGBEncoderConfig
     from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
     return LeRobotDataset.create(
@@ -43,14 +58,16 @@ def create_dataset(
         root=root,
         robot_type=suite.robot_type,
         use_videos=True,
-        # Nothing is read back here; naming a decoder spares the search for another one.
-        video_backend="pyav",
-        rgb_encoder=RGBEncoderConfig(vcodec=vcodec, pix_fmt=pix_fmt, crf=crf, preset=PRESETS.get(vcodec)),
-        streaming_encoding=True,
-        # A full queue drops frames; one that holds the longest episode never is.
-        encoder_queue_maxsize=1000,
-        encoder_threads=1,
+        rgb_encoder=encoder,
+        **WRITING,
     )
+
+
+def resume_dataset(repo_id: str, root: Path, encoder: RGBEncoderConfig) -> LeRobotDataset:
+    """Append to a dataset that was finalized."""
+    from lerobot.datasets.lerobot_dataset import LeRobotDataset
+
+    return LeRobotDataset.resume(repo_id, root, rgb_encoder=encoder, **WRITING)
 
 
 def _features(suite: Suite, size: tuple[int, int]) -> dict[str, dict[str, Any]]:
