@@ -14,8 +14,8 @@ from lerobot_openspm.errors import OpenSPMError
 from lerobot_openspm.geometry.camera import load_cameras
 from lerobot_openspm.memory.entry import MemoryEntry
 from lerobot_openspm.memory.exchange import combined, read_parcel
-from lerobot_openspm.memory.files import changing
-from lerobot_openspm.memory.memory import Memory, read_memory, write_memory
+from lerobot_openspm.memory.io import changing, read_memory, write_memory
+from lerobot_openspm.memory.memory import Memory
 from lerobot_openspm.memory.merging import merge_near_duplicates
 from lerobot_openspm.memory.quality import with_outcome
 

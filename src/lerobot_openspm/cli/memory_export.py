@@ -10,7 +10,7 @@ import draccus
 
 from lerobot_openspm.errors import OpenSPMError
 from lerobot_openspm.memory.exchange import write_entries_file
-from lerobot_openspm.memory.memory import read_memory, write_memory
+from lerobot_openspm.memory.io import read_memory, write_memory
 
 
 @dataclass

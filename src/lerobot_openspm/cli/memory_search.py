@@ -12,7 +12,7 @@ import draccus
 from lerobot_openspm.cli.memory_show import check_limit
 from lerobot_openspm.errors import OpenSPMError
 from lerobot_openspm.language.names import TABLE_NAMES, NameSimilarity, names_from
-from lerobot_openspm.memory.memory import read_memory
+from lerobot_openspm.memory.io import read_memory
 from lerobot_openspm.memory.retrieval import ScoreWeights
 from lerobot_openspm.search import Found, Hit, observation_of, search_memory, search_scene
 from lerobot_openspm.types import Reference, SubTask

@@ -14,7 +14,7 @@ import numpy as np
 from lerobot_openspm.errors import OpenSPMError
 from lerobot_openspm.geometry import se3
 from lerobot_openspm.memory.entry import MemoryEntry, MemoryKeyPose, Outcome
-from lerobot_openspm.memory.memory import read_memory
+from lerobot_openspm.memory.io import read_memory
 
 
 @dataclass

@@ -7,28 +7,47 @@ import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
+import msgspec
 import numpy as np
 
 from lerobot_openspm.errors import MemoryFormatError
 from lerobot_openspm.files import write_beside
-from lerobot_openspm.memory.bank import anchored_objects, entry_to_json
+from lerobot_openspm.memory.bank import anchored_objects
 from lerobot_openspm.memory.entry import MemoryEntry
-from lerobot_openspm.memory.fields import MALFORMED, known, text
-from lerobot_openspm.memory.files import MAX_JSON_BYTES, VERSION, Fields, read_bytes
-from lerobot_openspm.memory.header import header_from_fields, header_to_fields
-from lerobot_openspm.memory.memory import Memory, header_of, read_memory
+from lerobot_openspm.memory.io import read_memory
+from lerobot_openspm.memory.memory import Memory
 from lerobot_openspm.memory.merging import SOURCES
-from lerobot_openspm.memory.store import entry_from_fields
-from lerobot_openspm.memory.strict_json import loads
+from lerobot_openspm.memory.schema import (
+    VERSION,
+    Name,
+    Origin,
+    checked,
+    entry_from_fields,
+    entry_to_json,
+    loads,
+    memory_from,
+    origin_of,
+    record_of,
+)
 from lerobot_openspm.perception.objects.model import KnownObject
 from lerobot_openspm.perception.objects.store import to_parts as object_to_parts
 
 FORMAT = "openspm-entries"
-NAMES = (
-    "format", "version", "perception", "segmentation", "shape", "simulator_objects", "layouts", "robot",
-    "objects", "entries",
-)  # fmt: skip
+MAX_FILE_BYTES = 512_000_000
+
+
+class EntriesFile(Origin):
+    """A file of entries.
+
+    Attributes:
+        objects: By name, :func:`digest` of the model of every object that the entries have key poses at.
+        entries: The entries, each as :func:`~lerobot_openspm.memory.schema.entry_to_json` writes it.
+    """
+
+    objects: dict[Name, str]
+    entries: list[Any]
 
 
 @dataclass(frozen=True)
@@ -58,12 +77,13 @@ def digest(model: KnownObject) -> str:
 def write_entries_file(memory: Memory, path: Path) -> None:
     """Write the entries of a memory as one JSON file, an entry on every line."""
     names = anchored_objects(memory.entries) & memory.objects.keys()
-    fields = header_to_fields(header_of(memory, []))
-    fields["format"] = FORMAT
-    fields["objects"] = {name: digest(memory.objects[name]) for name in sorted(names)}
-    head = json.dumps({name: fields[name] for name in NAMES if name != "entries"}, indent=1, allow_nan=False)
+    objects = {name: digest(memory.objects[name]) for name in sorted(names)}
+    fields = {**origin_of(memory, FORMAT), "objects": objects, "entries": []}
+    origin = msgspec.to_builtins(record_of(fields, EntriesFile, "the file"))
+    del origin["entries"]
+    head = json.dumps(origin, indent=1, ensure_ascii=False).removesuffix("\n}").encode()
     lines = b",\n".join(map(entry_to_json, memory.entries))
-    write_beside(path, head.removesuffix("\n}").encode() + b',\n "entries": [\n' + lines + b"\n ]\n}\n")
+    write_beside(path, head + b',\n "entries": [\n' + lines + b"\n ]\n}\n")
 
 
 def read_parcel(path: Path) -> EntryImport:
@@ -71,55 +91,30 @@ def read_parcel(path: Path) -> EntryImport:
 
     Raises:
         MemoryFormatError: There is none, or it is malformed. Names file and field.
-        CalibrationError: The memory's calibration is not its own.
+        CalibrationError: The memory's calibration is malformed.
     """
     if path.is_dir():
         memory = read_memory(path)
-        digests = {name: digest(model) for name, model in memory.objects.items()}
-        return EntryImport(memory, digests, is_edited=False)
-    return _read_entries_file(path)
-
-
-def _read_entries_file(path: Path) -> EntryImport:
+        return EntryImport(memory, {name: digest(memory.objects[name]) for name in memory.objects}, False)
     if not path.is_file():
         raise MemoryFormatError(
             f"nothing at {path}; expected a checkpoint's folder, or a file that `openspm memory export` wrote"
         )
-    fields = loads(read_bytes(path, MAX_JSON_BYTES), str(path))
-    if not isinstance(fields, dict) or fields.get("format") != FORMAT or fields.get("version") != VERSION:
-        got = (
-            {name: fields.get(name) for name in ("format", "version")} if isinstance(fields, dict) else fields
-        )
+    if (size := path.stat().st_size) > MAX_FILE_BYTES:
         raise MemoryFormatError(
-            f"{path}: got {str(got)[:100]}, expected format {FORMAT!r} and version {VERSION}, as "
+            f"{path}: {size} bytes, expected up to {MAX_FILE_BYTES}; export fewer entries"
+        )
+    fields = loads(path.read_bytes(), str(path))
+    got = [fields.get(name) for name in ("format", "version")] if isinstance(fields, dict) else [fields]
+    if got != [FORMAT, VERSION]:
+        raise MemoryFormatError(
+            f"{path}: got format and version {str(got)[:100]}, expected {FORMAT!r} and {VERSION}, as "
             "`openspm memory export` writes it"
         )
-    try:
-        known(fields, NAMES, "the file")
-        objects = known(fields["objects"], fields["objects"], "'objects'")
-        digests = {name: text(objects, name) for name in objects}
-        rows = fields["entries"]
-        if not isinstance(rows, list):
-            raise ValueError("'entries' must be a list")
-    except MALFORMED as error:
-        raise MemoryFormatError(f"{path}: malformed: {error!r}") from error
-    own = {name: fields[name] for name in NAMES if name in fields and name not in ("objects", "entries")}
-    header = header_from_fields(
-        {**own, "objects": [], "n_entries": 0, "anchored": [], "files": {}}, str(path)
-    )
-    entries = tuple(_entry(row, f"{path}: entries[{i}]") for i, row in enumerate(rows))
-    memory = Memory(
-        entries, {}, header.robot, {}, header.perception, header.simulator_objects, header.segmentation,
-        header.shape, header.layouts,
-    )  # fmt: skip
-    return EntryImport(memory, digests, is_edited=True)
-
-
-def _entry(fields: Fields, where: str) -> MemoryEntry:
-    try:
-        return entry_from_fields(fields)
-    except MALFORMED as error:
-        raise MemoryFormatError(f"{where} is malformed: {error!r}") from error
+    file = checked(fields, EntriesFile, str(path))
+    entries = tuple(entry_from_fields(e, f"{path}: entries[{i}]") for i, e in enumerate(file.entries))
+    memory = memory_from(file, str(path), entries=entries, objects={}, cameras={})
+    return EntryImport(memory, file.objects, is_edited=True)
 
 
 def combined(ours: Memory, parcel: EntryImport, where: str) -> tuple[Memory, int]:
