@@ -212,8 +212,8 @@ def test_what_was_merged_or_removed_is_not_added_again(openspm: Openspm, memory:
     write_memory(made(), other)  # its entries have no outcomes, so are not quite what was merged
     run(openspm, memory, "export", f"--output={file}")
     run(openspm, memory, "merge")
-    for parcel in (other, file):
-        again = run(openspm, memory, "add", f"--other={parcel}")
+    for source in (other, file):
+        again = run(openspm, memory, "add", f"--other={source}")
         assert again == {"entries": 2, "superseded": 2, "added": 0, "unchanged": 3}
     # Also where nothing is known of how the merged entry came about.
     run(openspm, memory, "export", f"--output={merged}")

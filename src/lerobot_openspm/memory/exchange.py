@@ -86,7 +86,7 @@ def write_entries_file(memory: Memory, path: Path) -> None:
     write_beside(path, head + b',\n "entries": [\n' + lines + b"\n ]\n}\n")
 
 
-def read_parcel(path: Path) -> EntryImport:
+def read_import(path: Path) -> EntryImport:
     """Read entries from a memory's folder or from a file that :func:`write_entries_file` wrote.
 
     Raises:
@@ -117,23 +117,20 @@ def read_parcel(path: Path) -> EntryImport:
     return EntryImport(memory, file.objects, is_edited=True)
 
 
-def combined(ours: Memory, parcel: EntryImport, where: str) -> tuple[Memory, int]:
-    """A memory with the entries of a parcel that it does not hold yet.
+def combined(ours: Memory, imported: EntryImport, where: str) -> Memory:
+    """A memory with the imported entries that it does not hold yet; what they replace is superseded.
 
     Args:
-        ours: The memory.
-        parcel: What is added.
-        where: Names the parcel in errors.
-
-    Returns:
-        The memory afterwards, and how many entries are new or newer. What they replace is superseded.
+        ours: The memory. Where nothing is new, it is returned itself.
+        imported: What is added.
+        where: Names their origin in errors.
 
     Raises:
-        MemoryFormatError: The parcel comes from another robot, from another perception, or has key poses in
+        MemoryFormatError: It comes from another robot, from another perception, or has key poses in
             the frames of other models of objects. Or it is a file with two entries of one source and
             instruction, or with an edited entry that was merged into another one.
     """
-    theirs = parcel.memory
+    theirs = imported.memory
     for name in ("perception", "segmentation", "shape", "simulator_objects"):
         mine, other = getattr(ours, name), getattr(theirs, name)
         if mine != other:
@@ -141,17 +138,20 @@ def combined(ours: Memory, parcel: EntryImport, where: str) -> tuple[Memory, int
                 f"{where}: {name} is {other!r}, the memory's {mine!r}: its key poses are in other frames. "
                 "Mine its demonstrations into this memory: openspm teach, or --policy.memory_update=append"
             )
-    _check_objects(ours, parcel, where)
-    if parcel.is_edited:
+    _check_objects(ours, imported, where)
+    if imported.is_edited:
         _check_twice(theirs.entries, where)
-    new = _not_held(ours, parcel, where)
-    if parcel.is_edited:
-        return _with_edited(ours, new, theirs), len(new)
-    return ours.appended(replace(theirs, entries=new, superseded=())), len(new)
+    new = _not_held(ours, imported, where)
+    after = (
+        _with_edited(ours, new, theirs)
+        if imported.is_edited
+        else ours.appended(replace(theirs, entries=new, superseded=()))
+    )
+    return after if new else ours
 
 
-def _not_held(ours: Memory, parcel: EntryImport, where: str) -> tuple[MemoryEntry, ...]:
-    """The entries of a parcel that a memory does not hold: neither as they are, nor within merged ones.
+def _not_held(ours: Memory, imported: EntryImport, where: str) -> tuple[MemoryEntry, ...]:
+    """The imported entries that a memory does not hold: neither as they are, nor within merged ones.
 
     From another memory, nothing is taken that this one has superseded: what was replaced, merged or removed
     stays so until it is restored. A file that people edit may well bring back what an entry was before.
@@ -160,11 +160,11 @@ def _not_held(ours: Memory, parcel: EntryImport, where: str) -> tuple[MemoryEntr
     superseded = {entry_to_json(entry) for entry in ours.superseded}
     merged = {(part, e.key): e.source for e in ours.entries for part in _merged_sources(e)}
     new: list[MemoryEntry] = []
-    for i, entry in enumerate(parcel.memory.entries):
+    for i, entry in enumerate(imported.memory.entries):
         text, within = entry_to_json(entry), merged.get((entry.source, entry.key))
-        if text in held or (text in superseded and (within or not parcel.is_edited)):
+        if text in held or (text in superseded and (within or not imported.is_edited)):
             continue
-        if within and parcel.is_edited:
+        if within and imported.is_edited:
             raise MemoryFormatError(
                 f"{where}: entries[{i}] is an edited {entry.source!r}, which is part of the merged entry "
                 f"{within!r} by now; export and edit that one, or remove it and restore what it was made of"
@@ -204,9 +204,9 @@ def _with_edited(ours: Memory, new: Sequence[MemoryEntry], theirs: Memory) -> Me
     return replace(rest, superseded=(*ours.superseded, *gone))
 
 
-def _check_objects(ours: Memory, parcel: EntryImport, where: str) -> None:
+def _check_objects(ours: Memory, imported: EntryImport, where: str) -> None:
     """Every object that entries have key poses at has to be known by the same model, or to come along."""
-    theirs = parcel.memory
+    theirs = imported.memory
     for name in sorted(anchored_objects(theirs.entries)):
         model = ours.objects.get(name)
         if model is None and name not in theirs.objects and ours.perception != "oracle":
@@ -214,7 +214,7 @@ def _check_objects(ours: Memory, parcel: EntryImport, where: str) -> None:
                 f"{where}: entries have key poses at {name!r}, which the memory knows no model of; it knows "
                 f"{', '.join(sorted(ours.objects))}. Add from the checkpoint's folder, which holds the models"
             )
-        if model is not None and parcel.digests.get(name) != digest(model):
+        if model is not None and imported.digests.get(name) != digest(model):
             raise MemoryFormatError(
                 f"{where}: 'objects': {name!r} is known by another model there, so its key poses are in "
                 "another frame. Mine its demonstrations into this memory: openspm teach, or "

@@ -47,10 +47,8 @@ from lerobot_openspm.perception.objects.store import to_parts as object_to_parts
 
 FORMAT = "openspm-memory"
 MEMORY_JSON, ARRAYS, LOCK = "memory.json", "memory-{}.safetensors", ".memory.lock"
-# Also files of earlier releases, and what interrupted saves have left.
-LEFTOVER = re.compile(
-    r"memory-[0-9a-f]{64}\.safetensors|memory\.(entries|arrays|cameras)-.*|\.memory\..*partial"
-)
+# The arrays of other saves, and what interrupted ones have left.
+LEFTOVER = re.compile(r"memory-[0-9a-f]{64}\.safetensors|\.memory[.-].*\.partial")
 # Line breaks are none within JSON texts, so these stand in no name.
 SEAL, ENTRIES = b',\n "sha256": "', b'",\n "entries": [\n'
 BEGINNING = re.compile(rb'\{\s*"format":\s*"openspm-memory",\s*"version":\s*(\d{1,9})\b')
