@@ -1,8 +1,8 @@
 """The entries of a memory as lines of one file, each read and checked when it is asked for.
 
-Of every entry the end of its line, a digest, and what it is found by are kept as columns beside the file, so
-that a memory of a million entries is loaded without reading them, and no line that was changed or damaged is
-read unnoticed.
+Columns beside the file hold the end of each entry's line, a digest of the line, and what the entry is found
+by. So a memory of a million entries is loaded without reading them, and a changed or damaged line is noticed
+when it is read.
 """
 
 from __future__ import annotations
@@ -11,6 +11,7 @@ import hashlib
 import json
 import os
 import weakref
+from array import array
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, fields
 from functools import lru_cache
@@ -28,7 +29,7 @@ from lerobot_openspm.types import SubTask
 BETWEEN, TAIL = b",\n", b"\n ]\n}\n"
 DIGEST_BYTES = 16
 MAX_LINE_BYTES = 4_000_000
-# So many of the entries read last are kept in memory.
+# The entries read last stay in memory, up to this many.
 KEPT_ENTRIES = 4096
 
 Key = tuple[SubTask, ...]
@@ -89,9 +90,9 @@ class Columns:
 
 
 class OpenFile:
-    """A file that is read here and there, and closed when nobody has it any more.
+    """A file that is read at any place, and closed with its last user.
 
-    It is not mapped: reading a mapped file that somebody has truncated ends the process.
+    It is not mapped into memory: reading a mapped file that was truncated kills the process.
 
     Raises:
         OSError: It cannot be opened.
@@ -104,7 +105,7 @@ class OpenFile:
         self.n_bytes = os.fstat(self._descriptor).st_size
 
     def read(self, start: int, n_bytes: int) -> bytes:
-        """So many bytes from a place on; fewer where the file ends."""
+        """Up to `n_bytes` bytes from `start`; fewer at the end of the file."""
         try:
             return os.pread(self._descriptor, n_bytes, start)
         except OSError as error:
@@ -158,7 +159,7 @@ class EntryBank(Sequence[MemoryEntry]):
         return self._entry(self._rows[index])
 
     def __iter__(self) -> Iterator[MemoryEntry]:
-        # Past the cache: going through all entries must neither hold them all nor push out those in use.
+        # Without the cache: a pass over all entries must not hold them all, nor push out those in use.
         return (self._read(row) for row in self._rows)
 
     def __deepcopy__(self, _: dict[int, Any]) -> EntryBank:
@@ -182,7 +183,7 @@ class EntryBank(Sequence[MemoryEntry]):
         return np.arange(self._rows.start, self._rows.stop, self._rows.step)
 
     def lines(self) -> Iterator[tuple[bytes, int, float]]:
-        """Each entry's JSON, unread but known to be what was written, its key's digest and its quality."""
+        """Each entry's JSON, checked against its digest but not parsed; its key's digest and its quality."""
         for row in self._rows:
             yield self._text(row), int(self._columns.keys[row]), float(self._columns.qualities[row])
 
@@ -231,10 +232,8 @@ def write_entries(file: BinaryIO, groups: Sequence[Sequence[MemoryEntry]]) -> Co
     Raises:
         MemoryFormatError: An entry could not be read again.
     """
-    ends, position = [], -len(BETWEEN)
-    digests: list[bytes] = []
-    keys: list[int] = []
-    qualities: list[float] = []
+    ends, digests, keys, qualities = array("q"), bytearray(), array("Q"), array("d")
+    position = -len(BETWEEN)
     for text, key, quality in (line for group in groups for line in _lines(group)):
         if len(text) > MAX_LINE_BYTES:
             raise MemoryFormatError(
@@ -245,16 +244,20 @@ def write_entries(file: BinaryIO, groups: Sequence[Sequence[MemoryEntry]]) -> Co
         file.write(BETWEEN + text if ends else text)
         position += len(BETWEEN) + len(text)
         ends.append(position)
-        digests.append(_digest(text))
+        digests += _digest(text)
         keys.append(key)
         qualities.append(quality)
     file.write(TAIL)
-    rows = np.frombuffer(b"".join(digests), np.uint8).reshape(-1, DIGEST_BYTES)
-    return Columns(np.array(ends, np.int64), rows, np.array(keys, np.uint64), np.array(qualities, float))
+    return Columns(
+        np.array(ends, np.int64),
+        np.frombuffer(digests, np.uint8).reshape(-1, DIGEST_BYTES),
+        np.array(keys, np.uint64),
+        np.array(qualities, np.float64),
+    )
 
 
 def _lines(entries: Sequence[MemoryEntry]) -> Iterator[tuple[bytes, int, float]]:
-    if isinstance(entries, EntryBank):  # what lies in a file already is taken from there as it is
+    if isinstance(entries, EntryBank):  # their lines are copied, not parsed
         return entries.lines()
     return ((entry_to_json(e), key_digest(e.key.sub_tasks), e.quality) for e in entries)
 

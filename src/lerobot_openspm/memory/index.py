@@ -17,12 +17,12 @@ from lerobot_openspm.memory.key_vector import DIMENSIONS, Vectors
 
 logger = logging.getLogger(__name__)
 
-# Up to so many vectors all are compared.
+# Up to this many vectors, a query is compared with all of them.
 EXACT_LIMIT = 200_000
-# The number of lists grows with the root of that of vectors; a query looks into so many of them. Of a million
-# vectors in 1500 lists 32,000 are compared.
+# The number of lists grows with the square root of the number of vectors; a query looks into _PROBES lists.
+# Of a million vectors in 1500 lists, 32,000 are compared.
 _LISTS_PER_ROOT, _PROBES = 1.5, 48
-# Samples and rounds that the lists' centres are found with.
+# Samples and iterations of the k-means that finds the centres of the lists.
 _SAMPLES_PER_LIST, _ROUNDS = 40, 5
 
 Indices = NDArray[np.int64]
@@ -103,7 +103,7 @@ class FaissIndex:
 
 
 def make_index(vectors: Vectors, where: str = "the memory") -> KeyIndex:
-    """The index for so many vectors: exact up to :data:`EXACT_LIMIT`, FAISS's beyond if it is installed.
+    """The index for a number of vectors: exact up to :data:`EXACT_LIMIT`, FAISS's beyond if it is installed.
 
     Args:
         vectors: Unit vectors ``(n, 64)``.

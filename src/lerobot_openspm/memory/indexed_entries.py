@@ -18,11 +18,11 @@ from lerobot_openspm.memory.index import make_index
 from lerobot_openspm.memory.key_vector import key_vectors
 from lerobot_openspm.types import SubTask
 
-# Banks of more entries are indexed; to score fewer takes no longer than a look at the scene.
+# Banks of more entries are indexed; scoring fewer takes no longer than perception.
 INDEX_FROM = 1000
-# Keys that the index finds for each part of an instruction.
+# Keys that the index returns for each part of an instruction.
 NEAREST_KEYS = 64
-# Of the entries of one key, so many are handed on, the best by quality; and so many in all.
+# Entries that are returned per key, the best by quality first, and in total.
 ENTRIES_PER_KEY, ENTRIES_IN_ALL = 64, 256
 
 # S_sem of what is asked and what is known.

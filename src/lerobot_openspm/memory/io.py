@@ -1,9 +1,8 @@
 """Reading and writing a memory: ``memory.json``, and the arrays that it names.
 
-``memory.json`` starts with what is known besides the entries, ends with the entries, one on every line, and
-is read by people as well. The arrays are in a safetensors file whose name is its checksum, so that the file
-of the memory before is still there when ``memory.json`` is renamed into place. That renaming is the one
-moment in which a memory changes.
+``memory.json`` holds the header first, then the entries, one on every line, so that people can read it too.
+The arrays are in a safetensors file whose name is its checksum: saving never overwrites the arrays of the
+memory before. Renaming ``memory.json`` into place is the one moment in which a memory changes.
 """
 
 from __future__ import annotations
@@ -47,14 +46,16 @@ from lerobot_openspm.perception.objects.store import to_parts as object_to_parts
 
 FORMAT = "openspm-memory"
 MEMORY_JSON, ARRAYS, LOCK = "memory.json", "memory-{}.safetensors", ".memory.lock"
-# The arrays of other saves, and what interrupted ones have left.
+# The arrays of earlier saves, and what interrupted saves have left.
 LEFTOVER = re.compile(r"memory-[0-9a-f]{64}\.safetensors|\.memory[.-].*\.partial")
-# Line breaks are none within JSON texts, so these stand in no name.
+# A JSON string holds no raw line break, so these bytes occur in no name or text.
 SEAL, ENTRIES = b',\n "sha256": "', b'",\n "entries": [\n'
 BEGINNING = re.compile(rb'\{\s*"format":\s*"openspm-memory",\s*"version":\s*(\d{1,9})\b')
-MAX_HEADER_BYTES, MAX_ARRAY_BYTES = 16_000_000, 4_000_000_000
-# So many entries are read when a memory is loaded; of a larger one, each when it is asked for.
+FIRST_BYTES, MAX_HEADER_BYTES, MAX_ARRAY_BYTES = 2**16, 2**24, 2**32
+# Memories up to this size are read at once; the entries of a larger one when they are asked for.
 READ_AT_LOAD = 2000
+
+NO_FILE = (FileNotFoundError, NotADirectoryError, IsADirectoryError)
 
 Arrays = Mapping[str, NDArray[Any]]
 
@@ -67,7 +68,7 @@ class Header(Origin):
         objects: Fields of the objects' models; their arrays are "objects.NAME.ARRAY".
         anchored: Names of all objects that entries have key poses at.
         n_entries: How many of the entries are in use; those after them are superseded.
-        arrays: Name of the file of arrays, which has its SHA-256 in it.
+        arrays: Name of the file of arrays; its SHA-256 is part of the name.
     """
 
     cameras: dict[str, Any]
@@ -83,14 +84,14 @@ class _Named(Struct):
 
 @contextmanager
 def changing(directory: Path) -> Generator[None]:
-    """Keep others from changing a memory while it is read, changed and saved."""
-    # Where there is none yet, there is nothing that could be lost.
+    """Keep other processes from changing a memory while it is read, changed and saved."""
+    # A folder without a memory needs no lock: there is nothing to lose.
     with locked(directory / LOCK) if (directory / MEMORY_JSON).is_file() else nullcontext():
         yield
 
 
 def write_memory(memory: Memory, directory: Path) -> None:
-    """Write a memory: whatever interrupts this, the folder holds the one before or this one, whole.
+    """Write a memory. If this is interrupted, the folder still holds the memory before, or this one.
 
     Raises:
         MemoryFormatError: Something in it could not be read again.
@@ -106,11 +107,11 @@ def write_memory(memory: Memory, directory: Path) -> None:
             header.arrays = ARRAYS.format(hashlib.sha256(blob).hexdigest())
             write_beside(directory / header.arrays, blob)
             file.seek(0)
-            file.write(_sealed(header))  # of the same length: only two checksums are others
+            file.write(_sealed(header))  # of the same length: only two checksums differ
         rename(beside, directory / MEMORY_JSON)
         for path in directory.iterdir():
             if LEFTOVER.fullmatch(path.name) and path.name != header.arrays:
-                with suppress(OSError):  # what stays does no harm: nothing names it any more
+                with suppress(OSError):  # a file that stays does no harm: nothing names it
                     path.unlink()
 
 
@@ -163,7 +164,7 @@ def read_memory(directory: Path, cameras: Path | None = None) -> Memory:
         try:
             return _loaded(file, header, start, cameras)
         except MemoryFormatError:
-            # Another process may have saved a newer memory in between; then its arrays are named differently.
+            # If another process has saved a newer memory meanwhile, its arrays have another name.
             if header == _opened(directory)[1]:
                 raise
 
@@ -177,9 +178,10 @@ def _opened(directory: Path) -> tuple[OpenFile, Header, int]:
     """``memory.json``, its header, and where its first entry starts."""
     path = directory / MEMORY_JSON
     try:
-        file = OpenFile(path)
-        blob = file.read(0, MAX_HEADER_BYTES)
-    except OSError as error:
+        file, blob = OpenFile(path), b""
+        while ENTRIES not in blob and len(blob) < min(file.n_bytes, MAX_HEADER_BYTES):
+            blob = file.read(0, max(2 * len(blob), FIRST_BYTES))
+    except NO_FILE as error:
         raise MemoryFormatError(_missing(path)) from error
     _check_version(blob, path)
     head, mark, _ = blob.partition(ENTRIES)
@@ -200,7 +202,7 @@ def _check_version(blob: bytes, path: Path) -> None:
             f"{FORMAT!r} and version {VERSION}; {AGAIN}"
         )
     if (version := int(found[1])) != VERSION:
-        do = "train again: lerobot-train --policy.type=openspm --dataset.repo_id=NAME"
+        do = "train again: lerobot-train --policy.type=openspm --dataset.repo_id=NAME --policy.cameras=FILE"
         raise MemoryFormatError(
             f"{path}: got version {version}, expected {VERSION}; "
             f"{'upgrade lerobot_policy_openspm' if version > VERSION else do}"
@@ -249,7 +251,7 @@ def _read_arrays(path: Path) -> Arrays:
         if (size := path.stat().st_size) > MAX_ARRAY_BYTES:
             raise MemoryFormatError(f"{path}: {size} bytes, more than the {MAX_ARRAY_BYTES} that are read")
         blob = path.read_bytes()
-    except OSError as error:
+    except NO_FILE as error:
         raise MemoryFormatError(_missing(path)) from error
     if path.name != ARRAYS.format(hashlib.sha256(blob).hexdigest()):
         raise MemoryFormatError(f"{path}: its checksum is not its name: truncated or changed; {AGAIN}")

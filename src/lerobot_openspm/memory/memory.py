@@ -127,7 +127,7 @@ def _same_demonstration(a: MemoryEntry, b: MemoryEntry) -> bool:
 
 
 def check_layouts(ours: Layouts | None, theirs: Layouts | None, whose: str, where: str) -> None:
-    """Two layouts have to mean the same by the same numbers, whatever those are called.
+    """Check that the numbers of two layouts have the same meaning; their names may differ.
 
     Args:
         ours: Layouts of state and action that the memory was mined with; None where it is not known.

@@ -1,4 +1,4 @@
-"""The JSON of a memory: a schema for each object in it, and the few rules that a schema cannot state."""
+"""The JSON of a memory: a schema for each object in it, and the rules that a schema cannot state."""
 
 from __future__ import annotations
 
@@ -22,22 +22,22 @@ from lerobot_openspm.types import OWN_WORDS, SubTask
 
 VERSION = 7
 AGAIN = "train or pull it again"
-# Beyond what any robot, unit or count needs, and such that sums and products stay finite and exact.
+# More than any robot, unit or count needs; sums and products of such numbers stay finite and exact.
 LIMIT = 1e9
 
-# A terminal obeys control characters, and no file takes a lone surrogate.
+# Control characters, which a terminal would obey, and lone surrogates, which no UTF-8 file can hold.
 _CONTROL = r"\x00-\x08\x0b\x0c\x0e-\x1f\x7f-\x9f\ud800-\udfff"
 _LINE = rf"[^\t\n\r{_CONTROL}]"
 Text = Annotated[str, Meta(pattern=rf"\A(?=[\s\S]*\S)[^{_CONTROL}]+\Z")]
 Line = Annotated[str, Meta(pattern=rf"\A(?=.*\S){_LINE}+\Z")]
 Name = Annotated[str, Meta(pattern=rf"\A(?=.*\S){_LINE}+\Z", max_length=1000)]
-# A part of an instruction that may say nothing.
+# Part of an instruction; may be empty.
 Words = Annotated[str, Meta(pattern=rf"\A{_LINE}*\Z", max_length=10_000)]
 
 Count = Annotated[int, Meta(ge=0, le=int(LIMIT))]
 Share = Annotated[float, Meta(ge=0, le=1)]
 Number = Annotated[float, Meta(ge=-LIMIT, le=LIMIT)]
-Positive = Annotated[float, Meta(ge=0, le=LIMIT)]
+NotNegative = Annotated[float, Meta(ge=0, le=LIMIT)]
 Gain = Annotated[float, Meta(ge=-1000, le=1000)]
 Speed = Annotated[float, Meta(ge=0, le=1000)]
 Vector = Annotated[list[Number], Meta(min_length=3, max_length=3)]
@@ -49,10 +49,10 @@ Covariance = Annotated[list[_Row6], Meta(min_length=6, max_length=6)]
 
 
 class Record(Struct, forbid_unknown_fields=True, omit_defaults=True):
-    """A JSON object that holds these fields alone; what has its default is left out."""
+    """A JSON object. Unknown fields are refused; fields at their default are not written."""
 
 
-# What operations, relations and references there are, language knows; here they are lines of text.
+# Operations, relations and references are plain text here: only the language room knows their lists.
 class _Reference(Record):
     relation: Name
     landmarks: list[Name] = []
@@ -105,7 +105,7 @@ class _Outcome(Record):
     anchor: _Anchor
     position: Vector
     shown: Vector
-    tolerance_m: Positive
+    tolerance_m: NotNegative
 
 
 class _Entry(Record, kw_only=True):
@@ -124,7 +124,7 @@ class _Entry(Record, kw_only=True):
 class _Robot(Record):
     close_command: Number
     open_command: Number
-    open_width: Positive
+    open_width: NotNegative
     metres_per_action: Gain
     radians_per_action: Gain
     metres_per_step: Speed
@@ -155,7 +155,7 @@ class Origin(Record):
 
 
 def loads(text: bytes, where: str) -> Any:
-    """Read JSON text as the standard has it.
+    """Parse standard JSON.
 
     Args:
         text: The text, UTF-8.
@@ -186,7 +186,7 @@ _DECODER = json.JSONDecoder(object_pairs_hook=_object, parse_constant=_constant)
 
 
 def checked[T](fields: Any, schema: type[T], where: str) -> T:
-    """JSON fields as a record. Raises MemoryFormatError naming file and field where they do not fit it."""
+    """Parsed JSON as a record. Raises MemoryFormatError naming file and field where it does not fit."""
     try:
         return msgspec.convert(fields, schema)
     except (msgspec.ValidationError, UnicodeEncodeError) as error:
@@ -194,7 +194,7 @@ def checked[T](fields: Any, schema: type[T], where: str) -> T:
 
 
 def record_of[T: Record](value: Any, schema: type[T], what: str) -> T:
-    """What is about to be written, as a record. Raises MemoryFormatError where it could not be read again."""
+    """A value that is to be written, as a record. Raises MemoryFormatError if it could not be read again."""
     try:
         return msgspec.convert(msgspec.to_builtins(value, enc_hook=_without_numpy), schema)
     except (msgspec.ValidationError, UnicodeEncodeError) as error:
@@ -205,7 +205,7 @@ def record_of[T: Record](value: Any, schema: type[T], what: str) -> T:
 
 
 def _built[T](fields: Any, kind: type[T]) -> T:
-    """The dataclass that fields, which fit its schema, are the JSON form of."""
+    """The dataclass of parsed JSON that fits its schema; lists become arrays."""
     return msgspec.convert(fields, kind, dec_hook=lambda _, value: np.array(value, np.float64))
 
 
@@ -214,7 +214,7 @@ def _without_numpy(value: Any) -> Any:
 
 
 def _told(error: Exception) -> str:
-    """An error of msgspec's; the patterns of texts in words."""
+    """The text of a msgspec error, with the pattern of a text said in words."""
     return re.sub(r"matching regex '.*'", "of printable characters, not empty", str(error))
 
 
@@ -228,7 +228,7 @@ def entry_from_json(text: bytes, where: str) -> MemoryEntry:
 
 
 def entry_from_fields(fields: Any, where: str) -> MemoryEntry:
-    """Likewise of an entry's JSON that was read already."""
+    """One entry of parsed JSON. Raises MemoryFormatError as :func:`entry_from_json` does."""
     checked(fields, _Entry, where)
     entry = _built(fields, MemoryEntry)
     if wrong := _wrong(entry):
@@ -242,7 +242,7 @@ def entry_to_json(entry: MemoryEntry) -> bytes:
 
 
 def _wrong(entry: MemoryEntry) -> str:
-    """What no schema finds: fields that contradict one another, and matrices that are none; "" if nothing."""
+    """What a schema cannot state: fields that contradict each other, invalid matrices. "" if all is well."""
     poses, n_sub_tasks = entry.key_poses, len(entry.key.sub_tasks)
     needed = {name for one in (*poses, *entry.outcomes) for name in one.anchor.objects}
     needed |= {outcome.target for outcome in entry.outcomes}
@@ -286,7 +286,7 @@ def _wrong_covariance(covariance: Array) -> str:
 
 
 def origin_of(memory: Memory, file_format: str) -> dict[str, Any]:
-    """The fields of an :class:`Origin`."""
+    """The fields of a memory's :class:`Origin`."""
     layouts = None
     if memory.layouts is not None:
         state, action = ({"names": v.names, "rotation": v.rotation_kind} for v in memory.layouts)
@@ -298,7 +298,7 @@ def origin_of(memory: Memory, file_format: str) -> dict[str, Any]:
 
 
 def memory_from(origin: Origin, where: str, **others: Any) -> Memory:
-    """A memory of that origin, and with other attributes as given. Raises MemoryFormatError."""
+    """A memory of this origin, its other attributes as given. Raises MemoryFormatError."""
     robot = _built(msgspec.to_builtins(origin.robot), RobotModel)
     if not (robot.workspace[0] <= robot.workspace[1]).all():
         raise MemoryFormatError(
