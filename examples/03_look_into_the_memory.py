@@ -19,7 +19,7 @@ from lerobot_openspm.control.controller import EpisodeController
 from lerobot_openspm.control.planning_context import PlanningContext
 from lerobot_openspm.control.transfer import transfer
 from lerobot_openspm.envs.tabletop.env import ACTION_NAMES, STATE_NAMES, TabletopEnv
-from lerobot_openspm.memory.memory import read_memory
+from lerobot_openspm.memory.io import read_memory
 from lerobot_openspm.perception.observation import split_batch
 from lerobot_openspm.perception.pipeline import Perception
 

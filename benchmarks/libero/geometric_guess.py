@@ -37,7 +37,8 @@ from lerobot_openspm.geometry import se3
 from lerobot_openspm.geometry.se3 import Array
 from lerobot_openspm.language.instruction import parse_instruction
 from lerobot_openspm.memory.entry import WORLD, Anchor, MemoryEntry, MemoryKeyPose, RetrievalKey
-from lerobot_openspm.memory.memory import Memory, read_memory
+from lerobot_openspm.memory.io import read_memory
+from lerobot_openspm.memory.memory import Memory
 from lerobot_openspm.mining.phase_labels.endpoint import API_BASE, ChatEndpoint
 from lerobot_openspm.mining.phase_labels.qwen3vl import WEIGHTS, Qwen3VL
 from lerobot_openspm.modeling_openspm import OpenSPMPolicy

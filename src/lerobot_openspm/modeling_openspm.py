@@ -30,7 +30,8 @@ from lerobot_openspm.flow.training_set import TrainingSet
 from lerobot_openspm.language.names import NameSimilarity, names_from
 from lerobot_openspm.memory.entry import MemoryEntry
 from lerobot_openspm.memory.indexed_entries import indexed
-from lerobot_openspm.memory.memory import Memory, write_memory
+from lerobot_openspm.memory.io import write_memory
+from lerobot_openspm.memory.memory import Memory
 from lerobot_openspm.perception.observation import Observation, split_batch
 from lerobot_openspm.perception.pipeline import Perception
 from lerobot_openspm.types import Hand, Segmenter

@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+from lerobot_openspm.checkpoint import check_labels
 from lerobot_openspm.configuration_openspm import OpenSPMConfig, feature_names
 from lerobot_openspm.errors import DatasetError, LayoutError
 from lerobot_openspm.geometry.camera import load_cameras
@@ -15,7 +16,7 @@ from lerobot_openspm.language.instruction import read_tasks
 from lerobot_openspm.language.own_words import normal_words
 from lerobot_openspm.memory.entry import MemoryEntry
 from lerobot_openspm.memory.indexed_entries import known_names
-from lerobot_openspm.memory.memory import Memory, check_labels
+from lerobot_openspm.memory.memory import Memory
 from lerobot_openspm.training import dataset_processor, memory_of
 from lerobot_openspm.types import Segmenter
 

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 from tests.cli.conftest import Openspm
 
-from lerobot_openspm.memory.memory import read_memory
+from lerobot_openspm.memory.io import read_memory
 
 
 @pytest.mark.parametrize(

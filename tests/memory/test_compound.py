@@ -49,13 +49,6 @@ def test_an_entry_with_one_sub_task_is_its_own_part():
     assert parts(one)[0] is one
 
 
-def test_an_older_memory_that_does_not_say_the_sub_tasks_is_told_by_its_gripper():
-    new = drawer_entry()
-    old = drawer_entry(key_poses=tuple(replace(pose, sub_task=0) for pose in new.key_poses))
-    assert [part.key for part in parts(old)] == [part.key for part in parts(new)]
-    assert [len(part.key_poses) for part in parts(old)] == [5, 8]
-
-
 def test_contacts_at_an_object_that_is_not_named_make_no_part():
     T = hand_pose(0.0, 0.0, 0.1)
     elsewhere = [replace(pose, anchor=key_pose("bowl", T, "open").anchor) for pose in opened()]

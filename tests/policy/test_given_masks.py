@@ -20,7 +20,7 @@ from lerobot_openspm.envs.tabletop import scene
 from lerobot_openspm.envs.tabletop.env import TabletopEnv
 from lerobot_openspm.errors import MemoryFormatError, PerceptionError
 from lerobot_openspm.geometry.camera import Camera
-from lerobot_openspm.memory.memory import read_memory
+from lerobot_openspm.memory.io import read_memory
 from lerobot_openspm.mining.dataset import Demonstrations
 from lerobot_openspm.mining.signals import Episode
 from lerobot_openspm.modeling_openspm import OpenSPMPolicy

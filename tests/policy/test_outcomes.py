@@ -8,7 +8,7 @@ from tests.policy.conftest import Frame, batch_of
 
 from lerobot_openspm.control.status import Status
 from lerobot_openspm.errors import OpenSPMError
-from lerobot_openspm.memory.memory import read_memory
+from lerobot_openspm.memory.io import read_memory
 from lerobot_openspm.modeling_openspm import OpenSPMPolicy
 
 

@@ -16,8 +16,8 @@ from lerobot_openspm.bench.synthetic_bank import synthetic_experience
 from lerobot_openspm.bench.synthetic_keys import Key, distinct_keys, said_otherwise
 from lerobot_openspm.memory.index import ExactIndex, FaissIndex, KeyIndex, make_index
 from lerobot_openspm.memory.indexed_entries import NEAREST_KEYS, IndexedEntries
+from lerobot_openspm.memory.io import read_memory, write_memory
 from lerobot_openspm.memory.key_vector import DIMENSIONS, Vectors, key_vectors
-from lerobot_openspm.memory.memory import read_memory, write_memory
 from lerobot_openspm.memory.retrieval import semantic_score
 
 WARM_UP = 100

@@ -20,12 +20,12 @@ from lerobot_openspm.geometry import se3
 from lerobot_openspm.geometry.se3 import Array
 from lerobot_openspm.language.instruction import read_tasks
 from lerobot_openspm.language.names import TABLE_NAMES, NameSimilarity
-from lerobot_openspm.memory.bank import entry_from_json, entry_to_json
 from lerobot_openspm.memory.compose import plan_parts
 from lerobot_openspm.memory.entry import MemoryEntry
 from lerobot_openspm.memory.indexed_entries import known_names
 from lerobot_openspm.memory.retrieval import ScoreWeights
 from lerobot_openspm.memory.robot import RobotModel
+from lerobot_openspm.memory.schema import entry_from_json, entry_to_json
 from lerobot_openspm.mining.anchors import Demonstration
 from lerobot_openspm.mining.entries import task_entries
 from lerobot_openspm.mining.key_poses import find_key_poses

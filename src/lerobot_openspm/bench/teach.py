@@ -158,7 +158,7 @@ def teach(data: Demonstrations, nine: Path, task: str, demos: int, folder: Path)
         wrong. The folder holds the taught checkpoint, unless there was an error.
     """
     from lerobot_openspm.bench.episode import load
-    from lerobot_openspm.memory.memory import write_memory
+    from lerobot_openspm.memory.io import write_memory
     from lerobot_openspm.mining.dataset import dataset_metadata
 
     note = folder.with_name(f"{folder.name}.json")

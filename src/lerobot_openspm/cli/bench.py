@@ -94,7 +94,7 @@ class BenchConfig(ResultOption):
         """Where results go; what was measured of other code or another checkpoint is discarded."""
         from lerobot_openspm.cli.pipeline import digest, measured_folder
 
-        files = [self.checkpoint / name for name in ("model.safetensors", "memory.json", "cameras.json")]
+        files = [self.checkpoint / name for name in ("model.safetensors", "memory.json")]
         options = [what, self.env.type, *([str(self.demonstrations)] if what == "perception" else [])]
         folder = Path(self.output or f"outputs/bench/{what}_{self.env.type}")
         return measured_folder(folder, digest(files, options))

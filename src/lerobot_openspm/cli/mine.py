@@ -10,7 +10,7 @@ from pathlib import Path
 import draccus
 
 from lerobot_openspm.configuration_openspm import OpenSPMConfig
-from lerobot_openspm.memory.memory import write_memory
+from lerobot_openspm.memory.io import write_memory
 from lerobot_openspm.mining.annotate import check_folder, write_annotated
 from lerobot_openspm.mining.dataset import dataset_metadata
 from lerobot_openspm.training import dataset_processor, memory_of

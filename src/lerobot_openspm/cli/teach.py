@@ -15,8 +15,8 @@ import draccus
 
 from lerobot_openspm.errors import OpenSPMError
 from lerobot_openspm.memory.exchange import digest
-from lerobot_openspm.memory.files import changing
-from lerobot_openspm.memory.memory import MEMORY_JSON, Memory, read_memory, write_memory
+from lerobot_openspm.memory.io import MEMORY_JSON, changing, read_memory, write_memory
+from lerobot_openspm.memory.memory import Memory
 from lerobot_openspm.mining.dataset import dataset_metadata
 from lerobot_openspm.teaching import Lesson
 

@@ -17,7 +17,7 @@ from lerobot_openspm.language.descriptions import phrase
 from lerobot_openspm.language.meaning import semantic_score
 from lerobot_openspm.language.names import TABLE_NAMES, NameSimilarity
 from lerobot_openspm.language.own_words import normal_words
-from lerobot_openspm.memory.entry import MemoryEntry, MemoryKeyPose, RetrievalKey
+from lerobot_openspm.memory.entry import MemoryEntry, RetrievalKey
 from lerobot_openspm.memory.indexed_entries import near
 from lerobot_openspm.memory.retrieval import candidates_for, read_instruction, why_unread
 from lerobot_openspm.types import SubTask
@@ -66,22 +66,17 @@ def parts(entry: MemoryEntry) -> tuple[MemoryEntry, ...]:
     sub_tasks = entry.key.sub_tasks
     if len(sub_tasks) == 1 or sub_tasks[0].words:
         return (entry,)  # no words say what each part of an instruction is that cannot be read
-    serves = _sub_tasks_of(entry)
-    found: list[MemoryEntry] = []
-    for i in range(len(sub_tasks)):
-        own = [pose for pose, served in zip(entry.key_poses, serves, strict=True) if served == i]
-        part = _part(entry, i, own)
-        if part is not None:
-            found.append(part)
-    return tuple(found)
+    found = (_part(entry, i) for i in range(len(sub_tasks)))
+    return tuple(part for part in found if part is not None)
 
 
-def _part(entry: MemoryEntry, number: int, own: Sequence[MemoryKeyPose]) -> MemoryEntry | None:
+def _part(entry: MemoryEntry, number: int) -> MemoryEntry | None:
     sub_task = entry.key.sub_tasks[number]
     kept = tuple(
         replace(pose, sub_task=0)
-        for pose in own
-        if set(pose.anchor.objects) <= set(sub_task.objects) or pose.phase not in FREE_PHASES
+        for pose in entry.key_poses
+        if pose.sub_task == number
+        and (set(pose.anchor.objects) <= set(sub_task.objects) or pose.phase not in FREE_PHASES)
     )
     contacts = [pose for pose in kept if pose.phase not in FREE_PHASES]
     if not contacts or any(not set(pose.anchor.objects) <= set(sub_task.objects) for pose in contacts):
@@ -94,18 +89,6 @@ def _part(entry: MemoryEntry, number: int, own: Sequence[MemoryKeyPose]) -> Memo
         layout={name: T for name, T in entry.layout.items() if name in sub_task.objects},
         outcomes=tuple(replace(one, sub_task=0) for one in entry.outcomes if one.sub_task == number),
     )
-
-
-def _sub_tasks_of(entry: MemoryEntry) -> list[int]:
-    """The sub-task of every key pose; told by the gripper where an older memory does not say it."""
-    if any(pose.sub_task > 0 for pose in entry.key_poses):
-        return [pose.sub_task for pose in entry.key_poses]
-    served: list[int] = []
-    contact = 0
-    for pose in entry.key_poses:
-        served.append(sub_task_index(contact, pose.phase, len(entry.key.sub_tasks)))
-        contact += pose.dwell  # the fingers have closed or opened here
-    return served
 
 
 def plan_parts(

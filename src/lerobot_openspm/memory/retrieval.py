@@ -19,7 +19,7 @@ from lerobot_openspm.types import SubTask
 MIN_SEMANTIC = 0.75
 # Entries about different things whose scores lie this close together leave open which is meant.
 MARGIN = 0.05
-# So many known instructions are named in an error.
+# An error names at most this many known instructions.
 MAX_NAMED = 20
 
 

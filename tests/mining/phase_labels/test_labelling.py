@@ -25,7 +25,7 @@ from lerobot_openspm import training
 from lerobot_openspm.configuration_openspm import JudgeConfig, OpenSPMConfig
 from lerobot_openspm.errors import DatasetError, PerceptionError
 from lerobot_openspm.memory.entry import PHASES
-from lerobot_openspm.memory.memory import read_memory
+from lerobot_openspm.memory.io import read_memory
 from lerobot_openspm.mining.dataset import Demonstrations
 from lerobot_openspm.mining.key_poses import KeyPose
 from lerobot_openspm.mining.mined import MinedEpisode
