@@ -7,7 +7,7 @@ from collections.abc import Generator, Sequence
 from contextlib import contextmanager
 from copy import deepcopy
 from dataclasses import dataclass, replace
-from functools import cached_property, partial
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -20,9 +20,9 @@ from torch import Tensor
 from lerobot_openspm.checkpoint import checkpoint_folder, load_memory
 from lerobot_openspm.configuration_openspm import OpenSPMConfig
 from lerobot_openspm.control.controller import EpisodeController
-from lerobot_openspm.control.planning_context import PlanningContext
+from lerobot_openspm.control.planning import PlanningContext
 from lerobot_openspm.errors import DatasetError, MemoryFormatError, OpenSPMError
-from lerobot_openspm.flow.condition import CONDITION_DIM, Query, encode, to_world_frame
+from lerobot_openspm.flow.condition import CONDITION_DIM, encode, to_world_frame
 from lerobot_openspm.flow.network import VelocityField
 from lerobot_openspm.flow.training_set import TrainingSet
 from lerobot_openspm.language.names import NameSimilarity, names_from
@@ -95,16 +95,132 @@ class OpenSPMPolicy(PreTrainedPolicy):
             self.flow.action_scale.copy_(self._training_set.action_scale)
         self.reset()
 
-    # Acting. `select_action` reads top to bottom: observe, ask for chunks where needed, act.
+    # Acting. Top to bottom: look where the controller wants it, ask for a chunk where it is needed, act.
 
     def reset(self) -> None:
         """Forget the running episodes."""
         self.episodes: list[RunningEpisode] = []
 
+    @torch.no_grad()
+    def select_action(self, batch: dict[str, Tensor], **kwargs: Any) -> Tensor:
+        """Choose one action ``(b, action_dim)`` for every environment of a batch of observations."""
+        return self._encode(self.act(split_batch(batch, self.config.layouts()[0]))[:, 0])
+
+    @torch.no_grad()
+    def predict_action_chunk(self, batch: dict[str, Tensor], **kwargs: Any) -> Tensor:
+        """What the next actions ``(b, chunk_size, action_dim)`` would be if no new observation came.
+
+        The policy stays as it is: episodes go on, with :meth:`select_action`, as if nobody had asked.
+        """
+        observations, n_steps = split_batch(batch, self.config.layouts()[0]), self.config.chunk_size
+        with self._looking_ahead():
+            return self._encode(self.act(observations, n_steps, n_steps))
+
+    @torch.no_grad()
+    def act(
+        self, observations: Sequence[Observation], n_actions: int = 1, n_kept: int | None = None
+    ) -> np.ndarray:
+        """Choose the next canonical actions ``(b, n_actions, 7)`` for every environment.
+
+        Args:
+            observations: One for every environment; its images are looked at when the controller wants it.
+            n_actions: How many actions to choose.
+            n_kept: How many actions of every new chunk are kept; as configured if not given.
+        """
+        self.eval()
+        n_kept = self.config.n_action_steps if n_kept is None else n_kept
+        self._begin_episodes(observations)
+        actions = np.empty((len(observations), n_actions, 7))
+        for row, (episode, observation) in enumerate(zip(self.episodes, observations, strict=True)):
+            controller, hand = episode.controller, observation.hand
+            look = controller.advance(hand)
+            while look is not None:  # twice where a part of the instruction ends and the next one begins
+                detections = episode.perception.detect(observation, look.names, look.expected, look.time_s)
+                look = controller.take_in(look, detections, hand)
+            for i in range(n_actions):
+                action = controller.executor.next_action(hand)
+                if action is None:
+                    controller.executor.push_chunk(self._chunk(controller, hand)[:n_kept])
+                    action = controller.executor.next_action(hand)
+                actions[row, i] = action
+        return actions
+
+    @contextmanager
+    def _looking_ahead(self) -> Generator[None]:
+        """Act on copies of the running episodes; at the end those that were running are back."""
+        running, is_training = self.episodes, self.training
+        # The memory and a segmenter's weights are large and never change: the copies share them.
+        shared = [self.segmenter, *(one.perception.memory for one in running)]
+        try:
+            self.episodes = deepcopy(running, {id(one): one for one in shared})
+            yield
+        finally:
+            self.episodes = running
+            self.train(is_training)
+
+    def _begin_episodes(self, observations: Sequence[Observation]) -> None:
+        """Begin an episode wherever there is none, or its instruction is new."""
+        if len(self.episodes) != len(observations):
+            self.episodes = [self._new_episode(observation) for observation in observations]
+        for i, observation in enumerate(observations):
+            if self.episodes[i].controller.instruction != observation.instruction:
+                self.episodes[i] = self._new_episode(observation)
+
+    def _new_episode(self, observation: Observation) -> RunningEpisode:
+        memory, config = self.require_memory(), self.config
+        # Episodes share the index, which is made anew when the memory was replaced.
+        if self._entries is None or self._entries[0] is not memory.entries:
+            self._entries = memory.entries, indexed(memory.entries)
+        context = PlanningContext(
+            self._entries[1], memory.yaw_periods, memory.robot, config.score_weights,
+            config.transfer_limits, config.control_settings, TrackerSettings(), config.tracking,
+            self.step_s, self.names,
+        )  # fmt: skip
+        controller = EpisodeController(
+            context, observation.instruction, observation.fingerprint(), config.noise_seed
+        )
+        return RunningEpisode(controller, Perception(memory, config.hand_radius_m, self.segmenter))
+
+    def _chunk(self, controller: EpisodeController, hand: Hand) -> np.ndarray:
+        """Generate a chunk ``(chunk_size, 7)`` in the world. Episodes go one by one, so batches act alike."""
+        query = controller.executor.query(hand)
+        condition = encode(query, self.config.conditioning)
+        noise = controller.noise((1, self.config.chunk_size, 7))
+        device = self.flow.action_scale.device
+        chunk = self.flow.sample(
+            torch.as_tensor(condition[None], dtype=torch.float32, device=device),
+            torch.as_tensor(noise, dtype=torch.float32, device=device),
+            self.config.num_inference_steps,
+        )
+        actions = chunk[0].cpu().numpy().astype(float)
+        return to_world_frame(actions, query.T_world_target, self.config.conditioning)
+
+    def _encode(self, actions: np.ndarray) -> Tensor:
+        """Actions ``(..., 7)`` in the robot's own layout."""
+        vectors = self.config.layouts()[1].encode_actions(actions)
+        return torch.as_tensor(vectors, dtype=torch.float32, device=self.config.device)
+
+    @property
+    def step_s(self) -> float:
+        """Seconds that a control step takes."""
+        return 1 / (self.config.control_hz or DEFAULT_CONTROL_HZ)
+
+    @cached_property
+    def segmenter(self) -> Segmenter | None:
+        """What finds the objects' masks, made when it is first needed; None where their colours do."""
+        return self.config.make_segmenter()
+
+    @cached_property
+    def names(self) -> NameSimilarity:
+        """What tells which names mean the same thing: the table of words, or with embeddings beside it."""
+        return names_from(self.config.name_embeddings)
+
+    # Learning.
+
     @property
     def outcomes(self) -> list[bool | None]:
         """Whether each running episode is seen to have done what was asked; None where that is not known."""
-        return [episode.controller.succeeded for episode in self.episodes]
+        return [episode.controller.state.succeeded for episode in self.episodes]
 
     def report_outcomes(self, successes: Sequence[bool | None] | None = None) -> None:
         """Tell how the running episodes ended, before the next :meth:`reset`; the memory learns from it.
@@ -130,137 +246,10 @@ class OpenSPMPolicy(PreTrainedPolicy):
         for episode, success in zip(self.episodes, successes, strict=True):
             if success is not None and not episode.is_reported:
                 episode.is_reported = True
-                outcomes += [(entry, success) for entry in episode.controller.planner.used]
+                used = {id(entry): entry for entry in episode.controller.state.used}
+                outcomes += [(entry, success) for entry in used.values()]
         if outcomes:
             self.memory = self.require_memory().with_outcomes(outcomes)
-
-    @torch.no_grad()
-    def select_action(self, batch: dict[str, Tensor], **kwargs: Any) -> Tensor:
-        """Choose one action ``(b, action_dim)`` for every environment of a batch of observations."""
-        return self._encode(self.act(split_batch(batch, self.config.layouts()[0])))
-
-    @torch.no_grad()
-    def act(self, observations: Sequence[Observation]) -> np.ndarray:
-        """Choose one canonical action ``(b, 7)`` for every environment; images are looked at when needed."""
-        self.eval()
-        actions = []
-        for controller, hand in self._observe(observations):
-            action = controller.next_action(hand)
-            if action is None:
-                chunk = self._chunk(controller, controller.query(hand))
-                controller.executor.push_chunk(chunk[: self.config.n_action_steps])
-                action = controller.next_action(hand)
-            actions.append(action)
-        return np.stack(actions)
-
-    @torch.no_grad()
-    def predict_action_chunk(self, batch: dict[str, Tensor], **kwargs: Any) -> Tensor:
-        """What the next actions ``(b, chunk_size, action_dim)`` would be if no new observation came.
-
-        The policy stays as it is: episodes go on, with :meth:`select_action`, as if nobody had asked.
-        """
-        with self._looking_ahead():
-            chunks = []
-            for controller, hand in self._observe(split_batch(batch, self.config.layouts()[0])):
-                chunk = []
-                while len(chunk) < self.config.chunk_size:
-                    action = controller.next_action(hand)
-                    if action is None:
-                        controller.executor.push_chunk(self._chunk(controller, controller.query(hand)))
-                    else:
-                        chunk.append(action)
-                chunks.append(chunk)
-            return self._encode(np.stack(chunks))
-
-    @contextmanager
-    def _looking_ahead(self) -> Generator[None]:
-        """Act on copies of the running episodes; at the end those that were running are back."""
-        running, is_training = self.episodes, self.training
-        # Entries, models and a segmenter's weights are large and never change: the copies share them.
-        shared = [self.memory, self.segmenter, *(one.perception.memory for one in running)]
-        for controller in (one.controller for one in running):
-            entries = [*controller.planner.used, *(one.entry for one in controller.planner.ranked)]
-            shared += [controller.planner.parts, *entries]
-        try:
-            self.episodes = deepcopy(running, {id(one): one for one in shared})
-            self.eval()
-            yield
-        finally:
-            self.episodes = running
-            self.train(is_training)
-
-    def _observe(self, observations: Sequence[Observation]) -> list[tuple[EpisodeController, Hand]]:
-        """Each environment's controller, brought up to its observation, and its hand."""
-        self._begin_episodes(observations)
-        for episode, observation in zip(self.episodes, observations, strict=True):
-            detect = partial(episode.perception.detect, observation)
-            episode.controller.observe(observation.hand, detect)
-        return [
-            (episode.controller, observation.hand)
-            for episode, observation in zip(self.episodes, observations, strict=True)
-        ]
-
-    def _encode(self, actions: np.ndarray) -> Tensor:
-        """Actions ``(..., 7)`` in the robot's own layout."""
-        vectors = self.config.layouts()[1].encode_actions(actions)
-        return torch.as_tensor(vectors, dtype=torch.float32, device=self.config.device)
-
-    def _begin_episodes(self, observations: Sequence[Observation]) -> None:
-        """Begin an episode wherever there is none, or its instruction is new."""
-        if len(self.episodes) != len(observations):
-            self.episodes = [self._new_episode(observation) for observation in observations]
-        for i, observation in enumerate(observations):
-            if self.episodes[i].controller.instruction != observation.instruction:
-                self.episodes[i] = self._new_episode(observation)
-
-    def _new_episode(self, observation: Observation) -> RunningEpisode:
-        memory, config = self.require_memory(), self.config
-        # Episodes share the index, which is made anew when the memory was replaced.
-        if self._entries is None or self._entries[0] is not memory.entries:
-            self._entries = memory.entries, indexed(memory.entries)
-        context = PlanningContext(
-            self._entries[1], memory.yaw_periods, memory.robot, config.score_weights,
-            config.transfer_limits, config.control_settings, TrackerSettings(), config.tracking,
-            self.step_s, self.names,
-        )  # fmt: skip
-        controller = EpisodeController(
-            context, observation.instruction, observation.fingerprint(), config.noise_seed
-        )
-        return RunningEpisode(controller, Perception(memory, config.hand_radius_m, self.segmenter))
-
-    @property
-    def step_s(self) -> float:
-        """Seconds that a control step takes."""
-        return 1 / (self.config.control_hz or DEFAULT_CONTROL_HZ)
-
-    @cached_property
-    def segmenter(self) -> Segmenter | None:
-        """What finds the objects' masks, made when it is first needed; None where their colours do."""
-        return self.config.make_segmenter()
-
-    @cached_property
-    def names(self) -> NameSimilarity:
-        """What says which names mean the same thing: the table of words, or with embeddings beside it."""
-        return names_from(self.config.name_embeddings)
-
-    def _chunk(self, controller: EpisodeController, query: Query) -> np.ndarray:
-        """Generate a chunk ``(chunk_size, 7)`` in the world. Episodes go one by one, so batches act alike."""
-        condition = encode(query, self.config.conditioning)
-        noise = controller.noise((1, self.config.chunk_size, 7))
-        device = self.flow.action_scale.device
-        chunk = self.flow.sample(
-            torch.as_tensor(condition[None], dtype=torch.float32, device=device),
-            torch.as_tensor(noise, dtype=torch.float32, device=device),
-            self.config.num_inference_steps,
-        )
-        actions = to_world_frame(
-            chunk[0].cpu().numpy().astype(float), query.T_world_target, self.config.conditioning
-        )
-        # The fingers do what the key pose says; the flow model's last number only says it less surely.
-        actions[:, 6] = self.require_memory().robot.command(bool(query.closed))
-        return actions
-
-    # Learning.
 
     def forward(self, batch: dict[str, Tensor], reduction: str = "mean") -> tuple[Tensor, dict[str, float]]:
         """Flow-matching loss of the batch's frames, and of others drawn beside them while training.

@@ -6,15 +6,14 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose
-from tests.control.test_controller import HAND, Perception, row, shifted, watch
+from tests.control.test_controller import HAND, Perception, observe, row, shifted, watch
 from tests.memory.builders import entry, hand_pose, key_pose, robot
 
-from lerobot_openspm.control.contact import LEFT_BEHIND_M, OUTRUN_M
 from lerobot_openspm.control.executor import Executor
-from lerobot_openspm.control.pushes import push_ways
-from lerobot_openspm.control.status import Status
+from lerobot_openspm.control.scene import LEFT_BEHIND_M, OUTRUN_M
+from lerobot_openspm.control.state import EpisodeState, Status
 from lerobot_openspm.control.strategies import ControlSettings
-from lerobot_openspm.control.transfer import Target, transfer
+from lerobot_openspm.control.transfer import Target, push_paths, transfer
 from lerobot_openspm.geometry import se3
 from lerobot_openspm.memory.entry import Anchor, Outcome
 from lerobot_openspm.perception.tracking.tracker import TrackStatus
@@ -105,8 +104,8 @@ def test_a_push_without_a_known_outcome_ends_where_the_demonstration_did():
 
 
 def test_a_hand_that_strays_while_it_pushes_is_led_back_to_its_way():
-    executor = Executor(ControlSettings(), robot())
-    memory, ways = push().key_poses[2], push_ways(push(), LAYOUT)[0]
+    executor = Executor(ControlSettings(), robot(), EpisodeState())
+    memory, ways = push().key_poses[2], push_paths(push(), LAYOUT)[0]
     start, end = hand_pose(0.3, 0.0, 0.02), hand_pose(0.1, 0.0, 0.02)
     executor.begin([Target(end, memory, precise=True, push=ways)], Hand(start, 0.0))
     strayed = Hand(hand_pose(0.2, 0.004, 0.028), 0.0)
@@ -120,8 +119,8 @@ def test_a_hand_that_strays_while_it_pushes_is_led_back_to_its_way():
 
 @given(st.floats(-0.05, 0.05), st.floats(-0.05, 0.05), st.floats(-1, 1), st.floats(-1, 1))
 def test_an_action_that_leads_back_to_the_way_stays_within_bounds(y, z, along, across):
-    executor = Executor(ControlSettings(), robot())
-    memory, ways = push().key_poses[2], push_ways(push(), LAYOUT)[0]
+    executor = Executor(ControlSettings(), robot(), EpisodeState())
+    memory, ways = push().key_poses[2], push_paths(push(), LAYOUT)[0]
     start, end = hand_pose(0.3, 0.0, 0.02), hand_pose(0.1, -0.1, 0.02)
     executor.begin([Target(end, memory, precise=True, push=ways)], Hand(start, 0.0))
     executor.push_chunk(np.array([[along, across, 0.0, 0.0, 0.0, 0.0, 1.0]]))
@@ -143,15 +142,15 @@ def test_where_a_push_turns_the_hand_passes_by():
 
 def test_a_plate_goes_along_around_the_turn_of_a_push_and_is_let_go_at_its_end():
     eyes, one = Perception(LAYOUT), row(turning_push(), instruction=INSTRUCTION)
-    one.observe(HAND, eyes)
+    observe(one, HAND, eyes)
     eyes.visible = 0.0
-    ends = [target.T_world_ee for target in one.executor.plan]
-    one.executor.begin(one.executor.plan, HAND, 1)
+    ends = [target.T_world_ee for target in one.executor.targets]
+    one.executor.begin(one.executor.targets, HAND, 1)
     for index, is_held in ((1, True), (2, True), (3, False)):
         watch(one, eyes, Hand(ends[index], 0.0), 1)
-        assert one.executor.index == index + 1
+        assert one.state.index == index + 1
         assert (one.scene.tracker.held == {"plate"}) is is_held, index
-        assert_allclose(one.executor.plan[2].T_world_ee, ends[2], atol=1e-9)
+        assert_allclose(one.executor.targets[2].T_world_ee, ends[2], atol=1e-9)
 
 
 def test_what_is_pushed_goes_along_and_not_what_the_hand_began_relative_to():
@@ -162,24 +161,24 @@ def test_what_is_pushed_goes_along_and_not_what_the_hand_began_relative_to():
     )
     memory = entry(INSTRUCTION, (approach, of_stove, corner, end), LAYOUT)
     eyes, one = Perception(LAYOUT), row(memory, instruction=INSTRUCTION)
-    one.observe(HAND, eyes)
-    one.executor.begin(one.executor.plan, HAND, 1)
-    watch(one, eyes, Hand(one.executor.plan[1].T_world_ee, 0.0), 1)
+    observe(one, HAND, eyes)
+    one.executor.begin(one.executor.targets, HAND, 1)
+    watch(one, eyes, Hand(one.executor.targets[1].T_world_ee, 0.0), 1)
     assert one.scene.tracker.held == {"plate"}
 
 
 def test_a_plate_that_the_hand_has_not_reached_yet_is_not_left_behind():
     for gone, is_fetched in ((0.5 * OUTRUN_M, False), (3 * OUTRUN_M, True)):
         eyes, one = Perception(LAYOUT), row(turning_push(), instruction=INSTRUCTION)
-        one.observe(HAND, eyes)
-        contact = one.executor.plan[1].T_world_ee
-        one.executor.begin(one.executor.plan, HAND, 1)
+        observe(one, HAND, eyes)
+        contact = one.executor.targets[1].T_world_ee
+        one.executor.begin(one.executor.targets, HAND, 1)
         watch(one, eyes, Hand(contact, 0.0), 1)
         assert one.scene.tracker.held == {"plate"}
         ahead = contact.copy()
         ahead[1, 3] += gone
         watch(one, eyes, Hand(ahead, 0.0), 12)
-        assert (one.executor.index < 2) is is_fetched, gone
+        assert (one.state.index < 2) is is_fetched, gone
 
 
 def test_a_hand_that_is_on_its_way_to_the_plate_has_not_outrun_it():
@@ -187,15 +186,15 @@ def test_a_hand_that_is_on_its_way_to_the_plate_has_not_outrun_it():
     far = replace(contact, T_obj_ee=hand_pose(0.0, -0.2, 0.02))
     memory = entry(INSTRUCTION, (approach, far, corner, end), LAYOUT)
     eyes, one = Perception(LAYOUT), row(memory, instruction=INSTRUCTION)
-    one.observe(HAND, eyes)
-    met = one.executor.plan[1].T_world_ee
-    one.executor.begin(one.executor.plan, HAND, 1)
+    observe(one, HAND, eyes)
+    met = one.executor.targets[1].T_world_ee
+    one.executor.begin(one.executor.targets, HAND, 1)
     watch(one, eyes, Hand(met, 0.0), 1)
     assert one.scene.tracker.held == {"plate"}
     nearer = met.copy()
     nearer[1, 3] += 1.5 * OUTRUN_M
     watch(one, eyes, Hand(nearer, 0.0), 12)
-    assert one.executor.attempts == 0
+    assert one.state.attempts == 0
 
 
 def test_where_a_push_turns_the_place_of_meeting_is_not_told_by_its_end():
@@ -212,23 +211,23 @@ def test_what_a_push_leads_to_is_watched_beyond_a_turn():
     corner = replace(end, T_obj_ee=end.T_obj_ee @ se3.from_yaw([0.1, 0.0, 0.0], 0.0))
     memory = entry(INSTRUCTION, (approach, contact, corner, end), LAYOUT)
     eyes, one = Perception(LAYOUT), row(memory, instruction=INSTRUCTION)
-    one.observe(HAND, eyes)
-    here = Hand(one.executor.plan[2].T_world_ee, 0.0)
-    shown = one.executor.plan[3].T_world_ee
-    one.executor.begin(one.executor.plan, here, 3)
+    observe(one, HAND, eyes)
+    here = Hand(one.executor.targets[2].T_world_ee, 0.0)
+    shown = one.executor.targets[3].T_world_ee
+    one.executor.begin(one.executor.targets, here, 3)
     one.scene.tracker.hold("plate", here.T_world_ee)
     eyes.layout["stove"] = shifted(LAYOUT["stove"], 0.04)
     del eyes.layout["plate"]
     watch(one, eyes, here, 10)
-    assert_allclose(one.executor.plan[3].T_world_ee, shifted(shown, 0.04), atol=2e-3)
+    assert_allclose(one.executor.targets[3].T_world_ee, shifted(shown, 0.04), atol=2e-3)
 
 
 def pushing(one, eyes, ahead_m):
     """The hand during a push, so far ahead of where it entered the plate."""
-    one.observe(HAND, eyes)
-    one.executor.begin(one.executor.plan, HAND, 1)
-    inside = one.executor.plan[1].T_world_ee
-    one.observe(Hand(inside, 0.0), eyes)
+    observe(one, HAND, eyes)
+    one.executor.begin(one.executor.targets, HAND, 1)
+    inside = one.executor.targets[1].T_world_ee
+    observe(one, Hand(inside, 0.0), eyes)
     assert one.executor.target.key_pose.phase == "push"
     way = one.executor.target.T_world_ee[:3, 3] - inside[:3, 3]
     T = inside.copy()
@@ -256,17 +255,17 @@ def test_a_plate_that_slides_under_the_hand_is_pushed_on_and_one_left_behind_is_
         way /= np.linalg.norm(way)
         eyes.layout["plate"] = se3.from_yaw([*(met - (LEAD_M + behind) * way)[:2], 0.0], 0.0)
         watch(one, eyes, hand, 20)
-        assert one.status is Status.RUNNING
-        assert (one.executor.index < 2) is is_fetched, behind
+        assert one.state.status is Status.RUNNING
+        assert (one.state.index < 2) is is_fetched, behind
 
 
 def done(one, eyes, end):
     """The push, finished, with the plate where it is told, looked at once."""
-    one.observe(HAND, eyes)
-    last = one.executor.plan[-1]
+    observe(one, HAND, eyes)
+    last = one.executor.targets[-1]
     eyes.layout["plate"] = end
     one.scene.tracker.forget(["plate"])
-    one.executor.begin(one.executor.plan, HAND, len(one.executor.plan) - 1)
+    one.executor.begin(one.executor.targets, HAND, len(one.executor.targets) - 1)
     hand = Hand(last.T_world_ee, 0.0)
     watch(one, eyes, hand, 1)
     return hand
@@ -276,8 +275,8 @@ def test_a_plate_in_its_place_is_a_success():
     eyes, one = Perception(LAYOUT), row(push(), instruction=INSTRUCTION)
     goal = se3.from_yaw(se3.apply(LAYOUT["stove"], GOAL[None])[0], 0.0)
     done(one, eyes, goal)
-    assert one.status is Status.DONE
-    assert one.succeeded is True
+    assert one.state.status is Status.DONE
+    assert one.state.succeeded is True
 
 
 def test_a_plate_that_stopped_short_is_pushed_on_until_attempts_are_used_up():
@@ -285,27 +284,27 @@ def test_a_plate_that_stopped_short_is_pushed_on_until_attempts_are_used_up():
     goal = se3.from_yaw(se3.apply(LAYOUT["stove"], GOAL[None])[0], 0.0)
     hand = done(one, eyes, shifted(goal, 0.05))
     for attempt in range(1, ControlSettings().max_attempts + 1):
-        assert one.status is Status.RUNNING
-        assert one.executor.attempts == attempt
-        assert one.executor.index == 0
-        inside = one.executor.plan[1].T_world_ee[:3, 3]
+        assert one.state.status is Status.RUNNING
+        assert one.state.attempts == attempt
+        assert one.state.index == 0
+        inside = one.executor.targets[1].T_world_ee[:3, 3]
         assert_allclose(inside[:2], goal[:2, 3] + [0.05 - 0.03, 0.0], atol=2e-3)
-        one.executor.begin(one.executor.plan, HAND, 3)
-        hand = Hand(one.executor.plan[-1].T_world_ee, 0.0)
+        one.executor.begin(one.executor.targets, HAND, 3)
+        hand = Hand(one.executor.targets[-1].T_world_ee, 0.0)
         watch(one, eyes, hand, 10)
-    assert one.status is Status.NO_PROGRESS
-    assert one.succeeded is False
+    assert one.state.status is Status.NO_PROGRESS
+    assert one.state.succeeded is False
 
 
 def test_what_cannot_be_seen_in_the_end_is_done_and_not_known():
     eyes, one = Perception(LAYOUT), row(push(), instruction=INSTRUCTION)
-    one.observe(HAND, eyes)
-    one.executor.begin(one.executor.plan, HAND, 3)
+    observe(one, HAND, eyes)
+    one.executor.begin(one.executor.targets, HAND, 3)
     eyes.visible = 0.0
-    watch(one, eyes, Hand(one.executor.plan[-1].T_world_ee, 0.0), 40)
-    assert one.status is Status.DONE
-    assert one.succeeded is None
+    watch(one, eyes, Hand(one.executor.targets[-1].T_world_ee, 0.0), 40)
+    assert one.state.status is Status.DONE
+    assert one.state.succeeded is None
     assert one.scene.tracker.status("plate") is TrackStatus.HIDDEN
     asked = len(eyes.asked)
-    watch(one, eyes, Hand(one.executor.plan[-1].T_world_ee, 0.0), 40)
+    watch(one, eyes, Hand(one.executor.targets[-1].T_world_ee, 0.0), 40)
     assert len(eyes.asked) == asked, "it is not looked for on and on"

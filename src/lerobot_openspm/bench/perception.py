@@ -142,7 +142,7 @@ def measure_episode(
     samples: dict[str, list[Sample]] = {variant: [] for variant in VARIANTS}
 
     def compare(step: int, observation: Observation, row: EpisodeController) -> None:
-        if not row.planner.ranked:
+        if not row.state.ranked:
             return
         T_world_ee = observation.hand.T_world_ee
         true = truth.now(world.object_poses())
@@ -152,7 +152,7 @@ def measure_episode(
             "unfiltered": shadow.seen,
             "one_view": shadow.tracker.poses(T_world_ee),
         }
-        for name in (name for name in row.planner.ranked[0].entry.objects if name in offsets):
+        for name in (name for name in row.state.ranked[0].entry.objects if name in offsets):
             held = name in row.scene.tracker.held
             for variant, poses in known.items():
                 error: tuple[float | None, float | None] = (None, None)

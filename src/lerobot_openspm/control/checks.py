@@ -72,7 +72,7 @@ def check_transfer(
 
 def geometric_score(
     entry: MemoryEntry,
-    layout: Mapping[str, Array],
+    object_poses: Mapping[str, Array],
     yaw_periods: Mapping[str, float],
     T_world_ee: Array,
     robot: RobotModel,
@@ -86,15 +86,15 @@ def geometric_score(
 
     Args:
         entry: The entry.
-        layout: Present poses ``T_world_obj`` ``(4, 4)`` of the objects that were found.
+        object_poses: Present poses ``T_world_obj`` ``(4, 4)`` of the objects that were found.
         yaw_periods: Angle by object that turns it into itself, radians; 0 for a body of revolution.
         T_world_ee: Present hand pose ``(4, 4)``.
         robot: The robot.
         limits: Bounds of the checks.
     """
-    if any(name not in layout for name in entry.objects):
+    if any(name not in object_poses for name in entry.objects):
         return 0.0
-    targets = transfer(entry, layout, yaw_periods, T_world_ee)
+    targets = transfer(entry, object_poses, yaw_periods, T_world_ee)
     if check_transfer(targets, T_world_ee, robot, limits):
         return 0.0
     return max(float(np.exp(-shape_deviation(entry, targets) / SHAPE_SCALE_M)), MIN_USABLE_SCORE)

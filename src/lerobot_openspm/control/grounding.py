@@ -63,7 +63,7 @@ class Grounding:
         return changed
 
     def sort_out(
-        self, estimates: Mapping[str, PoseEstimate], layout: Mapping[str, Array]
+        self, estimates: Mapping[str, PoseEstimate], object_poses: Mapping[str, Array]
     ) -> dict[str, PoseEstimate]:
         """What was seen of the objects that are meant.
 
@@ -72,19 +72,19 @@ class Grounding:
 
         Args:
             estimates: What a look brought.
-            layout: Poses ``T_world_obj`` ``(4, 4)`` of objects seen before.
+            object_poses: Poses ``T_world_obj`` ``(4, 4)`` of objects seen before.
         """
         places = {name: one.T_world_obj for name, one in estimates.items() if one.status == "found"}
-        known = {**places, **layout}
+        known = {**places, **object_poses}
         return {name: self._meant(name, one, known) for name, one in estimates.items()}
 
-    def _meant(self, name: str, estimate: PoseEstimate, layout: Mapping[str, Array]) -> PoseEstimate:
+    def _meant(self, name: str, estimate: PoseEstimate, object_poses: Mapping[str, Array]) -> PoseEstimate:
         if name in self._not_meant:
             return self._unless_another(name, estimate)
         if estimate.status == "not_found" or not estimate.others:
             return estimate
         candidates = (estimate.T_world_obj, *estimate.others)
-        landmarks = {mark: T for mark, T in layout.items() if mark != name}
+        landmarks = {mark: T for mark, T in object_poses.items() if mark != name}
         index = choose(self.said[name], candidates, landmarks) if name in self.said else None
         if index is None:
             where = self.said.get(name, "nothing")

@@ -1,9 +1,6 @@
 import pytest
-from tests.memory.builders import robot
 
-from lerobot_openspm.control.executor import Executor
-from lerobot_openspm.control.status import TRANSITIONS, Status
-from lerobot_openspm.control.strategies import ControlSettings
+from lerobot_openspm.control.state import TRANSITIONS, EpisodeState, Status
 
 FINAL = {Status.NO_PROGRESS, Status.NOT_UNDERSTOOD, Status.CAMERA_FAULT}
 
@@ -24,9 +21,8 @@ def test_every_status_can_be_reached_from_the_start_and_every_one_but_the_final_
 
 @pytest.mark.parametrize("final", sorted(FINAL))
 def test_nothing_follows_the_end_of_an_episode(final: Status):
-    executor = Executor(ControlSettings(), robot())
-    executor.go(Status.RUNNING)
-    executor.stop(final)
-    executor.stop(final)
+    state = EpisodeState(Status.RUNNING)
+    state.go(final)
+    state.go(final)
     with pytest.raises(RuntimeError, match=f"from {final} to running"):
-        executor.go(Status.RUNNING)
+        state.go(Status.RUNNING)
