@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import logging
-from collections.abc import Generator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from copy import deepcopy
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -20,7 +18,7 @@ from torch import Tensor
 from lerobot_openspm.checkpoint import checkpoint_folder, load_memory
 from lerobot_openspm.configuration_openspm import OpenSPMConfig
 from lerobot_openspm.control.controller import EpisodeController
-from lerobot_openspm.control.planning import PlanningContext
+from lerobot_openspm.episodes import RunningEpisode, new_episode
 from lerobot_openspm.errors import DatasetError, MemoryFormatError, OpenSPMError
 from lerobot_openspm.flow.condition import CONDITION_DIM, encode, to_world_frame
 from lerobot_openspm.flow.network import VelocityField
@@ -30,31 +28,18 @@ from lerobot_openspm.memory.entry import MemoryEntry
 from lerobot_openspm.memory.indexed_entries import indexed
 from lerobot_openspm.memory.memory import Memory, write_memory
 from lerobot_openspm.perception.observation import Observation, split_batch
-from lerobot_openspm.perception.pipeline import Perception
-from lerobot_openspm.perception.tracking.tracker import TrackerSettings
 from lerobot_openspm.types import Hand, Segmenter
 
 if TYPE_CHECKING:
     from lerobot_openspm.teaching import Lesson
-
-logger = logging.getLogger(__name__)
 
 # Options that mean nothing on another machine; a checkpoint is saved without them.
 ON_ONE_MACHINE = (
     "cameras", "sam3d_python", "sam3d_checkout", "phase_judge_api_base", "phase_judge_cache",
 )  # fmt: skip
 
-# Of checkpoints that do not say how often their robot acts.
-DEFAULT_CONTROL_HZ = 20.0
-
-
-@dataclass
-class RunningEpisode:
-    """One environment: what decides there, through what it looks, whether its outcome was reported."""
-
-    controller: EpisodeController
-    perception: Perception
-    is_reported: bool = False
+# What `huggingface_hub.snapshot_download` is told besides the revision.
+HUB_OPTIONS = ("force_download", "token", "cache_dir", "local_files_only")
 
 
 class OpenSPMPolicy(PreTrainedPolicy):
@@ -89,10 +74,8 @@ class OpenSPMPolicy(PreTrainedPolicy):
         if dataset_meta is not None:
             _ = self.names  # what cannot be used is an error now, not at the first observation
             config.control_hz = config.control_hz or float(dataset_meta.fps)
-            from lerobot_openspm.training import learn
-
-            self.memory, self._training_set = learn(dataset_meta, config, None, self.segmenter)
-            self.flow.action_scale.copy_(self._training_set.action_scale)
+            training_set = self._learn(dataset_meta)
+            self.flow.action_scale.copy_(training_set.action_scale)
         self.reset()
 
     # Acting. Top to bottom: look where the controller wants it, ask for a chunk where it is needed, act.
@@ -113,8 +96,15 @@ class OpenSPMPolicy(PreTrainedPolicy):
         The policy stays as it is: episodes go on, with :meth:`select_action`, as if nobody had asked.
         """
         observations, n_steps = split_batch(batch, self.config.layouts()[0]), self.config.chunk_size
-        with self._looking_ahead():
+        running, is_training = self.episodes, self.training
+        # Copies act. They share the memory and the segmenter, which are large and never change.
+        shared = [self.segmenter, *(one.perception.memory for one in running)]
+        try:
+            self.episodes = deepcopy(running, {id(one): one for one in shared})
             return self._encode(self.act(observations, n_steps, n_steps))
+        finally:
+            self.episodes = running
+            self.train(is_training)
 
     @torch.no_grad()
     def act(
@@ -145,19 +135,6 @@ class OpenSPMPolicy(PreTrainedPolicy):
                 actions[row, i] = action
         return actions
 
-    @contextmanager
-    def _looking_ahead(self) -> Generator[None]:
-        """Act on copies of the running episodes; at the end those that were running are back."""
-        running, is_training = self.episodes, self.training
-        # The memory and a segmenter's weights are large and never change: the copies share them.
-        shared = [self.segmenter, *(one.perception.memory for one in running)]
-        try:
-            self.episodes = deepcopy(running, {id(one): one for one in shared})
-            yield
-        finally:
-            self.episodes = running
-            self.train(is_training)
-
     def _begin_episodes(self, observations: Sequence[Observation]) -> None:
         """Begin an episode wherever there is none, or its instruction is new."""
         if len(self.episodes) != len(observations):
@@ -167,31 +144,23 @@ class OpenSPMPolicy(PreTrainedPolicy):
                 self.episodes[i] = self._new_episode(observation)
 
     def _new_episode(self, observation: Observation) -> RunningEpisode:
-        memory, config = self.require_memory(), self.config
+        memory = self.require_memory()
         # Episodes share the index, which is made anew when the memory was replaced.
         if self._entries is None or self._entries[0] is not memory.entries:
             self._entries = memory.entries, indexed(memory.entries)
-        context = PlanningContext(
-            self._entries[1], memory.yaw_periods, memory.robot, config.score_weights,
-            config.transfer_limits, config.control_settings, TrackerSettings(), config.tracking,
-            self.step_s, self.names,
-        )  # fmt: skip
-        controller = EpisodeController(
-            context, observation.instruction, observation.fingerprint(), config.noise_seed
-        )
-        return RunningEpisode(controller, Perception(memory, config.hand_radius_m, self.segmenter))
+        entries = self._entries[1]
+        return new_episode(observation, memory, entries, self.config, self.names, self.segmenter)
 
     def _chunk(self, controller: EpisodeController, hand: Hand) -> np.ndarray:
         """Generate a chunk ``(chunk_size, 7)`` in the world. Episodes go one by one, so batches act alike."""
         query = controller.executor.query(hand)
-        condition = encode(query, self.config.conditioning)
+        condition = encode(query, self.config.conditioning)[None]
         noise = controller.noise((1, self.config.chunk_size, 7))
         device = self.flow.action_scale.device
-        chunk = self.flow.sample(
-            torch.as_tensor(condition[None], dtype=torch.float32, device=device),
-            torch.as_tensor(noise, dtype=torch.float32, device=device),
-            self.config.num_inference_steps,
+        condition, noise = (
+            torch.as_tensor(array, dtype=torch.float32, device=device) for array in (condition, noise)
         )
+        chunk = self.flow.sample(condition, noise, self.config.num_inference_steps)
         actions = chunk[0].cpu().numpy().astype(float)
         return to_world_frame(actions, query.T_world_target, self.config.conditioning)
 
@@ -199,11 +168,6 @@ class OpenSPMPolicy(PreTrainedPolicy):
         """Actions ``(..., 7)`` in the robot's own layout."""
         vectors = self.config.layouts()[1].encode_actions(actions)
         return torch.as_tensor(vectors, dtype=torch.float32, device=self.config.device)
-
-    @property
-    def step_s(self) -> float:
-        """Seconds that a control step takes."""
-        return 1 / (self.config.control_hz or DEFAULT_CONTROL_HZ)
 
     @cached_property
     def segmenter(self) -> Segmenter | None:
@@ -225,13 +189,13 @@ class OpenSPMPolicy(PreTrainedPolicy):
     def report_outcomes(self, successes: Sequence[bool | None] | None = None) -> None:
         """Tell how the running episodes ended, before the next :meth:`reset`; the memory learns from it.
 
-        The quality of the entries that each episode was acted by follows, for the episodes to come and in
-        what is saved from now on. An episode counts once, however often it is reported.
+        The quality of the entries that each episode was acted by changes, for later episodes and in what is
+        saved. A failure does not count for the parts of an instruction that were seen to be done. An episode
+        counts once, however often it is reported.
 
         Args:
-            successes: For every environment, in the order of the observations, whether its episode succeeded;
-                None where that is not known. Without it what the policy has seen itself counts:
-                :attr:`outcomes`.
+            successes: For every environment whether its episode succeeded, None where that is not known; what
+                the policy has seen itself (:attr:`outcomes`) if not given.
 
         Raises:
             OpenSPMError: There are more or fewer environments.
@@ -246,10 +210,16 @@ class OpenSPMPolicy(PreTrainedPolicy):
         for episode, success in zip(self.episodes, successes, strict=True):
             if success is not None and not episode.is_reported:
                 episode.is_reported = True
-                used = {id(entry): entry for entry in episode.controller.state.used}
-                outcomes += [(entry, success) for entry in used.values()]
+                outcomes += episode.controller.state.entry_outcomes(success)
         if outcomes:
             self.memory = self.require_memory().with_outcomes(outcomes)
+
+    def _learn(self, dataset_meta: Any) -> TrainingSet:
+        """Mine a dataset: the memory begins or goes on with it, and the flow model learns from it."""
+        from lerobot_openspm.training import learn
+
+        self.memory, self._training_set = learn(dataset_meta, self.config, self.memory, self.segmenter)
+        return self._training_set
 
     def forward(self, batch: dict[str, Tensor], reduction: str = "mean") -> tuple[Tensor, dict[str, float]]:
         """Flow-matching loss of the batch's frames, and of others drawn beside them while training.
@@ -308,38 +278,27 @@ class OpenSPMPolicy(PreTrainedPolicy):
         dataset_stats: dict[str, dict[str, Tensor]] | None = None,
         dataset_meta: Any | None = None,
         strict: bool = True,
-        force_download: bool = False,
-        token: str | bool | None = None,
-        cache_dir: str | Path | None = None,
-        local_files_only: bool = False,
         revision: str | None = None,
         **kwargs: Any,
     ) -> OpenSPMPolicy:
         """Load weights, memory and calibration from a directory or from the Hub.
 
         With `dataset_meta`, training goes on: the memory is kept, appended to or rebuilt, as
-        ``config.memory_update`` says.
+        ``config.memory_update`` says. What else LeRobot takes for a download is taken here.
 
         Raises:
             MemoryFormatError: The checkpoint has no memory, or a damaged or newer one.
         """
-        directory = checkpoint_folder(
-            pretrained_name_or_path, revision, force_download=force_download, token=token,
-            cache_dir=cache_dir, local_files_only=local_files_only,
-        )  # fmt: skip
+        hub = {option: kwargs.pop(option) for option in HUB_OPTIONS if option in kwargs}
+        directory = checkpoint_folder(pretrained_name_or_path, revision, **hub)
         policy = super().from_pretrained(directory, config=config, strict=strict, **kwargs)
-        policy._attach(directory, dataset_meta)
-        return policy
-
-    def _attach(self, directory: Path, dataset_meta: Any | None) -> None:
-        """Give a freshly loaded policy its memory, and its training set when training goes on."""
-        is_kept = self.config.memory_update == "keep" or dataset_meta is None
-        self.memory = load_memory(directory, self.config, is_kept)
-        _ = self.segmenter, self.names  # what cannot be used is an error now, not at the first observation
+        is_kept = policy.config.memory_update == "keep" or dataset_meta is None
+        policy.memory = load_memory(directory, policy.config, is_kept)
+        # What cannot be used is an error now, not at the first observation.
+        _ = policy.segmenter, policy.names
         if dataset_meta is not None:
-            from lerobot_openspm.training import learn
-
-            self.memory, self._training_set = learn(dataset_meta, self.config, self.memory, self.segmenter)
+            policy._learn(dataset_meta)
+        return policy
 
     def require_memory(self) -> Memory:
         """What was mined. Raises MemoryFormatError when nothing was."""

@@ -83,3 +83,15 @@ def test_outcomes_of_episodes_that_do_not_run_are_refused(
     policy.reset()
     policy.report_outcomes([])
     assert trials(policy) == {}
+
+
+def test_a_failure_counts_for_the_part_that_failed_and_not_for_the_one_that_was_seen_to_be_done(
+    policy: OpenSPMPolicy, recorded: list[list[Frame]]
+):
+    policy.select_action(batch_of([recorded[0][0], recorded[3][0]]))
+    done, failed = (policy.episodes[i].controller.state for i in (0, 1))
+    done.parts, done.used = done.parts + failed.parts, done.used + failed.used
+    done.begin_next_part()
+    done.verdicts = (True,)
+    policy.report_outcomes([False, None])
+    assert trials(policy) == {done.used[0].source: (1, 1), done.used[1].source: (1, 0)}

@@ -19,6 +19,7 @@ from lerobot_openspm.bench.object_frames import offset
 from lerobot_openspm.bench.truth import Truth, pose_error, true_period
 from lerobot_openspm.control.controller import EpisodeController
 from lerobot_openspm.envs.recording import source
+from lerobot_openspm.episodes import step_s
 from lerobot_openspm.files import write_json
 from lerobot_openspm.geometry.se3 import Array
 from lerobot_openspm.modeling_openspm import OpenSPMPolicy
@@ -171,7 +172,7 @@ class _Shadow:
         first = next(iter(memory.cameras))
         one_camera = replace(memory, cameras={first: memory.cameras[first]})
         self._eyes = Perception(one_camera, policy.config.hand_radius_m, policy.segmenter)
-        self._step_s = policy.step_s
+        self._step_s = step_s(policy.config)
         self.tracker = Tracker(memory.yaw_periods, TrackerSettings())
         self.seen: dict[str, Array] = {}
         self._time_s = self._looked_at_s = 0.0

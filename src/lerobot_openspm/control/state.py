@@ -137,6 +137,20 @@ class EpisodeState:
         is_known = self.status is Status.DONE and all(verdict is True for verdict in self.verdicts)
         return self.verdict if is_known else None
 
+    def entry_outcomes(self, success: bool) -> list[tuple[MemoryEntry, bool]]:
+        """How the entries fared that were acted by, each once, given whether the episode succeeded.
+
+        A failure does not count for the parts that were seen to be done, but for all others that were begun.
+        Where every part was seen to be done, one of the sightings is wrong, and the failure counts for all.
+        """
+        seen = list(zip(self.used, (*self.verdicts, self.verdict), strict=False))
+        is_denied = len(seen) == len(self.parts) and all(verdict is True for _, verdict in seen)
+        fared: dict[int, tuple[MemoryEntry, bool]] = {}
+        for entry, verdict in seen:
+            _, before = fared.get(id(entry), (entry, True))
+            fared[id(entry)] = entry, before and (success or (verdict is True and not is_denied))
+        return list(fared.values())
+
     def begin_next_part(self) -> None:
         """Turn to the next part, which has attempts and looks of its own."""
         self.verdicts = (*self.verdicts, self.verdict)
