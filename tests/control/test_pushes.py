@@ -308,3 +308,44 @@ def test_what_cannot_be_seen_in_the_end_is_done_and_not_known():
     asked = len(eyes.asked)
     watch(one, eyes, Hand(one.executor.targets[-1].T_world_ee, 0.0), 40)
     assert len(eyes.asked) == asked, "it is not looked for on and on"
+
+
+def landmark_push():
+    """A push whose key poses all belong to the stove, where the plate should end."""
+
+    def of_stove(pose):
+        T_world_ee = pose.anchor.frame(LAYOUT) @ pose.T_obj_ee
+        return replace(
+            pose, anchor=Anchor("stove", "stove"), T_obj_ee=se3.inverse(LAYOUT["stove"]) @ T_world_ee
+        )
+
+    return replace(push(), key_poses=tuple(of_stove(pose) for pose in push().key_poses))
+
+
+def test_what_is_pushed_is_looked_for_although_no_key_pose_belongs_to_it():
+    eyes, one = Perception(LAYOUT), row(landmark_push(), instruction=INSTRUCTION)
+    observe(one, HAND, eyes)
+    assert set(eyes.asked[0]) == {"plate", "stove"}
+    eyes.layout["plate"] = moved = shifted(LAYOUT["plate"], 0.05)
+    watch(one, eyes, HAND, 12)
+    assert_allclose(one.state.plan.object_poses["plate"], moved, atol=2e-3)
+    phases = [pose.phase for pose in landmark_push().key_poses]
+    for index, phase in enumerate(phases):
+        is_before = phase == "approach"
+        assert ("plate" in one.state.plan.objects(index, ())) is is_before, "the hand meets it in the push"
+
+
+def test_a_push_by_its_landmark_alone_begins_beside_the_plate_wherever_it_stands():
+    layout = {**LAYOUT, "plate": se3.from_yaw([0.25, -0.15, 0.0], 0.0)}
+    for scene in (LAYOUT, layout):
+        found, expected = (ends(memory, scene) for memory in (landmark_push(), push()))
+        assert_allclose(found, expected, atol=1e-9)
+
+
+def test_a_plate_that_no_key_pose_belongs_to_and_that_is_not_found_does_not_hold_up_its_push():
+    eyes, one = Perception({"stove": LAYOUT["stove"]}), row(landmark_push(), instruction=INSTRUCTION)
+    observe(one, HAND, eyes)
+    assert one.state.status is Status.RUNNING
+    eyes.layout["plate"] = LAYOUT["plate"]
+    watch(one, eyes, HAND, 6)
+    assert "plate" in one.state.plan.object_poses, "it is taken up when it is seen"

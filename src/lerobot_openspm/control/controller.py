@@ -17,7 +17,7 @@ from lerobot_openspm.control.executor import Executor
 from lerobot_openspm.control.planning import Plan, PlanningContext, is_met, until
 from lerobot_openspm.control.scene import GIVE_UP_S, LookRequest, SceneState
 from lerobot_openspm.control.state import LOOKS_AT_OUTCOME, EpisodeState, Status
-from lerobot_openspm.control.transfer import Target, rise, transfer
+from lerobot_openspm.control.transfer import Target, pushed_by_landmark, rise, transfer
 from lerobot_openspm.errors import InstructionError
 from lerobot_openspm.geometry.se3 import Array
 from lerobot_openspm.memory.compose import plan_parts
@@ -123,7 +123,7 @@ class EpisodeController:
             state.start_height = float(hand.T_world_ee[2, 3])
             scene.ground(state.parts[0])
         entries = [one.entry for part in state.parts[state.part :] for one in part]
-        needed = [name for entry in entries for name in entry.objects]
+        needed = [name for entry in entries for name in (*entry.objects, *pushed_by_landmark(entry).values())]
         names = dict.fromkeys([*needed, *scene.grounding.landmarks])
         return scene.look([name for name in names if name not in scene.altered], hand)
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from lerobot_openspm.control.checks import TransferLimits, check_transfer, geometric_score
 from lerobot_openspm.control.strategies import ControlSettings
-from lerobot_openspm.control.transfer import Target, transfer
+from lerobot_openspm.control.transfer import Target, pushed_by_landmark, transfer
 from lerobot_openspm.geometry import se3
 from lerobot_openspm.geometry.se3 import Array
 from lerobot_openspm.language.names import TABLE_NAMES, NameSimilarity
@@ -111,7 +111,10 @@ class Plan:
         moved: dict[str, Array] = {}
         for name in names:
             if name in object_poses:
-                metres, radians = se3.distances(object_poses[name], self.object_poses[name])
+                planned = self.object_poses.get(name)
+                metres, radians = (
+                    (np.inf, np.inf) if planned is None else se3.distances(object_poses[name], planned)
+                )
                 if metres > MOVED_M or radians > MOVED_RAD:
                     moved[name] = object_poses[name]
         return moved
@@ -120,6 +123,11 @@ class Plan:
         """Objects of the key poses from an index on, without those that look different by now."""
         ahead = self.entry.key_poses[index:]
         names = dict.fromkeys(name for pose in ahead for name in pose.anchor.objects)
+        # What is pushed is needed until the push begins, also if no key pose belongs to it.
+        pushed = pushed_by_landmark(self.entry)
+        for pose in ahead[1:]:
+            if pose.phase == "push" and pose.sub_task in pushed:
+                names[pushed[pose.sub_task]] = None
         return [name for name in names if name not in altered]
 
     def touched(self, passed: Sequence[Target]) -> set[str]:

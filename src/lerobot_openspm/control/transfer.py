@@ -9,7 +9,7 @@ import numpy as np
 
 from lerobot_openspm.geometry import se3
 from lerobot_openspm.geometry.se3 import Array
-from lerobot_openspm.memory.entry import CONTACT_PHASES, Axis, MemoryEntry, MemoryKeyPose
+from lerobot_openspm.memory.entry import CONTACT_PHASES, Axis, MemoryEntry, MemoryKeyPose, Outcome
 
 # How far the hand backs off at the end.
 RETREAT_M = 0.06
@@ -30,15 +30,18 @@ class PushPath:
         target: The object that is pushed.
         shown: Start and end ``(2, 3)`` of the target in the demonstration, in the world.
         now: Start and end ``(2, 3)`` of the target here.
+        is_by_landmark: Whether none of its key poses belongs to the target.
     """
 
     target: str
     shown: Array
     now: Array
+    is_by_landmark: bool = False
 
     def position(self, pose: MemoryKeyPose, layout_shown: Mapping[str, Array]) -> Array:
         """Where the hand goes ``(3,)`` for a key pose of the push."""
-        place = 0 if pose.anchor.place == self.target else 1
+        is_at_start = pose.anchor.place == self.target or (self.is_by_landmark and pose.phase == "approach")
+        place = 0 if is_at_start else 1
         T_world_ee = pose.anchor.frame(layout_shown) @ pose.T_obj_ee
         turn = _heading(self.now) - _heading(self.shown)
         if min(_length(self.shown), _length(self.now)) < MIN_PUSH_M:
@@ -139,24 +142,41 @@ def transfer(
 
 
 def push_paths(entry: MemoryEntry, object_poses: Mapping[str, Array]) -> dict[int, PushPath]:
-    """The paths of an entry's pushes by sub-task, of those whose outcome is known.
+    """The paths of an entry's pushes by sub-task, of those whose outcome is known."""
+    by_landmark = pushed_by_landmark(entry)
+    paths: dict[int, PushPath] = {}
+    for outcome in _push_outcomes(entry):
+        if any(name not in poses for name in outcome.objects for poses in (entry.layout, object_poses)):
+            continue
+        shown = np.stack([entry.layout[outcome.target][:3, 3], outcome.place_shown(entry.layout)])
+        now = np.stack([object_poses[outcome.target][:3, 3], outcome.place(object_poses)])
+        is_by_landmark = outcome.sub_task in by_landmark
+        paths[outcome.sub_task] = PushPath(outcome.target, shown, now, is_by_landmark)
+    return paths
+
+
+def pushed_by_landmark(entry: MemoryEntry) -> dict[int, str]:
+    """By sub-task, the targets of an entry's pushes that none of the push's key poses belongs to."""
+    return {
+        outcome.sub_task: outcome.target
+        for outcome in _push_outcomes(entry)
+        if not any(
+            outcome.target in pose.anchor.objects
+            for pose in entry.key_poses
+            if pose.sub_task == outcome.sub_task
+        )
+    }
+
+
+def _push_outcomes(entry: MemoryEntry) -> list[Outcome]:
+    """The outcomes of an entry's pushes.
 
     A sub-task that also grasps its target is no push: the target goes where the hand carries it.
     """
     pushing, grasping = (
         {pose.sub_task for pose in entry.key_poses if pose.phase == phase} for phase in ("push", "grasp")
     )
-    pushing -= grasping
-    paths: dict[int, PushPath] = {}
-    for outcome in entry.outcomes:
-        if outcome.sub_task not in pushing or any(
-            name not in poses for name in outcome.objects for poses in (entry.layout, object_poses)
-        ):
-            continue
-        shown = np.stack([entry.layout[outcome.target][:3, 3], outcome.place_shown(entry.layout)])
-        now = np.stack([object_poses[outcome.target][:3, 3], outcome.place(object_poses)])
-        paths[outcome.sub_task] = PushPath(outcome.target, shown, now)
-    return paths
+    return [one for one in entry.outcomes if one.sub_task in pushing - grasping]
 
 
 def rise(last: Target, height: float) -> tuple[Target, ...]:
