@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
-from tests.control.test_controller import HAND, Perception, observe, row, watch
+from tests.control.test_controller import HAND, Perception, controller, observe, watch
 from tests.memory.builders import entry, hand_pose, key_pose, pick_and_place
 
 from lerobot_openspm.control.scene import GIVE_UP_S
@@ -44,16 +44,16 @@ def test_travel_is_the_inverse_of_following(axis):
 
 @pytest.mark.parametrize("axis", KINDS.values(), ids=list(KINDS))
 def test_a_handle_that_slipped_out_is_taken_again_where_it_is_now_for_the_rest_of_its_way(axis):
-    eyes, one = Perception(CABINET), row(handle(axis), instruction=OPEN)
-    observe(one, HAND, eyes)
+    perception, one = Perception(CABINET), controller(handle(axis), instruction=OPEN)
+    observe(one, HAND, perception)
     shown = [target.T_world_ee for target in one.executor.targets]
     here = Hand(shown[2], 0.03)
     one.executor.begin(one.executor.targets, here, 3)
     world_axis = one.executor.targets[3].axis
     way = Axis(axis.kind, world_axis.direction, 0.4 * axis.amount)
-    watch(one, eyes, Hand(way.follow(shown[2]), 0.03), 1)
+    watch(one, perception, Hand(way.follow(shown[2]), 0.03), 1)
     assert one.state.index == 3
-    watch(one, eyes, Hand(axis.follow(shown[2]), 0.0), 1)  # the fingers have closed
+    watch(one, perception, Hand(axis.follow(shown[2]), 0.0), 1)  # the fingers have closed
     assert one.state.index == 0
     for index in (0, 1, 2):
         assert_allclose(one.executor.targets[index].T_world_ee, way.follow(shown[index]), atol=1e-9)
@@ -64,17 +64,17 @@ def test_a_handle_that_slipped_out_is_taken_again_where_it_is_now_for_the_rest_o
 
 def test_a_handle_that_went_back_when_it_slipped_out_is_looked_for_nearer_to_where_it_was():
     axis = KINDS["slide"]
-    eyes, one = Perception(CABINET), row(handle(axis), instruction=OPEN)
-    observe(one, HAND, eyes)
+    perception, one = Perception(CABINET), controller(handle(axis), instruction=OPEN)
+    observe(one, HAND, perception)
     shown = [target.T_world_ee for target in one.executor.targets]
     one.executor.begin(one.executor.targets, Hand(shown[2], 0.03), 3)
     way = Axis(axis.kind, one.executor.targets[3].axis.direction, 0.4 * axis.amount)
-    watch(one, eyes, Hand(way.follow(shown[2]), 0.03), 1)
-    watch(one, eyes, Hand(way.follow(shown[2]), 0.0), 1)
+    watch(one, perception, Hand(way.follow(shown[2]), 0.03), 1)
+    watch(one, perception, Hand(way.follow(shown[2]), 0.0), 1)
     for share in (0.2, 0.1):  # it is not where it slipped out
         there = one.executor.targets[2].T_world_ee
         one.executor.begin(one.executor.targets, Hand(there, 0.0), 3)
-        watch(one, eyes, Hand(there, 0.0), 1)
+        watch(one, perception, Hand(there, 0.0), 1)
         nearer = Axis(axis.kind, way.direction, share * axis.amount)
         assert_allclose(one.executor.targets[2].T_world_ee, nearer.follow(shown[2]), atol=1e-9)
 
@@ -82,8 +82,8 @@ def test_a_handle_that_went_back_when_it_slipped_out_is_looked_for_nearer_to_whe
 @pytest.mark.parametrize("share", [0.93, 0.97, 1.1])
 def test_a_handle_that_slipped_out_near_the_end_and_went_back_is_not_looked_for_further_out(share):
     axis = KINDS["slide"]
-    eyes, one = Perception(CABINET), row(handle(axis), instruction=OPEN)
-    observe(one, HAND, eyes)
+    perception, one = Perception(CABINET), controller(handle(axis), instruction=OPEN)
+    observe(one, HAND, perception)
     shown = [target.T_world_ee for target in one.executor.targets]
     one.executor.begin(one.executor.targets, Hand(shown[2], 0.03), 3)
     direction = one.executor.targets[3].axis.direction
@@ -91,42 +91,42 @@ def test_a_handle_that_slipped_out_near_the_end_and_went_back_is_not_looked_for_
     def pulled(metres):
         return Axis("slide", direction, metres).follow(shown[2])
 
-    watch(one, eyes, Hand(pulled(share * axis.amount), 0.03), 1)
-    watch(one, eyes, Hand(pulled(share * axis.amount), 0.0), 1)
+    watch(one, perception, Hand(pulled(share * axis.amount), 0.03), 1)
+    watch(one, perception, Hand(pulled(share * axis.amount), 0.0), 1)
     slipped = np.linalg.norm(one.executor.targets[2].T_world_ee[:3, 3] - shown[2][:3, 3])
     assert slipped < axis.amount
     there = one.executor.targets[2].T_world_ee
     one.executor.begin(one.executor.targets, Hand(there, 0.0), 3)
     drifted = there.copy()
     drifted[:3, 3] += 0.003 * (there[:3, 3] - shown[2][:3, 3]) / slipped  # the hand never stands quite still
-    watch(one, eyes, Hand(drifted, 0.0), 1)
+    watch(one, perception, Hand(drifted, 0.0), 1)
     assert_allclose(one.executor.targets[2].T_world_ee, pulled(0.5 * slipped), atol=1e-9)
 
 
 def test_a_handle_that_does_not_move_on_in_the_fingers_is_taken_again_where_it_is():
     axis = KINDS["slide"]
-    eyes, one = Perception(CABINET), row(handle(axis), instruction=OPEN)
-    observe(one, HAND, eyes)
+    perception, one = Perception(CABINET), controller(handle(axis), instruction=OPEN)
+    observe(one, HAND, perception)
     shown = [target.T_world_ee for target in one.executor.targets]
     one.executor.begin(one.executor.targets, Hand(shown[2], 0.03), 3)
     way = Axis(axis.kind, one.executor.targets[3].axis.direction, 0.4 * axis.amount)
-    watch(one, eyes, Hand(way.follow(shown[2]), 0.03), 1)
-    watch(one, eyes, Hand(way.follow(shown[2]), 0.0), 1)
+    watch(one, perception, Hand(way.follow(shown[2]), 0.03), 1)
+    watch(one, perception, Hand(way.follow(shown[2]), 0.0), 1)
     held = Hand(one.executor.targets[2].T_world_ee, 0.03)
     one.executor.begin(one.executor.targets, held, 3)
     for _ in range(200):
-        watch(one, eyes, held, 1)
+        watch(one, perception, held, 1)
         if one.state.attempts == 2:
             break
     assert one.state.attempts == 2
     assert_allclose(one.executor.targets[2].T_world_ee, way.follow(shown[2]), atol=1e-9)
 
 
-def stuck(one, eyes, hand, index):
+def stuck(one, perception, hand, index):
     """The hand, held up short of a key pose until it is given up."""
     one.executor.begin(one.executor.targets, hand, index)
     for _ in range(200):
-        watch(one, eyes, hand, 1)
+        watch(one, perception, hand, 1)
         if one.state.attempts:
             return
     pytest.fail("it was not given up")
@@ -134,16 +134,16 @@ def stuck(one, eyes, hand, index):
 
 def carrying(opening):
     """The bowl is in the hand, and its place is not reached."""
-    eyes, one = Perception(entry().layout), row()
-    observe(one, HAND, eyes)
+    perception, one = Perception(entry().layout), controller()
+    observe(one, HAND, perception)
     one.executor.begin(one.executor.targets, HAND, 2)
     grasp = one.executor.targets[2]
-    watch(one, eyes, Hand(grasp.T_world_ee, grasp.key_pose.opening), grasp.key_pose.n_steps + 1)
+    watch(one, perception, Hand(grasp.T_world_ee, grasp.key_pose.opening), grasp.key_pose.n_steps + 1)
     assert one.scene.tracker.held == {"bowl"}
-    eyes.visible = 0.0
+    perception.visible = 0.0
     place = one.executor.targets[5].T_world_ee.copy()
     place[2, 3] += 0.02
-    stuck(one, eyes, Hand(place, opening), 5)
+    stuck(one, perception, Hand(place, opening), 5)
     return one
 
 
@@ -161,15 +161,15 @@ def test_what_is_no_more_in_the_hand_is_fetched():
 
 
 def test_what_slipped_out_while_it_was_lifted_stands_where_it_stood_and_does_not_hang_in_the_air():
-    eyes, one = Perception(entry().layout), row()
-    observe(one, HAND, eyes)
+    perception, one = Perception(entry().layout), controller()
+    observe(one, HAND, perception)
     first = one.executor.targets[0].T_world_ee
     one.executor.begin(one.executor.targets, HAND, 2)
     grasp, lift = one.executor.targets[2], one.executor.targets[3]
-    watch(one, eyes, Hand(grasp.T_world_ee, grasp.key_pose.opening), grasp.key_pose.n_steps + 1)
+    watch(one, perception, Hand(grasp.T_world_ee, grasp.key_pose.opening), grasp.key_pose.n_steps + 1)
     assert one.scene.tracker.held == {"bowl"}
-    eyes.visible = 0.0  # the hand hides it
-    watch(one, eyes, Hand(lift.T_world_ee, 0.0), 1)
+    perception.visible = 0.0  # the hand hides it
+    watch(one, perception, Hand(lift.T_world_ee, 0.0), 1)
     assert one.state.index == 0
     assert_allclose(one.executor.targets[0].T_world_ee, first, atol=1e-6)
 
@@ -178,16 +178,17 @@ def test_what_a_later_sub_task_grasps_again_stays_in_the_hand():
     both = "put the bowl on the plate and put the bowl on the stove"
     again = [replace(pose, sub_task=1) for pose in pick_and_place("bowl", "stove")]
     layout = {**entry().layout, "stove": se3.from_yaw([-0.2, -0.1, 0.0], 0.0)}
-    eyes, one = Perception(layout), row(entry(both, (*pick_and_place(), *again), layout), instruction=both)
-    observe(one, HAND, eyes)
+    perception = Perception(layout)
+    one = controller(entry(both, (*pick_and_place(), *again), layout), instruction=both)
+    observe(one, HAND, perception)
     one.executor.begin(one.executor.targets, HAND, 2)
     grasp, lift = one.executor.targets[2], one.executor.targets[3]
-    watch(one, eyes, Hand(grasp.T_world_ee, 0.03), grasp.key_pose.n_steps + 1)
-    eyes.layout["bowl"] = lift.T_world_ee @ se3.inverse(grasp.T_world_ee) @ layout["bowl"]
-    watch(one, eyes, Hand(lift.T_world_ee, 0.03), 1)
+    watch(one, perception, Hand(grasp.T_world_ee, 0.03), grasp.key_pose.n_steps + 1)
+    perception.layout["bowl"] = lift.T_world_ee @ se3.inverse(grasp.T_world_ee) @ layout["bowl"]
+    watch(one, perception, Hand(lift.T_world_ee, 0.03), 1)
     assert one.executor.targets[one.state.index].key_pose.phase == "pre-place"
-    eyes.layout["plate"] = layout["plate"] @ se3.from_yaw([0.05, 0.05, 0.0], 0.0)
-    watch(one, eyes, Hand(lift.T_world_ee, 0.03), 15)
+    perception.layout["plate"] = layout["plate"] @ se3.from_yaw([0.05, 0.05, 0.0], 0.0)
+    watch(one, perception, Hand(lift.T_world_ee, 0.03), 15)
     assert one.state.attempts == 0
     assert one.scene.tracker.held == {"bowl"}
 
@@ -198,11 +199,11 @@ ON_PLATE = Outcome(0, "bowl", Anchor("plate", "plate"), np.zeros(3), np.zeros(3)
 def ended(at, look=None):
     """A bowl that was let go at a place relative to the plate, the hand gone, and looks from then on."""
     place = entry().layout["plate"] @ se3.from_yaw([*at], 0.0)
-    eyes, one = Perception(entry().layout), row(entry(outcomes=(ON_PLATE,)))
-    observe(one, HAND, eyes)
+    perception, one = Perception(entry().layout), controller(entry(outcomes=(ON_PLATE,)))
+    observe(one, HAND, perception)
     one.executor.begin(one.executor.targets, HAND, 7)
-    eyes.layout["bowl"] = place
-    watch(one, look or eyes, Hand(one.executor.targets[7].T_world_ee, 0.08), 12)
+    perception.layout["bowl"] = place
+    watch(one, look or perception, Hand(one.executor.targets[7].T_world_ee, 0.08), 12)
     return one, place
 
 
@@ -236,22 +237,22 @@ def drawer_opened_but_bowl_missed(putting):
     layout = {**entry().layout, **CABINET}
     both = "put the bowl on the plate and open the top drawer"
     whole = entry(both, (*putting, *pull), layout, outcomes=(ON_PLATE,))
-    eyes, one = Perception(layout), row(whole, instruction=both)
-    observe(one, HAND, eyes)
+    perception, one = Perception(layout), controller(whole, instruction=both)
+    observe(one, HAND, perception)
     last = len(one.executor.targets) - 1
     one.executor.begin(one.executor.targets, HAND, last)
-    eyes.layout["bowl"] = layout["plate"] @ se3.from_yaw([0.06, 0.0, 0.0], 0.0)
-    watch(one, eyes, Hand(one.executor.targets[last].T_world_ee, 0.08), 12)
-    return eyes, one
+    perception.layout["bowl"] = layout["plate"] @ se3.from_yaw([0.06, 0.0, 0.0], 0.0)
+    watch(one, perception, Hand(one.executor.targets[last].T_world_ee, 0.08), 12)
+    return perception, one
 
 
 def test_of_several_things_to_do_only_the_one_that_is_missed_is_done_again():
-    eyes, one = drawer_opened_but_bowl_missed(pick_and_place())
+    perception, one = drawer_opened_but_bowl_missed(pick_and_place())
     assert one.state.index == 0
     assert {target.key_pose.sub_task for target in one.executor.targets} == {0}
     one.executor.begin(one.executor.targets, HAND, 7)
-    eyes.layout["bowl"] = entry().layout["plate"]
-    watch(one, eyes, Hand(one.executor.targets[7].T_world_ee, 0.08), 12)
+    perception.layout["bowl"] = entry().layout["plate"]
+    watch(one, perception, Hand(one.executor.targets[7].T_world_ee, 0.08), 12)
     assert one.state.status is Status.DONE
     assert one.state.attempts == 1
     assert one.state.succeeded is True, "the drawer went all the way before"
@@ -267,11 +268,11 @@ def test_an_outcome_that_no_key_pose_leads_to_is_not_tried_again():
     memory = entry("put both bowls on the plate", pick_and_place(), layout,
                    outcomes=(replace(ON_PLATE, sub_task=1),))  # fmt: skip
     assert len(memory.key.sub_tasks) == 2
-    eyes, one = Perception(layout), row(memory, instruction="put both bowls on the plate")
-    observe(one, HAND, eyes)
+    perception, one = Perception(layout), controller(memory, instruction="put both bowls on the plate")
+    observe(one, HAND, perception)
     one.executor.begin(one.executor.targets, HAND, 7)
-    eyes.layout["bowl"] = layout["plate"] @ se3.from_yaw([0.06, 0.0, 0.0], 0.0)
-    watch(one, eyes, Hand(one.executor.targets[7].T_world_ee, 0.08), 12)
+    perception.layout["bowl"] = layout["plate"] @ se3.from_yaw([0.06, 0.0, 0.0], 0.0)
+    watch(one, perception, Hand(one.executor.targets[7].T_world_ee, 0.08), 12)
     assert one.state.status is Status.DONE
     assert one.state.attempts == 0
     assert one.state.succeeded is None
@@ -292,10 +293,10 @@ def test_an_episode_that_is_given_up_has_failed():
 def test_a_handle_that_went_all_the_way_is_a_success_if_the_fingers_could_feel_it():
     for opening, expected in ((0.03, True), (0.001, None)):
         poses = [replace(pose, opening=opening) for pose in handle(KINDS["slide"]).key_poses]
-        eyes, one = Perception(CABINET), row(entry(OPEN, poses, CABINET), instruction=OPEN)
-        observe(one, HAND, eyes)
+        perception, one = Perception(CABINET), controller(entry(OPEN, poses, CABINET), instruction=OPEN)
+        observe(one, HAND, perception)
         last = len(one.executor.targets) - 1
         one.executor.begin(one.executor.targets, HAND, last)
-        watch(one, eyes, Hand(one.executor.targets[last].T_world_ee, 0.08), 12)
+        watch(one, perception, Hand(one.executor.targets[last].T_world_ee, 0.08), 12)
         assert one.state.status is Status.DONE
         assert one.state.succeeded is expected

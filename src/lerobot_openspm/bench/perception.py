@@ -182,7 +182,7 @@ class _Shadow:
         self._time_s += self._step_s
         self.tracker.predict(self._step_s)
         hand = observation.hand.T_world_ee
-        if row.scene.has_just_looked and row.scene.detections is not None:
+        if row.scene.has_just_looked:
             estimates = row.scene.detections.estimates
             self.seen |= {name: e.T_world_obj for name, e in estimates.items() if e.status == "found"}
             seen = self._eyes.detect(observation, list(estimates), self.tracker.poses(hand), self._time_s)

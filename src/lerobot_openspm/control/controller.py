@@ -15,13 +15,14 @@ import numpy as np
 
 from lerobot_openspm.control.executor import Executor
 from lerobot_openspm.control.planning import Plan, PlanningContext, is_met, until
-from lerobot_openspm.control.scene import GIVE_UP_S, LookRequest, SceneState
+from lerobot_openspm.control.scene import GIVE_UP_S, LOOK_AGAIN_S, SECOND_LOOK_S, LookRequest, SceneState
 from lerobot_openspm.control.state import LOOKS_AT_OUTCOME, EpisodeState, Status
 from lerobot_openspm.control.transfer import Target, pushed_by_landmark, rise, transfer
 from lerobot_openspm.errors import InstructionError
 from lerobot_openspm.geometry.se3 import Array
 from lerobot_openspm.memory.compose import plan_parts
 from lerobot_openspm.memory.entry import Outcome
+from lerobot_openspm.perception.tracking.tracker import TrackStatus
 from lerobot_openspm.types import Detections, Hand
 
 logger = logging.getLogger(__name__)
@@ -67,11 +68,11 @@ class EpisodeController:
         self.scene.predict()
         match self.state.status:
             case Status.WAITING | Status.OBJECT_NOT_FOUND | Status.INFEASIBLE:
-                return self._look_for_plan(hand) if self.scene.is_time_for_another_look else None
+                return self._look_for_plan(hand) if self.scene.is_due(LOOK_AGAIN_S) else None
             case Status.RUNNING | Status.PAUSED:
                 return self._follow_plan(hand)
             case Status.OBJECT_LOST:
-                return self._look_around(hand) if self.scene.is_time_for_a_second_look else None
+                return self._look_around(hand) if self.scene.is_due(SECOND_LOOK_S) else None
             case Status.DONE:
                 return self._look_at_outcome(hand) if self.state.looks_left > 0 else None
             case Status.NO_PROGRESS | Status.NOT_UNDERSTOOD | Status.CAMERA_FAULT:
@@ -105,7 +106,7 @@ class EpisodeController:
 
     def _check_cameras(self) -> None:
         """Give up where a camera gave no sound picture for too long, unless all is done but to look."""
-        for camera, fault in self.scene.faults.items():
+        for camera, fault in self.scene.detections.faults.items():
             if fault.seconds >= GIVE_UP_S and self.state.status is not Status.DONE:
                 logger.warning("%r: stopping, camera %r: %s", self.instruction, camera, fault.reason)
                 self.executor.stop(Status.CAMERA_FAULT)
@@ -189,11 +190,11 @@ class EpisodeController:
             return False
         if target.key_pose.dwell and not is_paused:
             return False  # the fingers hide what they are around
-        if scene.faults:
+        if scene.detections.faults:
             return True
         if is_paused or scene.tracker.doubtful:
-            return scene.is_time_for_a_second_look
-        return self.state.index != index_before or scene.is_time_for_another_look
+            return scene.is_due(SECOND_LOOK_S)
+        return self.state.index != index_before or scene.is_due(LOOK_AGAIN_S)
 
     def _look_around(self, hand: Hand) -> LookRequest:
         """Look for what the remaining key poses need, and for what is in the hand."""
@@ -247,14 +248,15 @@ class EpisodeController:
     def _wait_for_what_is_needed(self, hand: Hand) -> None:
         """Hold still without sound pictures, and while what the hand is on its way to is not to be seen."""
         state, scene, needed = self.state, self.scene, self._now_needed()
-        if lost := scene.lost(needed):
+        if lost := scene.those(TrackStatus.LOST, needed):
             if state.status is not Status.OBJECT_LOST:
                 logger.info("%r: lost: %s", self.instruction, ", ".join(lost))
             self.executor.stop(Status.OBJECT_LOST)
             return
         if state.status is Status.OBJECT_LOST:
             self._begin(self.executor.way_index(), hand)
-        state.go(Status.PAUSED if scene.is_blind or scene.is_any_stale(needed) else Status.RUNNING)
+        is_paused = scene.is_blind or scene.those(TrackStatus.STALE, needed)
+        state.go(Status.PAUSED if is_paused else Status.RUNNING)
 
     def _untouched(self) -> list[str]:
         """Objects of the key poses to come that still are where they were seen."""
@@ -298,7 +300,7 @@ class EpisodeController:
     def _look_at_outcome(self, hand: Hand) -> LookRequest | None:
         """Look whether what was to be done is done, as far as that can be seen."""
         state, scene = self.state, self.scene
-        if state.looks_left < LOOKS_AT_OUTCOME and not scene.is_time_for_a_second_look:
+        if state.looks_left < LOOKS_AT_OUTCOME and not scene.is_due(SECOND_LOOK_S):
             return None
         if not self._is_tracking:
             return self._end_part(hand)
@@ -334,7 +336,7 @@ class EpisodeController:
         state.looks_left = 0
         if not self.executor.try_again(f"the {missed.target} is not where it should be"):
             return
-        state.repeat(missed.sub_task)
+        state.looks_left, state.verdict, state.repeated = LOOKS_AT_OUTCOME, None, missed.sub_task
         poses = state.plan.entry.key_poses
         index = next(i for i, pose in enumerate(poses) if pose.sub_task == missed.sub_task)
         self._follow_objects(state.plan.objects(index, self.scene.altered), hand)

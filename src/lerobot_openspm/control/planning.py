@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -15,14 +15,15 @@ from lerobot_openspm.geometry.se3 import Array
 from lerobot_openspm.language.names import TABLE_NAMES, NameSimilarity
 from lerobot_openspm.language.vocabulary import SURFACES
 from lerobot_openspm.memory.compose import Candidate
-from lerobot_openspm.memory.entry import WORLD, MemoryEntry, MemoryKeyPose, Outcome
+from lerobot_openspm.memory.entry import WORLD, MemoryEntry, MemoryKeyPose, Outcome, RetrievalKey
 from lerobot_openspm.memory.retrieval import Scored, ScoreWeights, retrieve
 from lerobot_openspm.memory.robot import RobotModel
-from lerobot_openspm.perception.tracking.tracker import TrackerSettings
 from lerobot_openspm.types import SubTask
 
 # An object this far from where the key poses took it to be takes them along; less is noise.
 MOVED_M, MOVED_RAD = 0.002, 0.05
+# Where an object is that was never seen.
+NOWHERE = se3.transform(np.eye(3), np.full(3, np.inf))
 
 
 @dataclass(frozen=True)
@@ -36,7 +37,6 @@ class PlanningContext:
         weights: Of retrieval.
         limits: Of transferred key poses.
         settings: How key poses are followed.
-        tracker: When poses are believed.
         tracking: Whether objects are looked for again once a plan is made.
         step_s: Seconds that a control step takes.
         names: Tells which names in an instruction mean the same thing.
@@ -48,7 +48,6 @@ class PlanningContext:
     weights: ScoreWeights
     limits: TransferLimits
     settings: ControlSettings
-    tracker: TrackerSettings = field(default_factory=TrackerSettings)
     tracking: bool = True
     step_s: float = 0.05
     names: NameSimilarity = TABLE_NAMES
@@ -109,14 +108,11 @@ class Plan:
     def moved(self, names: Sequence[str], object_poses: Mapping[str, Array]) -> dict[str, Array]:
         """The poses of those objects that are elsewhere now than where the plan takes them to be."""
         moved: dict[str, Array] = {}
-        for name in names:
-            if name in object_poses:
-                planned = self.object_poses.get(name)
-                metres, radians = (
-                    (np.inf, np.inf) if planned is None else se3.distances(object_poses[name], planned)
-                )
-                if metres > MOVED_M or radians > MOVED_RAD:
-                    moved[name] = object_poses[name]
+        for name in (name for name in names if name in object_poses):
+            T = object_poses[name]
+            metres, radians = se3.distances(T, self.object_poses.get(name, NOWHERE))
+            if metres > MOVED_M or radians > MOVED_RAD:
+                moved[name] = T
         return moved
 
     def objects(self, index: int, altered: Collection[str]) -> list[str]:
@@ -170,3 +166,7 @@ def is_met(outcome: Outcome, poses: Mapping[str, Array], yaw_periods: Mapping[st
         return outcome.is_met(poses)
     turned = se3.yaw_equivalents(poses[axes], yaw_periods.get(axes, 2 * np.pi))
     return any(outcome.is_met({**poses, axes: T}) for T in turned)
+
+
+# Before the first plan: nothing is done, nowhere.
+NO_PLAN = Plan(MemoryEntry(RetrievalKey((), ()), "", (), 0.0, 0, ""), {}, np.eye(4))

@@ -12,8 +12,8 @@ from lerobot_openspm.control.planning import Plan, PlanningContext
 from lerobot_openspm.control.transfer import Target
 from lerobot_openspm.geometry.se3 import Array
 from lerobot_openspm.memory.compose import Candidate
-from lerobot_openspm.perception.tracking.tracker import Tracker, TrackStatus
-from lerobot_openspm.types import Detections, Fault, Hand
+from lerobot_openspm.perception.tracking.tracker import Tracker, TrackerSettings, TrackStatus
+from lerobot_openspm.types import Detections, Hand
 
 # An object that is not found is looked for again after this time; while things go well, all objects are.
 LOOK_AGAIN_S = 0.25
@@ -51,21 +51,18 @@ class SceneState:
     Attributes:
         tracker: Follows every object that was looked for.
         grounding: Which of several like objects is meant.
-        detections: What the last look brought; None before the first.
+        detections: What the last look brought.
         altered: Objects that were opened or turned: they look different now, and stand still.
     """
 
     def __init__(self, context: PlanningContext):
         self._context = context
-        self.tracker = Tracker(context.yaw_periods, context.tracker)
+        self.tracker = Tracker(context.yaw_periods, TrackerSettings())
         self.grounding = Grounding()
-        self.detections: Detections | None = None
+        self.detections = Detections({}, {})
         self.altered: set[str] = set()
         self._step = -1
-        # Both at least one step; four looks a second whatever the robot's rate.
-        self._look_again_steps = max(1, round(LOOK_AGAIN_S / context.step_s))
-        self._second_look_steps = max(1, round(SECOND_LOOK_S / context.step_s))
-        self._looked_at_step = -self._look_again_steps
+        self._looked_at_step = -self._steps(LOOK_AGAIN_S)
 
     # Looking.
 
@@ -94,7 +91,8 @@ class SceneState:
         Raises:
             InstructionError: The instruction tells like objects apart by a relation that is not known.
         """
-        waited_s = min(self._waited_steps, self._look_again_steps) * self._context.step_s
+        waited_steps = min(self._step - self._looked_at_step, self._steps(LOOK_AGAIN_S))
+        waited_s = waited_steps * self._context.step_s
         self.detections = detections
         self._looked_at_step = self._step
         known = {**self._context.surfaces, **self.tracker.poses(hand.T_world_ee)}
@@ -106,45 +104,27 @@ class SceneState:
         """Whether the last observation was looked at."""
         return self._looked_at_step == self._step
 
-    @property
-    def is_time_for_another_look(self) -> bool:
-        """Whether what was not found may be looked for again."""
-        return self._waited_steps >= self._look_again_steps
+    def is_due(self, seconds: float) -> bool:
+        """Whether the last look is so long ago; at least one step, whatever the robot's rate."""
+        return self._step - self._looked_at_step >= self._steps(seconds)
 
-    @property
-    def is_time_for_a_second_look(self) -> bool:
-        """Whether what looked wrong may be looked at again."""
-        return self._waited_steps >= self._second_look_steps
-
-    @property
-    def _waited_steps(self) -> int:
-        return self._step - self._looked_at_step
+    def _steps(self, seconds: float) -> int:
+        return max(1, round(seconds / self._context.step_s))
 
     # What was seen.
 
     @property
-    def faults(self) -> Mapping[str, Fault]:
-        """Cameras that were no use at the last look."""
-        return {} if self.detections is None else self.detections.faults
-
-    @property
     def is_blind(self) -> bool:
         """Whether a camera gave no sound picture for long enough to hold still."""
-        return any(fault.seconds >= BLIND_S for fault in self.faults.values())
+        return any(fault.seconds >= BLIND_S for fault in self.detections.faults.values())
 
     def recognised(self) -> set[str]:
         """The objects that the last look recognised."""
-        if self.detections is None:
-            return set()
         return {name for name in self.detections.estimates if self.tracker.is_seen(name)}
 
-    def lost(self, names: Sequence[str]) -> list[str]:
-        """Those of the objects that were seen before and are gone."""
-        return [name for name in names if self.tracker.status(name) is TrackStatus.LOST]
-
-    def is_any_stale(self, names: Sequence[str]) -> bool:
-        """Whether one of the objects was not seen for a while."""
-        return any(self.tracker.status(name) is TrackStatus.STALE for name in names)
+    def those(self, status: TrackStatus, names: Sequence[str]) -> list[str]:
+        """Those of some objects that have a status."""
+        return [name for name in names if self.tracker.status(name) is status]
 
     # What goes along with the hand.
 

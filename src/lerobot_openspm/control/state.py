@@ -8,7 +8,7 @@ from enum import StrEnum
 
 import numpy as np
 
-from lerobot_openspm.control.planning import Plan
+from lerobot_openspm.control.planning import NO_PLAN, Plan
 from lerobot_openspm.memory.compose import Candidate
 from lerobot_openspm.memory.entry import MemoryEntry, Outcome
 from lerobot_openspm.memory.retrieval import Scored
@@ -67,6 +67,7 @@ class EpisodeState:
         part: The part that is carried out now, counted from 0.
         start_height: Height of the hand when the instruction was read, metres.
         ranked: The entries of the last retrieval with their scores, best first.
+        plan: What is acted by, and where.
         used: For each part that was begun, the entry of the memory that it was carried out by.
         verdicts: For each part that was ended, whether it is seen to be done; None where that is not known.
         index: The key pose that is approached.
@@ -84,6 +85,7 @@ class EpisodeState:
     part: int = 0
     start_height: float = np.inf
     ranked: tuple[Scored, ...] = ()
+    plan: Plan = NO_PLAN
     used: tuple[MemoryEntry, ...] = ()
     verdicts: tuple[bool | None, ...] = ()
     index: int = 0
@@ -93,7 +95,6 @@ class EpisodeState:
     gone: dict[int, float] = field(default_factory=dict[int, float])
     followed: set[int] = field(default_factory=set[int])
     repeated: int | None = None
-    _plan: Plan | None = None
 
     def __deepcopy__(self, memo: dict[int, object]) -> EpisodeState:
         """A copy that goes on by itself. Entries and plans never change, so both share them."""
@@ -108,21 +109,6 @@ class EpisodeState:
         if status is not self.status and status not in TRANSITIONS[self.status]:
             raise RuntimeError(f"an episode cannot go from {self.status} to {status}")
         self.status = status
-
-    @property
-    def plan(self) -> Plan:
-        """What is acted by, and where.
-
-        Raises:
-            RuntimeError: There is no plan yet.
-        """
-        if self._plan is None:
-            raise RuntimeError("there is no plan to follow yet")
-        return self._plan
-
-    @plan.setter
-    def plan(self, plan: Plan) -> None:
-        self._plan = plan
 
     @property
     def is_last_part(self) -> bool:
@@ -157,10 +143,6 @@ class EpisodeState:
         self.part += 1
         self.attempts, self.looks_left, self.verdict = 0, LOOKS_AT_OUTCOME, None
         self.gone, self.followed, self.repeated = {}, set(), None
-
-    def repeat(self, sub_task: int) -> None:
-        """Do one sub-task again, and look at it afresh then."""
-        self.looks_left, self.verdict, self.repeated = LOOKS_AT_OUTCOME, None, sub_task
 
     def judge(self, expected: Sequence[Outcome], missed: Sequence[Outcome]) -> None:
         """Take in which outcomes are missed. The others, and handles that went all the way, are done."""
