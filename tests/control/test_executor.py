@@ -307,7 +307,7 @@ def test_closed_loop_queries_start_from_the_hand():
     assert_allclose(query.T_world_target, executor.targets[0].T_world_ee)
     assert query.opening == pytest.approx(0.5)
     assert query.closed == 0
-    assert executor.replans == 1
+    assert executor.state.replans == 1
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])

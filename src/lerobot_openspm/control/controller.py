@@ -52,7 +52,7 @@ class EpisodeController:
 
     def noise(self, shape: tuple[int, ...]) -> Array:
         """Standard normal noise of the next chunk, a function of (seed, episode, chunk) alone."""
-        return np.random.default_rng([*self._noise_key, self.executor.replans]).standard_normal(shape)
+        return np.random.default_rng([*self._noise_key, self.state.replans]).standard_normal(shape)
 
     # One control step.
 
@@ -267,7 +267,7 @@ class EpisodeController:
     def _now_needed(self) -> list[str]:
         """Objects that the present key pose is relative to, unless the hand has touched them."""
         untouched = self._untouched()
-        anchor = self.executor.targets[self.state.index].key_pose.anchor
+        anchor = self.executor.present.key_pose.anchor
         return [name for name in anchor.objects if name in untouched]
 
     # Trying again.
@@ -277,7 +277,7 @@ class EpisodeController:
         state, executor, tracker = self.state, self.executor, self.scene.tracker
         executor.note_travel(hand)
         # With the object still in the hand only the way to its place is gone again.
-        is_carrying = bool(tracker.held) and executor.approach.target.key_pose.phase == "place"
+        is_carrying = bool(tracker.held) and executor.present.key_pose.phase == "place"
         is_in_hand = is_carrying and not executor.has_lost_grip(hand)
         index = executor.way_index() if is_in_hand else executor.contact_index()
         state.plan = replace(state.plan, T_world_ee=hand.T_world_ee)

@@ -39,15 +39,14 @@ class Executor:
         state: What is being done; the controller's.
         strategy: How key poses are followed.
         targets: The key poses in the scene; of the present one, the target as it is approached.
-        replans: Chunks asked for so far; seeds the noise of each.
+        approach: The way to the present key pose.
     """
 
     def __init__(self, settings: ControlSettings, robot: RobotModel, state: EpisodeState):
         self._settings, self._robot, self.state = settings, robot, state
         self.strategy = STRATEGIES[settings.execution](settings, robot)
         self.targets: tuple[Target, ...] = ()
-        self.replans = 0
-        self._approach: Approach | None = None
+        self.approach = Approach(np.eye(4))
         self._believed = np.eye(4)  # where the hand should be, by the actions given out so far
         self._queue: deque[Array] = deque()
 
@@ -62,10 +61,10 @@ class Executor:
 
     def change(self, targets: Sequence[Target]) -> None:
         """Follow better versions of the same key poses from here on."""
-        present = self.targets[self.state.index]
+        present = self.present
         self.targets = tuple(targets)
         # A drawer or a knob goes on from where the hand took hold of it.
-        self._approach_target(present if present.axis is not None else self.targets[self.state.index])
+        self._approach_target(present if present.axis is not None else self.present)
         self._queue.clear()
 
     def stop(self, status: Status) -> None:
@@ -77,18 +76,12 @@ class Executor:
     def target(self) -> Target | None:
         """The key pose that is being approached, or None."""
         is_approached = self.state.status in (Status.RUNNING, Status.PAUSED)
-        return self.targets[self.state.index] if is_approached else None
+        return self.present if is_approached else None
 
     @property
-    def approach(self) -> Approach:
-        """The way to the present key pose.
-
-        Raises:
-            RuntimeError: There is no plan yet.
-        """
-        if self._approach is None:
-            raise RuntimeError("there is no plan to follow yet; call begin() first")
-        return self._approach
+    def present(self) -> Target:
+        """The present key pose, be it approached or not."""
+        return self.targets[self.state.index]
 
     def _here(self, hand: Hand) -> Array:
         """Where the hand is taken to be, ``T_world_ee`` ``(4, 4)``."""
@@ -103,7 +96,7 @@ class Executor:
         if target.axis is not None:
             # What slides or turns does so from where the hand took hold of it, be that a little off.
             target = replace(target, T_world_ee=target.axis.follow(start))
-        self._approach = Approach(target, start, 0)
+        self.approach = Approach(start)
         self._approach_target(target)
         self._queue.clear()
 
@@ -111,7 +104,6 @@ class Executor:
         """Approach a target at the present index, from where the way began."""
         index, approach = self.state.index, self.approach
         self.targets = (*self.targets[:index], target, *self.targets[index + 1 :])
-        approach.target = target
         approach.nominal_steps = target.key_pose.n_steps
         if not target.key_pose.dwell:
             length = float(se3.distance(approach.start, target.T_world_ee))
@@ -131,7 +123,7 @@ class Executor:
             if self.has_lost_grip(hand):
                 return self.try_again("the fingers hold nothing")
             approach = self.approach
-            if (axis := approach.target.axis) is not None:
+            if (axis := self.present.axis) is not None:
                 approach.travelled = max(approach.travelled, axis.travel(approach.start, hand.T_world_ee))
             if not self._is_met(hand):
                 return self._is_given_up(hand)
@@ -142,35 +134,34 @@ class Executor:
         return False
 
     def _is_met(self, hand: Hand) -> bool:
-        approach = self.approach
-        if approach.target.key_pose.dwell:
-            return approach.is_time_up
-        return self.strategy.is_met(approach, hand)
+        if self.present.key_pose.dwell:
+            return self.approach.is_time_up
+        return self.strategy.is_met(self.present, self.approach, hand)
 
     def _is_given_up(self, hand: Hand) -> bool:
         """Whether the present key pose is tried again because its corrections are used up."""
         approach = self.approach
         is_used_up = approach.corrections > self._settings.max_corrections
-        is_passed_by = not approach.target.precise and self.state.index + 1 < len(self.targets)
+        is_passed_by = not self.present.precise and self.state.index + 1 < len(self.targets)
         if is_passed_by and (is_used_up or approach.is_blocked):
             # A hand that is held up short of a key pose it only passes by goes on to the next one.
             self._enter(self.state.index + 1, hand)
             return False
         if not is_used_up:
             return False
-        metres, radians = se3.distances(hand.T_world_ee, approach.target.T_world_ee)
+        metres, radians = se3.distances(hand.T_world_ee, self.present.T_world_ee)
         return self.try_again(f"it stays {1000 * metres:.1f} mm and {radians:.3f} rad away")
 
     def next_action(self, hand: Hand) -> Array | None:
         """The next canonical action ``(7,)``, or None when a chunk is needed (:meth:`query`)."""
         if self.state.status is not Status.RUNNING:
             return self.hold()
-        approach = self.approach
-        if approach.target.key_pose.dwell:
-            action = self.strategy.toward(approach.target, self._here(hand))
+        target, approach = self.present, self.approach
+        if target.key_pose.dwell:
+            action = self.strategy.toward(target, self._here(hand))
         elif self._queue:
-            action = self.strategy.from_chunk(self._queue.popleft(), approach, hand)
-        elif (action := self.strategy.correct(approach, hand)) is None:
+            action = self.strategy.from_chunk(self._queue.popleft(), target, approach, hand)
+        elif (action := self.strategy.correct(target, approach, hand)) is None:
             return None
         approach.steps += 1
         self._believed = se3.apply_increment(self._believed, action[:6] * self._robot.gains)
@@ -178,18 +169,17 @@ class Executor:
 
     def hold(self) -> Array:
         """The action that stays where it is, fingers as they are."""
-        closed = self.targets[self.state.index].key_pose.closed if self.targets else False
+        closed = self.present.key_pose.closed if self.targets else False
         return np.array([0.0] * 6 + [self._robot.command(closed)])
 
     def query(self, hand: Hand) -> Query:
         """The condition of the next chunk, which is counted."""
-        approach, here = self.approach, self._here(hand)
-        target = approach.target
-        self.replans += 1
+        target, here = self.present, self._here(hand)
+        self.state.replans += 1
         return Query(
             T_world_ee=here,
             T_world_target=target.T_world_ee,
-            progress=progress(approach.start, here, target.T_world_ee),
+            progress=progress(self.approach.start, here, target.T_world_ee),
             closed=np.asarray(float(target.key_pose.closed)),
             opening=np.asarray(hand.opening / max(self._robot.open_width, 1e-9)),
             phase=np.asarray(PHASES.index(target.key_pose.phase)),
@@ -205,7 +195,7 @@ class Executor:
                 f"the flow model gave actions that are not finite: {actions}; its weights are "
                 "damaged, train again"
             )
-        fingers = self._robot.command(self.approach.target.key_pose.closed)
+        fingers = self._robot.command(self.present.key_pose.closed)
         self._queue.extend(np.append(action[:6], fingers) for action in actions)
 
     # Contact.
@@ -214,7 +204,7 @@ class Executor:
         """Whether the fingers closed further than the demonstration's did around the object."""
         if not self.strategy.feels_fingers or self.state.index == 0:
             return False
-        before, now = self.targets[self.state.index - 1].key_pose, self.targets[self.state.index].key_pose
+        before, now = self.targets[self.state.index - 1].key_pose, self.present.key_pose
         passed = [one.key_pose for one in self.targets[: self.state.index]]
         grasped = next((p for p in reversed(passed) if p.phase in ("grasp", "release", "push")), None)
         if not (before.closed and now.closed) or now.phase == "push":
@@ -246,7 +236,7 @@ class Executor:
     def try_again(self, why: str) -> bool:
         """Count another attempt at the present key pose; without one left there is no progress."""
         self.state.attempts += 1
-        phase = self.targets[self.state.index].key_pose.phase
+        phase = self.present.key_pose.phase
         if self.state.attempts > self._settings.max_attempts:
             self.stop(Status.NO_PROGRESS)
             logger.info("giving up at key pose %d (%s): %s", self.state.index, phase, why)
@@ -256,7 +246,7 @@ class Executor:
 
     def way_index(self) -> int:
         """The first key pose of the way to the present one, at the same anchor and after the last contact."""
-        index, place = self.state.index, self.targets[self.state.index].key_pose.anchor.place
+        index, place = self.state.index, self.present.key_pose.anchor.place
         while index > 0:
             before = self.targets[index - 1].key_pose
             if before.anchor.place != place or before.phase in CONTACTS:
@@ -275,7 +265,7 @@ class Executor:
 
     def note_travel(self, hand: Hand) -> None:
         """Take in how far a drawer or a knob has moved that has to be taken hold of again."""
-        key_pose, gone = self.approach.target.key_pose, self.state.gone
+        key_pose, gone = self.present.key_pose, self.state.gone
         shown = key_pose.axis  # the whole way, of which the target's own axis is what is left
         if shown is None or not self.feels_handle(self.state.index):
             return

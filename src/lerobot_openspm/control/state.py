@@ -71,6 +71,7 @@ class EpisodeState:
         used: For each part that was begun, the entry of the memory that it was carried out by.
         verdicts: For each part that was ended, whether it is seen to be done; None where that is not known.
         index: The key pose that is approached.
+        replans: Chunks asked for so far; seeds the noise of each.
         attempts: Attempts beyond the first at the present part.
         looks_left: How often the end of the present part may still be looked at.
         verdict: Whether the present part is seen to be done; None where that is not known.
@@ -89,6 +90,7 @@ class EpisodeState:
     used: tuple[MemoryEntry, ...] = ()
     verdicts: tuple[bool | None, ...] = ()
     index: int = 0
+    replans: int = 0
     attempts: int = 0
     looks_left: int = LOOKS_AT_OUTCOME
     verdict: bool | None = None

@@ -53,7 +53,6 @@ class Approach:
     """The way to one key pose.
 
     Attributes:
-        target: The key pose.
         start: The hand's pose ``T_world_ee`` ``(4, 4)`` where the way begins.
         nominal_steps: How long the way should take, by the demonstration and by its length here.
         steps: Control steps taken so far.
@@ -64,9 +63,8 @@ class Approach:
         travelled: How far a drawer or a knob has followed the hand, metres or radians.
     """
 
-    target: Target
     start: Array
-    nominal_steps: int
+    nominal_steps: int = 0
     steps: int = 0
     corrections: int = 0
     late_steps: int = 0
@@ -89,15 +87,15 @@ class ClosedLoop:
     def __init__(self, settings: ControlSettings, robot: RobotModel):
         self._settings, self._robot = settings, robot
 
-    def is_met(self, approach: Approach, hand: Hand) -> bool:
+    def is_met(self, target: Target, approach: Approach, hand: Hand) -> bool:
         """Whether a key pose in motion is met."""
-        return approach.is_time_up or self._is_near(approach, hand)
+        return approach.is_time_up or self._is_near(target, approach, hand)
 
-    def from_chunk(self, action: Array, approach: Approach, hand: Hand) -> Array:
+    def from_chunk(self, action: Array, target: Target, approach: Approach, hand: Hand) -> Array:
         """The action ``(7,)`` that is taken for one of the flow model's."""
         return action
 
-    def correct(self, approach: Approach, hand: Hand) -> Array | None:
+    def correct(self, target: Target, approach: Approach, hand: Hand) -> Array | None:
         """An action ``(7,)`` instead of the next chunk's; None where a chunk is wanted."""
         return None
 
@@ -113,8 +111,8 @@ class ClosedLoop:
         motion = motion / max(1.0, float(np.abs(motion).max()))
         return np.append(motion, self._robot.command(target.key_pose.closed))
 
-    def _is_near(self, approach: Approach, hand: Hand) -> bool:
-        target, settings = approach.target, self._settings
+    def _is_near(self, target: Target, approach: Approach, hand: Hand) -> bool:
+        settings = self._settings
         metres, radians = se3.distances(hand.T_world_ee, target.T_world_ee)
         if target.precise:
             share = max(float(metres) / settings.residual_m, float(radians) / settings.residual_rad)
@@ -127,7 +125,7 @@ class OpenLoop(ClosedLoop):
 
     measures = False
 
-    def is_met(self, approach: Approach, hand: Hand) -> bool:
+    def is_met(self, target: Target, approach: Approach, hand: Hand) -> bool:
         """Whether the time for a key pose is up."""
         return approach.is_time_up
 
@@ -140,34 +138,34 @@ class ClosedLoopTRC(ClosedLoop):
 
     feels_fingers = True
 
-    def is_met(self, approach: Approach, hand: Hand) -> bool:
+    def is_met(self, target: Target, approach: Approach, hand: Hand) -> bool:
         """Whether the hand is within the key pose's tolerance."""
-        return self._is_near(approach, hand)
+        return self._is_near(target, approach, hand)
 
-    def from_chunk(self, action: Array, approach: Approach, hand: Hand) -> Array:
+    def from_chunk(self, action: Array, target: Target, approach: Approach, hand: Hand) -> Array:
         """The flow model's action, kept on the path of a push."""
-        is_pushing = approach.target.key_pose.phase == "push"
-        return self._kept_on_way(action, approach, hand) if is_pushing else action
+        is_pushing = target.key_pose.phase == "push"
+        return self._kept_on_way(action, target, approach, hand) if is_pushing else action
 
-    def correct(self, approach: Approach, hand: Hand) -> Array | None:
+    def correct(self, target: Target, approach: Approach, hand: Hand) -> Array | None:
         """Make good what the flow model has left of the way, once its time is up."""
         if not approach.is_time_up:
             return None
         if approach.late_steps % CORRECTION_STEPS == 0:
             approach.corrections += 1
-            left = float(se3.distance(hand.T_world_ee, approach.target.T_world_ee))
+            left = float(se3.distance(hand.T_world_ee, target.T_world_ee))
             approach.is_blocked = left > STUCK_SHARE * approach.left
             approach.left = left
         approach.late_steps += 1
         share = min(1.0, CORRECTION_SHARE * approach.corrections)
-        return self.toward(approach.target, hand.T_world_ee, share)
+        return self.toward(target, hand.T_world_ee, share)
 
-    def _kept_on_way(self, action: Array, approach: Approach, hand: Hand) -> Array:
+    def _kept_on_way(self, action: Array, target: Target, approach: Approach, hand: Hand) -> Array:
         """An action whose motion across the straight way to the key pose leads back to that way.
 
         Nothing holds what is pushed. A hand that strays by millimetres slips over or past it.
         """
-        here, end = hand.T_world_ee[:3, 3], approach.target.T_world_ee[:3, 3]
+        here, end = hand.T_world_ee[:3, 3], target.T_world_ee[:3, 3]
         way = end - approach.start[:3, 3]
         length = float(np.linalg.norm(way))
         if length < 1e-9 or self._robot.metres_per_action <= 0:
