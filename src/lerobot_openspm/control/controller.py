@@ -14,7 +14,7 @@ from dataclasses import replace
 import numpy as np
 
 from lerobot_openspm.control.executor import Executor
-from lerobot_openspm.control.planning import Plan, PlanningContext, is_met, until
+from lerobot_openspm.control.planning import Plan, PlanningContext, until
 from lerobot_openspm.control.scene import GIVE_UP_S, LOOK_AGAIN_S, SECOND_LOOK_S, LookRequest, SceneState
 from lerobot_openspm.control.state import LOOKS_AT_OUTCOME, EpisodeState, Status
 from lerobot_openspm.control.transfer import Target, pushed_by_landmark, rise, transfer
@@ -91,13 +91,17 @@ class EpisodeController:
         self._check_cameras()
         match self.state.status:
             case Status.WAITING | Status.OBJECT_NOT_FOUND | Status.INFEASIBLE:
-                return self._plan(hand)
+                self._plan(hand)
+            case Status.RUNNING | Status.PAUSED | Status.OBJECT_LOST if look.back_to is not None:
+                self._follow_objects(look.names, hand)
+                self._begin(look.back_to, hand)
             case Status.RUNNING | Status.PAUSED | Status.OBJECT_LOST:
-                return self._go_on(look, moved, hand) if look.back_to is None else self._go_back(look, hand)
+                self._go_on(look, moved, hand)
             case Status.DONE:
                 return self._judge(hand)
             case Status.NO_PROGRESS | Status.NOT_UNDERSTOOD | Status.CAMERA_FAULT:
-                return None
+                pass
+        return None
 
     def _refuse(self, error: InstructionError) -> None:
         self.state.refusal = str(error)
@@ -149,9 +153,9 @@ class EpisodeController:
 
     def _begin(self, index: int, hand: Hand) -> None:
         """Go to a key pose; what is grasped or pushed from there on is not in the hand any more."""
-        self.state.plan = replace(self.state.plan, T_world_ee=hand.T_world_ee)
-        tracker = self.scene.tracker
-        tracker.drop(tracker.held & self.state.plan.regrasped(index), hand.T_world_ee)
+        state, tracker = self.state, self.scene.tracker
+        state.plan = replace(state.plan, T_world_ee=hand.T_world_ee)
+        tracker.drop(tracker.held & state.plan.regrasped(index), hand.T_world_ee)
         self.executor.begin(self._targets(), hand, index)
 
     def _targets(self) -> tuple[Target, ...]:
@@ -290,11 +294,6 @@ class EpisodeController:
         tracker.doubt(places - self.scene.altered, hand.T_world_ee)
         return self.scene.look(state.plan.objects(index, self.scene.altered), hand, back_to=index)
 
-    def _go_back(self, look: LookRequest, hand: Hand) -> None:
-        """Go back to an earlier key pose, where its objects are now."""
-        self._follow_objects(look.names, hand)
-        self._begin(look.back_to or 0, hand)
-
     # The end of a part.
 
     def _look_at_outcome(self, hand: Hand) -> LookRequest | None:
@@ -307,25 +306,19 @@ class EpisodeController:
         state.followed |= self.executor.followed_sub_tasks()
         names = dict.fromkeys(name for one in state.plan.outcomes for name in one.objects)
         if not names:
-            state.judge((), ())
+            state.judge(())
             return self._end_part(hand)
         state.looks_left -= 1
         return scene.look([name for name in names if name not in scene.altered], hand)
 
     def _judge(self, hand: Hand) -> LookRequest | None:
         """Compare what is seen with the outcomes: go on if all are met, else go back to what can mend it."""
-        state, expected = self.state, self.state.plan.outcomes
-        poses, recognised = self.scene.tracker.poses(hand.T_world_ee), self.scene.recognised()
-        seen = [one for one in expected if one.target in recognised and poses.keys() >= set(one.objects)]
-        missed = [one for one in seen if not is_met(one, poses, self._context.yaw_periods)]
-        if missed:
-            state.judge(expected, missed)
-            return self._mend(missed[0], hand)
-        if len(seen) == len(expected):
-            state.judge(expected, ())
-        elif state.looks_left > 0:
-            return None
-        return self._end_part(hand)
+        state, poses = self.state, self.scene.tracker.poses(hand.T_world_ee)
+        missed = state.plan.missed(poses, self.scene.recognised(), self._context.yaw_periods)
+        if missed is None:
+            return None if state.looks_left > 0 else self._end_part(hand)
+        state.judge(missed)
+        return self._mend(missed[0], hand) if missed else self._end_part(hand)
 
     def _mend(self, missed: Outcome, hand: Hand) -> None:
         """Do one sub-task again, from where its target is now, if an attempt is left.

@@ -152,6 +152,21 @@ class Plan:
         served = {pose.sub_task for pose in self.entry.key_poses}
         return [one for one in self.entry.outcomes if one.sub_task in served]
 
+    def missed(
+        self, poses: Mapping[str, Array], recognised: Collection[str], yaw_periods: Mapping[str, float]
+    ) -> list[Outcome] | None:
+        """The outcomes that are seen not to be met, in order; None where none is, but not all are seen.
+
+        Args:
+            poses: Poses ``T_world_obj`` ``(4, 4)`` of the objects.
+            recognised: The objects that the last look recognised.
+            yaw_periods: Angle by object that turns it into itself, radians.
+        """
+        outcomes = self.outcomes
+        seen = [one for one in outcomes if one.target in recognised and poses.keys() >= set(one.objects)]
+        missed = [one for one in seen if not _is_met(one, poses, yaw_periods)]
+        return missed if missed or len(seen) == len(outcomes) else None
+
 
 def until(entry: MemoryEntry, sub_task: int) -> MemoryEntry:
     """An entry without the sub-tasks after one."""
@@ -159,7 +174,7 @@ def until(entry: MemoryEntry, sub_task: int) -> MemoryEntry:
     return replace(entry, key=key, key_poses=tuple(p for p in entry.key_poses if p.sub_task <= sub_task))
 
 
-def is_met(outcome: Outcome, poses: Mapping[str, Array], yaw_periods: Mapping[str, float]) -> bool:
+def _is_met(outcome: Outcome, poses: Mapping[str, Array], yaw_periods: Mapping[str, float]) -> bool:
     """Whether an outcome is met whichever way round a symmetric landmark was seen."""
     axes = outcome.anchor.axes
     if axes == WORLD:

@@ -146,8 +146,8 @@ class EpisodeState:
         self.attempts, self.looks_left, self.verdict = 0, LOOKS_AT_OUTCOME, None
         self.gone, self.followed, self.repeated = {}, set(), None
 
-    def judge(self, expected: Sequence[Outcome], missed: Sequence[Outcome]) -> None:
+    def judge(self, missed: Sequence[Outcome]) -> None:
         """Take in which outcomes are missed. The others, and handles that went all the way, are done."""
-        done = {one.sub_task for one in expected} | self.followed
+        done = {one.sub_task for one in self.plan.outcomes} | self.followed
         is_all_known = done >= set(range(len(self.plan.entry.key.sub_tasks)))
         self.verdict = False if missed else (is_all_known or None)
