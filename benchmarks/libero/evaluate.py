@@ -25,10 +25,10 @@ import draccus
 import numpy as np
 import torch
 from benchmarks.libero.episode import Episode, initial_states, run_episode
-from lerobot_openspm.control.status import Status
 from tqdm import tqdm
 
 from lerobot_openspm.cli.pipeline import digest, rate
+from lerobot_openspm.control.state import Status
 from lerobot_openspm.control.strategies import Execution
 from lerobot_openspm.envs.libero.simulator import LiberoSimulator, tasks
 from lerobot_openspm.envs.seeds import TUNING_SEED_START
