@@ -38,9 +38,6 @@ ON_ONE_MACHINE = (
     "cameras", "sam3d_python", "sam3d_checkout", "phase_judge_api_base", "phase_judge_cache",
 )  # fmt: skip
 
-# What `huggingface_hub.snapshot_download` is told besides the revision.
-HUB_OPTIONS = ("force_download", "token", "cache_dir", "local_files_only")
-
 
 class OpenSPMPolicy(PreTrainedPolicy):
     """OpenSPM: a memory of key poses, carried over to the scene, and a flow model between them."""
@@ -74,8 +71,7 @@ class OpenSPMPolicy(PreTrainedPolicy):
         if dataset_meta is not None:
             _ = self.names  # what cannot be used is an error now, not at the first observation
             config.control_hz = config.control_hz or float(dataset_meta.fps)
-            training_set = self._learn(dataset_meta)
-            self.flow.action_scale.copy_(training_set.action_scale)
+            self.flow.action_scale.copy_(self._learn(dataset_meta).action_scale)
         self.reset()
 
     # Acting. Top to bottom: look where the controller wants it, ask for a chunk where it is needed, act.
@@ -93,7 +89,7 @@ class OpenSPMPolicy(PreTrainedPolicy):
     def predict_action_chunk(self, batch: dict[str, Tensor], **kwargs: Any) -> Tensor:
         """What the next actions ``(b, chunk_size, action_dim)`` would be if no new observation came.
 
-        The policy stays as it is: episodes go on, with :meth:`select_action`, as if nobody had asked.
+        Nothing changes: episodes go on, with :meth:`select_action`, as if nobody had asked.
         """
         observations, n_steps = split_batch(batch, self.config.layouts()[0]), self.config.chunk_size
         running, is_training = self.episodes, self.training
@@ -118,7 +114,6 @@ class OpenSPMPolicy(PreTrainedPolicy):
             n_kept: How many actions of every new chunk are kept; as configured if not given.
         """
         self.eval()
-        n_kept = self.config.n_action_steps if n_kept is None else n_kept
         self._begin_episodes(observations)
         actions = np.empty((len(observations), n_actions, 7))
         for row, (episode, observation) in enumerate(zip(self.episodes, observations, strict=True)):
@@ -130,7 +125,8 @@ class OpenSPMPolicy(PreTrainedPolicy):
             for i in range(n_actions):
                 action = controller.executor.next_action(hand)
                 if action is None:
-                    controller.executor.push_chunk(self._chunk(controller, hand)[:n_kept])
+                    chunk = self._chunk(controller, hand)
+                    controller.executor.push_chunk(chunk[: n_kept or self.config.n_action_steps])
                     action = controller.executor.next_action(hand)
                 actions[row, i] = action
         return actions
@@ -236,8 +232,7 @@ class OpenSPMPolicy(PreTrainedPolicy):
         draws = self.config.samples_per_frame if self.training else 1
         condition, actions = self._training_set.draw(batch["index"], draws, self.training)
         condition, actions = condition.to(self.flow.action_scale), actions.to(self.flow.action_scale)
-        noise = torch.randn_like(actions)
-        time = torch.rand(len(actions), device=actions.device)
+        noise, time = torch.randn_like(actions), torch.rand(len(actions), device=actions.device)
         losses = self.flow.loss(condition, actions, noise, time).view(len(batch["index"]), -1).mean(dim=1)
         loss = losses if reduction == "none" else losses.mean()
         return loss, {"flow_loss": float(losses.mean().detach())}
@@ -284,13 +279,14 @@ class OpenSPMPolicy(PreTrainedPolicy):
         """Load weights, memory and calibration from a directory or from the Hub.
 
         With `dataset_meta`, training goes on: the memory is kept, appended to or rebuilt, as
-        ``config.memory_update`` says. What else LeRobot takes for a download is taken here.
+        ``config.memory_update`` says. `kwargs` are LeRobot's own, those of the download among them.
 
         Raises:
             MemoryFormatError: The checkpoint has no memory, or a damaged or newer one.
         """
-        hub = {option: kwargs.pop(option) for option in HUB_OPTIONS if option in kwargs}
-        directory = checkpoint_folder(pretrained_name_or_path, revision, **hub)
+        options = ("force_download", "token", "cache_dir", "local_files_only")
+        download = {option: kwargs.pop(option) for option in options if option in kwargs}
+        directory = checkpoint_folder(pretrained_name_or_path, revision, **download)
         policy = super().from_pretrained(directory, config=config, strict=strict, **kwargs)
         is_kept = policy.config.memory_update == "keep" or dataset_meta is None
         policy.memory = load_memory(directory, policy.config, is_kept)
