@@ -53,9 +53,16 @@ def new_episode(
         segmenter: Finds the objects' masks; None where their colours do.
     """
     context = PlanningContext(
-        entries, memory.yaw_periods, memory.robot, config.score_weights, config.transfer_limits,
-        config.control_settings, tracking=config.tracking, step_s=step_s(config), names=names,
-    )  # fmt: skip
+        entries,
+        memory.yaw_periods,
+        memory.robot,
+        weights=config.score_weights,
+        limits=config.transfer_limits,
+        settings=config.control_settings,
+        tracking=config.tracking,
+        step_s=step_s(config),
+        names=names,
+    )
     fingerprint = observation.fingerprint()
     controller = EpisodeController(context, observation.instruction, fingerprint, config.noise_seed)
     return RunningEpisode(controller, Perception(memory, config.hand_radius_m, segmenter))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -45,9 +45,9 @@ class PlanningContext:
     entries: Sequence[MemoryEntry]
     yaw_periods: Mapping[str, float]
     robot: RobotModel
-    weights: ScoreWeights
-    limits: TransferLimits
-    settings: ControlSettings
+    weights: ScoreWeights = field(default_factory=ScoreWeights)
+    limits: TransferLimits = field(default_factory=TransferLimits)
+    settings: ControlSettings = field(default_factory=ControlSettings)
     tracking: bool = True
     step_s: float = 0.05
     names: NameSimilarity = TABLE_NAMES
