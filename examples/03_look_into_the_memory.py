@@ -45,10 +45,7 @@ def main() -> None:
 
     # 2. Plan: find the objects in the images, rank the entries, carry the best one over.
     memory = read_memory(options.memory)
-    context = PlanningContext(
-        memory.entries, memory.yaw_periods, memory.robot, config.score_weights,
-        config.transfer_limits, config.control_settings,
-    )  # fmt: skip
+    context = PlanningContext(memory.entries, memory.yaw_periods, memory.robot)
     controller = EpisodeController(context, options.instruction, observation.fingerprint(), noise_seed=0)
     perception = Perception(memory, config.hand_radius_m)
     look = controller.advance(observation.hand)
