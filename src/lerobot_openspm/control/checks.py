@@ -81,15 +81,8 @@ def geometric_score(
     """``S_geo`` in 0..1: whether an entry can be executed here, and how like its demonstration it would be.
 
     It is 0 where an object of its key poses was not found or the transferred key poses fail the checks. It is
-    1 where the objects lie to one another as in the demonstration, wherever that is.
-
-    Args:
-        entry: The entry.
-        object_poses: Present poses ``T_world_obj`` ``(4, 4)`` of the objects that were found.
-        yaw_periods: Angle by object that turns it into itself, radians; 0 for a body of revolution.
-        T_world_ee: Present hand pose ``(4, 4)``.
-        robot: The robot.
-        limits: Bounds of the checks.
+    1 where the objects lie to one another as in the demonstration, wherever that is. The arguments are those
+    of :func:`transfer` and :func:`check_transfer`.
     """
     if any(name not in object_poses for name in entry.objects):
         return 0.0

@@ -22,20 +22,14 @@ SAME_PLACE_M = 0.05
 def references(candidate: Candidate, object_meant: Callable[[str], str]) -> dict[str, Reference]:
     """By the name that an entry gives an object: where the instruction says that it is.
 
-    Args:
-        candidate: An entry, and what of the instruction it carries out.
-        object_meant: The name under which an object is known that the instruction tells others by.
+    Its landmarks go by the names under which they are known, which `object_meant` tells.
     """
-
-    def known_words(where: Reference) -> Reference:
-        return Reference(where.relation, tuple(object_meant(name) for name in where.landmarks))
-
     said: dict[str, Reference] = {}
     for asked, known in zip(candidate.asked, candidate.entry.key.sub_tasks, strict=True):
-        if asked.target_where is not None:
-            said[known.target] = known_words(asked.target_where)
-        if asked.landmark_where is not None:
-            said[known.landmark] = known_words(asked.landmark_where)
+        told = ((known.target, asked.target_where), (known.landmark, asked.landmark_where))
+        for name, where in told:
+            if where is not None:
+                said[name] = Reference(where.relation, tuple(map(object_meant, where.landmarks)))
     return said
 
 
@@ -65,14 +59,10 @@ class Grounding:
     def sort_out(
         self, estimates: Mapping[str, PoseEstimate], object_poses: Mapping[str, Array]
     ) -> dict[str, PoseEstimate]:
-        """What was seen of the objects that are meant.
+        """What was seen of the objects that are meant, given the poses of objects seen before.
 
         An object is told from its like once, when several are first seen; from then on those that are not
         meant are known by their places. One that cannot be told is ambiguous.
-
-        Args:
-            estimates: What a look brought.
-            object_poses: Poses ``T_world_obj`` ``(4, 4)`` of objects seen before.
         """
         places = {name: one.T_world_obj for name, one in estimates.items() if one.status == "found"}
         known = {**places, **object_poses}

@@ -72,12 +72,9 @@ class PlanningContext:
     def rank(
         self, candidates: Sequence[Candidate], object_poses: Mapping[str, Array], T_world_ee: Array
     ) -> tuple[Scored, ...]:
-        """Candidates by the paper's score in a scene, best first.
+        """Candidates by the paper's score, best first.
 
-        Args:
-            candidates: The entries to compare.
-            object_poses: Poses ``T_world_obj`` ``(4, 4)`` of the objects that were found.
-            T_world_ee: The hand's pose ``(4, 4)``.
+        The scene is the poses ``T_world_obj`` ``(4, 4)`` of the objects that were found, and the hand's.
         """
         scene = object_poses, self.yaw_periods, T_world_ee, self.robot, self.limits
         geometric = {id(one.entry): geometric_score(one.entry, *scene) for one in candidates}
@@ -157,10 +154,7 @@ class Plan:
     ) -> list[Outcome] | None:
         """The outcomes that are seen not to be met, in order; None where none is, but not all are seen.
 
-        Args:
-            poses: Poses ``T_world_obj`` ``(4, 4)`` of the objects.
-            recognised: The objects that the last look recognised.
-            yaw_periods: Angle by object that turns it into itself, radians.
+        One is seen where its target was recognised and the poses of its objects are known.
         """
         outcomes = self.outcomes
         seen = [one for one in outcomes if one.target in recognised and poses.keys() >= set(one.objects)]

@@ -153,15 +153,7 @@ class SceneState:
     def is_left_behind(
         self, name: str, plan: Plan, targets: Sequence[Target], index: int, hand: Hand
     ) -> bool:
-        """Whether an object that turned out to be elsewhere than in the hand does not go along with it.
-
-        Args:
-            name: The object.
-            plan: What is acted by.
-            targets: Its key poses in the scene.
-            index: The key pose that is approached.
-            hand: The hand.
-        """
+        """Whether an object that turned out not to be in the hand stays behind, on the way to a key pose."""
         target = targets[index]
         if target.key_pose.phase != "push":
             return True
