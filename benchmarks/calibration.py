@@ -47,7 +47,7 @@ def main(simulator: str) -> dict[str, Any]:
     root = Path(DEFAULTS[simulator][0]) / "dataset"
     collect_dataset(root, DEMOS, simulator)
     cv2.setNumThreads(1)
-    source = read(root, OpenSPMConfig(device="cpu", push_to_hub=False, state_rotation="axis_angle"))
+    source = read(root, OpenSPMConfig(device="cpu", push_to_hub=False, rotation="axis_angle"))
     name, suffix = ("tabletop", "") if simulator == "openspm_tabletop" else (simulator, f"_{simulator}")
     rows = {}
     for key, truth in source.cameras.items():

@@ -175,7 +175,8 @@ FIGURES: dict[str, Figure] = {
     "libero_few_shot_3": _libero("few_shot", options="--demos=3"),
     "libero_few_shot_1": _libero("few_shot", options="--demos=1 --states=10"),
     "libero_ablations": _libero(
-        "ablations", "benchmarks/libero/geometric_guess.py", f"{PACKAGE}/mining/phase_labels"
+        "ablations", "benchmarks/libero/geometric_guess.py", "benchmarks/libero/guessed_key_poses.py",
+        f"{PACKAGE}/mining/phase_labels",
     ),
     **{f"libero_new_task_{task}_3": _libero("new_task", options=f"--task={task}") for task in NEW_TASKS},
     "libero_losses": _libero("losses"),

@@ -38,9 +38,7 @@ def accuracy(checkpoint: Path, dataset: Path, episodes: list[dict[str, Any]]) ->
     found.
     """
     memory = read_memory(checkpoint)
-    config = OpenSPMConfig(
-        device="cpu", push_to_hub=False, state_rotation="axis_angle", action_rotation="axis_angle"
-    )
+    config = OpenSPMConfig(device="cpu", push_to_hub=False, rotation="axis_angle")
     demonstrations = open_demonstrations(LeRobotDatasetMetadata(REPO_ID, root=dataset), config)
     offsets = {name: offset(memory, name, demonstrations) for name in memory.objects}
     # Patches do not measure a yaw: such an object is taken to stand as demonstrated.

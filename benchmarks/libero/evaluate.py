@@ -29,12 +29,12 @@ from tqdm import tqdm
 
 from lerobot_openspm.cli.pipeline import digest, rate
 from lerobot_openspm.control.state import Status
-from lerobot_openspm.control.strategies import Execution
 from lerobot_openspm.envs.libero.simulator import LiberoSimulator, tasks
 from lerobot_openspm.envs.seeds import TUNING_SEED_START
 from lerobot_openspm.files import write_beside
 from lerobot_openspm.geometry import se3
 from lerobot_openspm.modeling_openspm import OpenSPMPolicy
+from lerobot_openspm.types import Execution
 
 logger = logging.getLogger(__name__)
 

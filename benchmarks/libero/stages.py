@@ -10,10 +10,10 @@ from typing import Any
 from benchmarks.common import known
 from benchmarks.libero.evaluate import EvaluationConfig, evaluate
 
-from lerobot_openspm.cli.collect import SUMMARY_FILE
 from lerobot_openspm.cli.pipeline import collect_dataset, train
-from lerobot_openspm.control.strategies import Execution
+from lerobot_openspm.envs.collection import SUMMARY_FILE
 from lerobot_openspm.envs.libero.simulator import tasks
+from lerobot_openspm.types import Execution
 
 REPO_ID = "local/libero"
 TRAIN_CONFIG = Path("configs/openspm_libero_train.yaml")

@@ -70,8 +70,11 @@ def load_memory(directory: Path, config: OpenSPMConfig, is_kept: bool) -> Memory
         raise MemoryFormatError(
             f"the memory in {directory} holds no entries, so nothing can be done with it; train again"
         )
-    for name in ("perception", "segmentation", "shape"):
-        made, asked = getattr(memory, name), getattr(config, name)
+    found_by = "oracle" if memory.perception == "oracle" else memory.segmentation
+    for name, made, asked in (
+        ("perception", found_by, config.perception),
+        ("segmentation.shape", memory.shape, config.segmentation.shape),
+    ):
         if made != asked:
             raise MemoryFormatError(
                 f"the memory in {directory} holds key poses in the frames of {name}={made}, got "
@@ -81,6 +84,6 @@ def load_memory(directory: Path, config: OpenSPMConfig, is_kept: bool) -> Memory
         where = str(directory / MEMORY_JSON)
         check_layouts(memory.layouts, config.layouts(), "the configuration's", where)
         check_anchors(memory, where)
-        check_labels(memory, config.mask_labels, str(directory / CONFIG_NAME))
+        check_labels(memory, config.segmentation.labels, str(directory / CONFIG_NAME))
     check_sizes(memory.cameras, config.image_sizes, config.cameras or str(directory / CAMERAS_JSON))
     return memory

@@ -6,8 +6,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from lerobot_openspm.configuration_openspm import OpenSPMConfig
+from lerobot_openspm.control.checks import TransferLimits
 from lerobot_openspm.control.controller import EpisodeController
 from lerobot_openspm.control.planning import PlanningContext
+from lerobot_openspm.control.strategies import ControlSettings
 from lerobot_openspm.language.names import NameSimilarity
 from lerobot_openspm.memory.entry import MemoryEntry
 from lerobot_openspm.memory.memory import Memory
@@ -56,9 +58,8 @@ def new_episode(
         entries,
         memory.yaw_periods,
         memory.robot,
-        weights=config.score_weights,
-        limits=config.transfer_limits,
-        settings=config.control_settings,
+        limits=TransferLimits(config.reach_margin_m, config.min_clearance_m),
+        settings=ControlSettings(config.execution),
         tracking=config.tracking,
         step_s=step_s(config),
         names=names,

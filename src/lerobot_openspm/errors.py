@@ -33,5 +33,5 @@ class PerceptionError(OpenSPMError):
     """A perception backend cannot be used: a package, weights, a worker or a phrase is missing."""
 
 
-class JudgementError(OpenSPMError):
-    """A judge of phases cannot be used, gave no answer, or one that makes no sense."""
+class PhaseLabelError(OpenSPMError):
+    """A judge of phases cannot be used, or gave no usable answer."""

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from copy import deepcopy
-from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -33,11 +32,6 @@ from lerobot_openspm.types import Hand, Segmenter
 if TYPE_CHECKING:
     from lerobot_openspm.teaching import Lesson
 
-# Options that mean nothing on another machine; a checkpoint is saved without them.
-ON_ONE_MACHINE = (
-    "cameras", "sam3d_python", "sam3d_checkout", "phase_judge_api_base", "phase_judge_cache",
-)  # fmt: skip
-
 
 class OpenSPMPolicy(PreTrainedPolicy):
     """OpenSPM: a memory of key poses, carried over to the scene, and a flow model between them."""
@@ -64,7 +58,7 @@ class OpenSPMPolicy(PreTrainedPolicy):
         super().__init__(config)
         config.validate_features()
         self.config: OpenSPMConfig = config
-        self.flow = VelocityField(CONDITION_DIM[config.conditioning], config.chunk_size, 7, config.hidden_dim)
+        self.flow = VelocityField(CONDITION_DIM[config.conditioning], config.chunk_size, 7)
         self.memory: Memory | None = None
         self._training_set: TrainingSet | None = None
         self._entries: tuple[Sequence[MemoryEntry], Sequence[MemoryEntry]] | None = None
@@ -257,11 +251,8 @@ class OpenSPMPolicy(PreTrainedPolicy):
     def _save_pretrained(self, save_directory: Path, state_dict: dict[str, Tensor] | None = None) -> None:
         memory = self.require_memory()  # before anything is written
         super()._save_pretrained(save_directory, state_dict=state_dict)
-        # What exists on one machine alone stays there; the calibration travels as a file of the checkpoint.
-        here: dict[str, None] = dict.fromkeys(ON_ONE_MACHINE)
-        if self.config.name_embeddings and Path(self.config.name_embeddings).is_dir():
-            here["name_embeddings"] = None
-        replace(self.config, **here)._save_pretrained(Path(save_directory))
+        # The calibration travels as a file of the checkpoint.
+        self.config.without_places()._save_pretrained(Path(save_directory))
         write_memory(memory, Path(save_directory))
 
     @classmethod

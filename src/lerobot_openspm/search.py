@@ -138,7 +138,7 @@ def search_scene(policy: OpenSPMPolicy, observation: Observation) -> Found:
     in_words = search_memory(
         observation.instruction,
         policy.require_memory().entries,
-        policy.config.score_weights,
+        ScoreWeights(),
         policy.names,
     )
     if in_words.refusal:

@@ -69,7 +69,7 @@ def teach(
         config: The configuration of the policy that knows it.
         dataset_meta: LeRobot's metadata of the dataset.
         episodes: The episodes to teach; all if not given.
-        segmenter: Finds the objects' masks, where the configuration's segmentation is not "demonstrations".
+        segmenter: Finds the objects' masks, where the configuration's perception has masks.
 
     Returns:
         The memory with the new entries and objects, and what is new in it.
@@ -100,7 +100,7 @@ def teach(
     objects = {name: mined.objects[name] for name in named if name in mined.objects}
     learned = replace(mined, entries=added, objects=objects)
     result = memory.appended(learned)
-    check_labels(result, config.mask_labels, f"the checkpoint of {config.type}")
+    check_labels(result, config.segmentation.labels, f"the checkpoint of {config.type}")
     used = {entry.source for entry in added}
     skipped = tuple(i for i in wanted if f"{dataset_meta.repo_id}#{i}" not in used)
     return result, _lesson(memory, learned, skipped)

@@ -16,6 +16,10 @@ Mask = NDArray[np.bool_]
 # What is learned of an object: its shape by the demonstrations' masks, the box around it, or a box of the
 # size that SAM 3D tells.
 Shape = Literal["demonstrations", "box", "sam3d"]
+# How key poses are followed: planned from where the hand should be, from where it is, or that and corrected.
+Execution = Literal["open_loop", "closed_loop", "closed_loop_trc"]
+# What the flow model is told: poses in the world, or the relative pose in the frame of the target key pose.
+Conditioning = Literal["paper", "equivariant"]
 
 # Standard deviation of a uniform angle: what is known of a yaw that cannot be seen.
 UNKNOWN_YAW_STD = float(np.pi / np.sqrt(3))

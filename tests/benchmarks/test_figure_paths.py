@@ -28,16 +28,10 @@ PASSED_OVER = (
     # It imports all measures; whose it runs say so in their paths.
     "cli/bench.py",
 )
-# What a figure of one simulator does not run of the other. Of the tabletop, LIBERO's hand shares constants.
+# What a figure of one simulator does not run of the other.
 OTHER_SIMULATOR = {
     "openspm_tabletop": ("envs/libero/", "bench/libero.py"),
-    "libero": (
-        *(
-            f"envs/tabletop/{name}.py"
-            for name in ("experts", "placement", "scene", "tasks", "env", "recording")
-        ),
-        "bench/tabletop.py",
-    ),
+    "libero": ("envs/tabletop/", "bench/tabletop.py"),
 }
 # What a figure imports for types alone, or of which it uses only what keeps its folder, or reads a dataset.
 OF_FIGURE = {
@@ -70,7 +64,7 @@ def test_what_a_figure_imports_lies_within_its_paths(name: str):
 def test_what_records_demonstrations_is_what_they_are_kept_for(simulator: str):
     package = ROOT / PACKAGE
     found = {str(p.relative_to(ROOT)) for pattern in RECORDED_BY[simulator] for p in package.glob(pattern)}
-    needed = closure(f"{PACKAGE}/cli/collect.py", PASSED_OVER + OTHER_SIMULATOR[simulator])
+    needed = closure(f"{PACKAGE}/envs/collection.py", PASSED_OVER + OTHER_SIMULATOR[simulator])
     assert needed - found == set()
 
 

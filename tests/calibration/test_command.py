@@ -45,7 +45,7 @@ def reason(result: tuple[int, str, str]) -> str:
 @pytest.fixture(scope="session")
 def turning_dataset(make_once: Callable[..., Path]) -> Path:
     """Two demonstrations each of two tasks in which the hand turns about different axes."""
-    from lerobot_openspm.cli.collect import CollectConfig, SimulatorConfig, collect
+    from lerobot_openspm.envs.collection import CollectConfig, SimulatorConfig, collect
 
     env = SimulatorConfig(task="open_middle_drawer,turn_on_stove")
     config = functools.partial(CollectConfig, env, 2, height=160, width=160, workers=0)

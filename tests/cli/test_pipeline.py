@@ -5,7 +5,6 @@ from pathlib import Path
 import pytest
 
 from lerobot_openspm.cli import pipeline
-from lerobot_openspm.cli.collect import SUMMARY_FILE, CollectConfig
 from lerobot_openspm.cli.demo import EVALUATION_SEED
 from lerobot_openspm.cli.pipeline import (
     Episode,
@@ -17,6 +16,7 @@ from lerobot_openspm.cli.pipeline import (
     read_episodes,
     success,
 )
+from lerobot_openspm.envs.collection import SUMMARY_FILE, CollectConfig
 from lerobot_openspm.envs.seeds import EVALUATION_SEEDS, seed_purpose
 from lerobot_openspm.errors import OpenSPMError
 

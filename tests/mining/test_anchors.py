@@ -31,7 +31,7 @@ def demonstrations(n, place_axes="plate", seed=0, error_m=0.0):
     rng, made = np.random.default_rng(seed), []
     for _ in range(n):
         layout = scene(rng)
-        wobble = se3.from_position_rotvec(error_m * rng.normal(size=3), np.zeros(3))
+        wobble = se3.transform(np.eye(3), error_m * rng.normal(size=3))
         T_place = Anchor("plate", place_axes).frame(layout)
         poses = (
             key_pose("grasp", layout["bowl"] @ wobble @ hand_pose(0.04, 0.01, 0.02, 0.3)),

@@ -15,7 +15,7 @@ from tests.policy.conftest import Frame, batch_of
 from tests.policy.lerobot_commands import call_lerobot, train_arguments, training_options
 from tests.policy.test_learning import new_config
 
-from lerobot_openspm.configuration_openspm import OpenSPMConfig
+from lerobot_openspm.configuration_openspm import OpenSPMConfig, SegmentationConfig
 from lerobot_openspm.errors import (
     CalibrationError,
     DatasetError,
@@ -322,9 +322,9 @@ def test_sam3d_that_nobody_said_where_to_find_is_an_error(
     tiny_meta: LeRobotDatasetMetadata, checkpoint: Path
 ):
     config = new_config(tiny_meta)
-    config.segmentation, config.shape, config.mask_labels = "given", "sam3d", {"bowl": 1}
+    config.perception, config.segmentation = "given", SegmentationConfig(labels={"bowl": 1}, shape="sam3d")
     config.cameras = str(checkpoint / "cameras.json")
-    with pytest.raises(PerceptionError, match=r"sam3d_python is None.*--policy\.sam3d_python=PYTHON"):
+    with pytest.raises(PerceptionError, match=r"sam3d_python is None.*\.segmentation\.sam3d_python=PYTHON"):
         OpenSPMPolicy(config, dataset_meta=tiny_meta)
 
 
@@ -332,7 +332,7 @@ def test_weights_that_are_not_there_are_an_error_when_the_policy_is_made(
     tiny_meta: LeRobotDatasetMetadata, checkpoint: Path, tmp_path: Path
 ):
     config = new_config(tiny_meta)
-    config.segmentation, config.segmentation_weights = "sam3", [str(tmp_path / "nowhere")]
+    config.perception, config.segmentation.weights = "sam3", [str(tmp_path / "nowhere")]
     config.cameras = str(checkpoint / "cameras.json")
     with pytest.raises(PerceptionError, match="nowhere"):
         OpenSPMPolicy(config, dataset_meta=tiny_meta)

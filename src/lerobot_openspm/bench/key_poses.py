@@ -22,7 +22,8 @@ from scipy.optimize import linear_sum_assignment
 from lerobot_openspm.bench.contact_events import PHASES, contact_events
 from lerobot_openspm.bench.recording import OPERATORS, Job, Recording, record
 from lerobot_openspm.bench.results import ResultOption
-from lerobot_openspm.envs.recording import Names, source
+from lerobot_openspm.envs.recording import Names
+from lerobot_openspm.envs.suites import find_suite
 from lerobot_openspm.geometry.vector_layout import RotationKind, parse_layout
 from lerobot_openspm.mining.key_poses import find_key_poses
 from lerobot_openspm.mining.signals import Episode, observe_robot
@@ -78,7 +79,7 @@ class Options(ResultOption):
                 f"episodes and workers must be at least 1, got {self.episodes} and {self.workers}"
             )
         for simulator in self.simulators:
-            source(simulator).tasks(self.env.task)
+            find_suite(simulator).tasks(self.env.task)
 
     @property
     def simulators(self) -> tuple[str, ...]:
@@ -89,7 +90,7 @@ class Options(ResultOption):
 
     def jobs(self, simulator: str) -> list[Job]:
         """The demonstrations of one simulator."""
-        tasks = source(simulator).tasks(self.env.task)
+        tasks = find_suite(simulator).tasks(self.env.task)
         return [
             Job(simulator, tasks[i % len(tasks)], self.seed + i // len(tasks), self.operator)
             for i in range(self.episodes)
@@ -228,7 +229,7 @@ def _grouped(verdicts: Sequence[Verdict], by: str) -> dict[str, Any]:
 def _episode(recording: Recording, index: int) -> Episode:
     """What mining reads of a recording, by the same layouts as of a dataset."""
     kind = ROTATIONS[recording.job.env_type]
-    names = source(recording.job.env_type).names
+    names = find_suite(recording.job.env_type).names
     state = parse_layout(_flat(names["observation.state"]), "state", kind)
     action = parse_layout(_flat(names["action"]), "action", kind)
     vectors = recording.state.astype(float)

@@ -18,7 +18,7 @@ from lerobot_openspm.bench.episode import IMAGES, World, load, run_episode
 from lerobot_openspm.bench.object_frames import offset
 from lerobot_openspm.bench.truth import Truth, pose_error, true_period
 from lerobot_openspm.control.controller import EpisodeController
-from lerobot_openspm.envs.recording import source
+from lerobot_openspm.envs.suites import find_suite
 from lerobot_openspm.episodes import step_s
 from lerobot_openspm.files import write_json
 from lerobot_openspm.geometry.se3 import Array
@@ -53,7 +53,7 @@ class Setting:
 
 def tasks(env_type: str, selection: str) -> list[str]:
     """Names of the tasks that a selection stands for."""
-    return source(env_type).tasks(selection)
+    return find_suite(env_type).tasks(selection)
 
 
 @contextlib.contextmanager

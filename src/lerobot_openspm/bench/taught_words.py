@@ -29,11 +29,10 @@ from lerobot_openspm.memory.robot import RobotModel
 from lerobot_openspm.mining.anchors import Demonstration
 from lerobot_openspm.mining.entries import task_entries
 from lerobot_openspm.mining.key_poses import find_key_poses
-from lerobot_openspm.mining.objects import hints
+from lerobot_openspm.mining.objects import contact_cues
 from lerobot_openspm.mining.outcomes import carried_to
-from lerobot_openspm.mining.processor import mine_episodes
+from lerobot_openspm.mining.processor import compare, mine_episodes
 from lerobot_openspm.mining.signals import Episode
-from lerobot_openspm.mining.tasks import compare
 
 ROBOT = RobotModel(1.0, -1.0, 0.08, 0.01, 0.1, 0.01, np.array([[-0.5, -0.5, 0.0], [0.5, 0.5, 0.5]]))
 # Opening of the fingers around a thing, metres; metres that the hand and the fingers go in a step.
@@ -66,9 +65,8 @@ def _teach(
         raise OpenSPMError(f"{instruction!r} has no words; give it some in everyday.json")
     episode = _drawn(instruction, number, len(tasks[instruction]), rng)
     (mined,), _ = mine_episodes([episode], partial(find_key_poses, robot=ROBOT), known_names(known))
-    layout = {
-        hint.name: se3.transform(np.eye(3), [*hint.point_world[:2], 0.0]) for hint in reversed(hints(mined))
-    }
+    cues = reversed(contact_cues(mined))
+    layout = {cue.name: se3.transform(np.eye(3), [*cue.point_world[:2], 0.0]) for cue in cues}
     ends = carried_to(Demonstration(mined.key_poses, layout), mined.sub_tasks)
     (task,) = compare([mined], [layout], [ends], {})
     found = task_entries(task, "drawn")

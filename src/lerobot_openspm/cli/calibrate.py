@@ -48,7 +48,7 @@ class CalibrateConfig:
             there.
         seed: Seed of the first estimate's random draws.
         policy: Options of the policy that say how to read the state, e.g.
-            ``--policy.state_rotation=axis_angle``.
+            ``--policy.rotation=axis_angle``.
     """
 
     repo_id: str = "local/openspm_tabletop"

@@ -72,7 +72,7 @@ def search(args: list[str]) -> None:
 def _search(instruction: str, config: SearchConfig) -> Found:
     if config.dataset.root is None and config.dataset.repo_id is None:
         entries = read_memory(Path(config.path)).entries
-        return search_memory(instruction, entries, *_scoring(config.path))
+        return search_memory(instruction, entries, ScoreWeights(), _names(config.path))
     if config.dataset.root is not None and not (Path(config.dataset.root) / "meta/info.json").is_file():
         raise FileNotFoundError(f"no dataset at --dataset.root={config.dataset.root}")
     from lerobot.datasets import LeRobotDataset
@@ -86,14 +86,14 @@ def _search(instruction: str, config: SearchConfig) -> Found:
     return search_scene(policy, observation_of(policy, dataset, episode, frame, instruction))
 
 
-def _scoring(path: str) -> tuple[ScoreWeights, NameSimilarity]:
-    """The weights and names that a checkpoint was given; a mined memory has none of its own."""
+def _names(path: str) -> NameSimilarity:
+    """The names that a checkpoint was given; a mined memory has none of its own."""
     if not (Path(path) / "config.json").is_file():
-        return ScoreWeights(), TABLE_NAMES
+        return TABLE_NAMES
     from lerobot_openspm.configuration_openspm import OpenSPMConfig
 
     config: Any = OpenSPMConfig.from_pretrained(path)
-    return config.score_weights, names_from(config.name_embeddings)
+    return names_from(config.name_embeddings)
 
 
 def _lines(found: Found, limit: int) -> list[str]:

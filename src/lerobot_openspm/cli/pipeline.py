@@ -21,7 +21,7 @@ from scipy.stats import binomtest
 from tqdm import tqdm
 
 import lerobot_openspm
-from lerobot_openspm.cli.collect import SUMMARY_FILE, CollectConfig, SimulatorConfig, collect
+from lerobot_openspm.envs.collection import SUMMARY_FILE, CollectConfig, SimulatorConfig, collect
 from lerobot_openspm.envs.tabletop.tasks import TASK_NAMES
 from lerobot_openspm.errors import OpenSPMError
 from lerobot_openspm.files import write_beside, write_json
@@ -34,17 +34,11 @@ LIBERO_ASSETS = Path("scripts/libero_assets.txt")
 # Each process computes with one; several run side by side.
 THREADS = 1
 DONE, LOG = "done.json", "output.log"
+GEOMETRY = ("geometry/camera.py", "geometry/se3.py")
 # The package's files that make a simulator's demonstrations what they are.
 RECORDED_BY = {
-    "openspm_tabletop": ("cli/collect.py", "envs/*.py", "envs/tabletop/*.py"),
-    "libero": (
-        "cli/collect.py",
-        *(
-            f"envs/{name}.py"
-            for name in ("calibration", "gl_backend", "motions", "recording", "seeds", "tabletop/simulator")
-        ),
-        "envs/libero/*.py",
-    ),
+    "openspm_tabletop": ("envs/*.py", "envs/tabletop/*.py", *GEOMETRY),
+    "libero": ("envs/*.py", "envs/libero/*.py", *GEOMETRY),
 }
 
 

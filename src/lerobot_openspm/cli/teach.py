@@ -34,12 +34,19 @@ class DatasetOption:
 
 
 @dataclass
+class Sam3dOption:
+    """Where SAM 3D Objects is, for checkpoints whose shapes are its; see docs/sam3d.md."""
+
+    sam3d_python: str | None = None  # of its environment
+    sam3d_checkout: str | None = None  # folder of its repository
+
+
+@dataclass
 class PolicyOption:
     """What the checkpoint does not say."""
 
     cameras: str | None = None  # calibration of the demonstrations; theirs or the checkpoint's if not given
-    sam3d_python: str | None = None  # for checkpoints whose shapes are SAM 3D's, see docs/sam3d.md
-    sam3d_checkout: str | None = None
+    segmentation: Sam3dOption = field(default_factory=Sam3dOption)
 
 
 @dataclass
@@ -96,8 +103,14 @@ def _policy(config: TeachConfig) -> OpenSPMPolicy:
     from lerobot_openspm.modeling_openspm import OpenSPMPolicy
 
     policy = OpenSPMPolicy.from_pretrained(config.into)
-    given = {name: value for name, value in vars(config.policy).items() if value is not None}
-    policy.config = replace(policy.config, **given)
+    places, segmentation = config.policy.segmentation, policy.config.segmentation
+    segmentation = replace(
+        segmentation,
+        sam3d_python=places.sam3d_python or segmentation.sam3d_python,
+        sam3d_checkout=places.sam3d_checkout or segmentation.sam3d_checkout,
+    )
+    cameras = config.policy.cameras or policy.config.cameras
+    policy.config = replace(policy.config, cameras=cameras, segmentation=segmentation)
     return policy
 
 

@@ -29,15 +29,16 @@ class TransferLimits:
 
     Attributes:
         reach_margin_m: How far outside the box that the demonstrations covered the hand may go.
-        max_jump_m: Longest way between consecutive key poses.
-        max_jump_rad: Largest turn between consecutive key poses.
         min_clearance_m: How far below the lowest demonstrated hand position the hand may go.
+        max_jump_m: Longest way between consecutive key poses. The default is the reach of a table-top arm.
+        max_jump_rad: Largest turn between consecutive key poses. The default is just short of half a turn,
+            whose direction is open.
     """
 
     reach_margin_m: float = 0.10
+    min_clearance_m: float = 0.01
     max_jump_m: float = 0.8
     max_jump_rad: float = 2.8
-    min_clearance_m: float = 0.01
 
 
 def check_transfer(

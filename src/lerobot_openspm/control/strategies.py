@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal, get_args
+from typing import get_args
 
 import numpy as np
 
@@ -11,9 +11,7 @@ from lerobot_openspm.control.transfer import Target
 from lerobot_openspm.geometry import se3
 from lerobot_openspm.geometry.se3 import Array
 from lerobot_openspm.memory.robot import RobotModel
-from lerobot_openspm.types import Hand
-
-Execution = Literal["open_loop", "closed_loop", "closed_loop_trc"]
+from lerobot_openspm.types import Execution, Hand
 
 # A correction that leaves more than this share of the residual is blocked by something solid.
 STUCK_SHARE = 0.9
@@ -26,7 +24,7 @@ CORRECTION_SHARE, CORRECTION_STEPS = 0.2, 5
 
 @dataclass(frozen=True)
 class ControlSettings:
-    """How key poses are followed.
+    """How key poses are followed. The numbers were set by hand on the tabletop, and serve LIBERO as well.
 
     Attributes:
         execution: ``open_loop`` plans every chunk from where the hand should be; ``closed_loop`` from where

@@ -8,7 +8,6 @@ A scene that is moved and turned as a whole looks the same to the second.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -16,9 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 from lerobot_openspm.geometry import se3
 from lerobot_openspm.geometry.se3 import Array
 from lerobot_openspm.memory.entry import PHASES
-
-Conditioning = Literal["paper", "equivariant"]
-CONDITIONINGS: tuple[Conditioning, ...] = ("paper", "equivariant")
+from lerobot_openspm.types import Conditioning
 
 # Relative poses are given at several scales: the coarse one says how far, the fine ones resolve the last
 # centimetres, where a single scale would leave millimetres in the noise.

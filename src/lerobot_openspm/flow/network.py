@@ -11,6 +11,8 @@ from torch import Tensor, nn
 
 TIME_FEATURES = 16
 STEP_FEATURES = 8
+# Gives the 240 K parameters of the paper's model.
+WIDTH = 268
 
 
 class VelocityField(nn.Module):
@@ -25,7 +27,7 @@ class VelocityField(nn.Module):
 
     action_scale: Tensor
 
-    def __init__(self, condition_dim: int, chunk_size: int, action_dim: int, width: int):
+    def __init__(self, condition_dim: int, chunk_size: int, action_dim: int, width: int = WIDTH):
         super().__init__()
         self.chunk_size, self.action_dim = chunk_size, action_dim
         self.encoder = nn.Sequential(

@@ -9,13 +9,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lerobot_openspm.errors import DatasetError
-from lerobot_openspm.flow.condition import Conditioning, Query, encode, progress, to_model_frame
+from lerobot_openspm.flow.condition import Query, encode, progress, to_model_frame
 from lerobot_openspm.geometry import se3
 from lerobot_openspm.geometry.se3 import Array
 from lerobot_openspm.memory.entry import PHASES
 from lerobot_openspm.memory.robot import RobotModel
 from lerobot_openspm.mining.key_poses import KeyPose
 from lerobot_openspm.mining.signals import Episode
+from lerobot_openspm.types import Conditioning
 
 # A hand that is further than this from its target and hardly commanded to move is pausing.
 PAUSE_DISTANCE_M = 0.012

@@ -7,8 +7,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from lerobot_openspm.flow.condition import Conditioning
 from lerobot_openspm.flow.samples import SegmentFrames, action_scale, conditions_and_chunks
+from lerobot_openspm.types import Conditioning
 
 
 class TrainingSet:

@@ -13,25 +13,19 @@ from dataclasses import dataclass, replace
 from functools import partial
 
 from lerobot_openspm.errors import InstructionError
+from lerobot_openspm.language.descriptions import phrase
 from lerobot_openspm.language.meaning import semantic_score
 from lerobot_openspm.language.names import TABLE_NAMES, NameSimilarity
 from lerobot_openspm.language.own_words import normal_words
 from lerobot_openspm.memory.entry import MemoryEntry, MemoryKeyPose, RetrievalKey
 from lerobot_openspm.memory.indexed_entries import near
 from lerobot_openspm.memory.retrieval import candidates_for, read_instruction, why_unread
-from lerobot_openspm.types import Reference, SubTask
+from lerobot_openspm.types import SubTask
 
 # A sub-task takes hold of something and lets it go again.
 TRANSITIONS_PER_SUB_TASK = 2
 # Ways through free space; without the objects they are relative to, the hand finds another way.
 FREE_PHASES = ("approach", "lift", "pre-place", "retreat")
-# Relations that are not the preposition that one says.
-_PREPOSITIONS = {
-    "front of": "to the front of", "left of": "to the left of", "right of": "to the right of", "at": "to",
-    "front": "in front of", "back": "behind", "left": "to the left of", "right": "to the right of",
-    "center": "in the center of",
-}  # fmt: skip
-_VERBS = {"pick": "pick up"}
 # What one thing after another is said with: "wipe the table, and then open the drawer".
 _NEXT = re.compile(r"(?:\band )?\bthen\b|[;.!?\n]+", re.IGNORECASE)
 _AND = re.compile(r"\band\b", re.IGNORECASE)
@@ -196,26 +190,3 @@ def _about(
         replace(by_entry[id(e)], semantic=score, asked=e.key.sub_tasks if asked[0].words else tuple(asked))
         for e, score in found
     )
-
-
-def phrase(sub_task: SubTask) -> str:
-    """A sub-task in words, as an instruction: "put the bowl in the top drawer of the cabinet"."""
-    if sub_task.words:
-        return sub_task.words
-    verb = _VERBS.get(sub_task.operation, sub_task.operation)
-    if not sub_task.landmark:
-        return f"{verb} {_noun(sub_task.target, sub_task.part, sub_task.target_where)}"
-    preposition = _PREPOSITIONS.get(sub_task.relation, sub_task.relation)
-    target = _noun(sub_task.target, "", sub_task.target_where)
-    landmark = _noun(sub_task.landmark, sub_task.part, sub_task.landmark_where)
-    return f"{verb} {target} {preposition} {landmark}"
-
-
-def _noun(name: str, part: str, where: Reference | None) -> str:
-    told = f"the {name}"
-    if where is not None and not where.landmarks:
-        told = f"the {where.relation} {name}"
-    elif where is not None:
-        preposition = _PREPOSITIONS.get(where.relation, where.relation)
-        told = f"the {name} {preposition} {' and '.join(f'the {landmark}' for landmark in where.landmarks)}"
-    return f"the {part} of {told}" if part else told

@@ -272,6 +272,7 @@ def check_labels(memory: Memory, labels: Mapping[str, int] | None, where: str) -
     """
     if labels is not None and (missing := sorted(set(memory.objects) - set(labels))):
         raise MemoryFormatError(
-            f"{where}: 'mask_labels' has no number for {', '.join(missing)}, which the memory has key poses "
-            f"at; it has {', '.join(sorted(labels))}. Pass --policy.mask_labels='{{...}}' with all of them"
+            f"{where}: 'segmentation.labels' has no number for {', '.join(missing)}, which the memory has "
+            f"key poses at; it has {', '.join(sorted(labels))}. Pass --policy.segmentation.labels='{{...}}' "
+            "with all of them"
         )

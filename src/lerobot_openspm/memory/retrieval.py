@@ -25,7 +25,10 @@ MAX_NAMED = 20
 
 @dataclass(frozen=True)
 class ScoreWeights:
-    """The paper's lambda_s, lambda_g and lambda_r."""
+    """The paper's lambda_s, lambda_g and lambda_r.
+
+    Only entries that mean the same are compared, so scene and quality weigh alike; what is meant weighs most.
+    """
 
     semantic: float = 1.0
     geometric: float = 0.5

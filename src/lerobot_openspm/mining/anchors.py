@@ -15,14 +15,15 @@ from lerobot_openspm.memory.entry import CONTACT_PHASES, WORLD, Anchor
 from lerobot_openspm.mining.key_poses import KeyPose
 from lerobot_openspm.types import SubTask
 
-# An anchor other than the one the instruction suggests must explain the demonstrations better by this much,
-# shared among them: with one demonstration the instruction decides, with many the evidence does.
+# An anchor other than the one that the instruction suggests must explain the demonstrations better by this
+# much divided by their number: with one demonstration the instruction decides, with many the evidence does.
 PRIOR_M = 0.05
 # Likewise for axes other than the anchor's own.
 AXES_PRIOR_M = 0.03
-# Key poses at contacts decide; the deviation of a good demonstration there is of this order.
+# The deviation of a good demonstration at its contacts is of this order.
 QUALITY_SCALE_M = 0.02
 
+# Which contact a key pose belongs to, its phase, and its number among those with both the same.
 Role = tuple[int, str, int]
 
 
@@ -40,10 +41,10 @@ class Demonstration:
 
 
 def roles(key_poses: Sequence[KeyPose]) -> list[Role]:
-    """What each key pose is for: which contact, which phase, and which of several with both the same.
+    """The role of each key pose.
 
-    The last ones of a kind are counted first (0 is the one nearest to the contact), so that an extra corner
-    far away in one demonstration does not shift the others.
+    Numbers count backwards (0 is the key pose nearest to the contact), so that an extra corner far away in
+    one demonstration does not shift the others.
     """
     seen: Counter[tuple[int, str]] = Counter()
     backwards: list[Role] = []
@@ -54,7 +55,7 @@ def roles(key_poses: Sequence[KeyPose]) -> list[Role]:
 
 
 def _is_turn(role: Role) -> bool:
-    """Whether a push goes on there: the hand passes by, in each demonstration somewhere else."""
+    """Whether a push goes on there: the hand passes by, elsewhere in each demonstration."""
     return role[1] == "push" and role[2] > 0
 
 
@@ -69,9 +70,9 @@ def things_taken(key_poses: Sequence[KeyPose]) -> int:
 
 
 def as_shown(sub_tasks: Sequence[SubTask], count: int) -> tuple[SubTask, ...]:
-    """Sub-tasks with as many things as the hand took, where the instruction is only kept by its words.
+    """Sub-tasks with as many targets as the hand took, where the instruction is only kept by its words.
 
-    "Set the table" does not say what is moved; the demonstrations show how many things are. Each gets a name
+    "Set the table" does not say what is moved; the demonstrations show how many objects are. Each gets a name
     of its own, so that perception learns it from where the hand touched it.
     """
     told = sub_tasks[0]
@@ -92,8 +93,7 @@ def suggested_anchor(pose: KeyPose, sub_tasks: Sequence[SubTask]) -> str:
 def consensus(demonstrations: Sequence[Demonstration], sub_tasks: Sequence[SubTask]) -> dict[Role, Anchor]:
     """Choose an anchor for every role of one task.
 
-    Candidates are built of the objects that the instruction names and that were found in a demonstration; an
-    object that it does not name is never an anchor, because nothing would look for it at run time.
+    Only objects that the instruction names are candidates, because nothing looks for others when acting.
     """
     names = list(dict.fromkeys(name for sub_task in sub_tasks for name in sub_task.objects))
     candidates = [Anchor(place, axes) for place in names for axes in (place, WORLD, *names)]
@@ -112,20 +112,14 @@ def consensus(demonstrations: Sequence[Demonstration], sub_tasks: Sequence[SubTa
 
 
 def _cost(anchor: Anchor, members: Sequence[tuple[KeyPose, Mapping[str, Array]]], suggested: str) -> float:
-    """How much key poses of one role vary in an anchor's frame, plus what speaks against it beforehand."""
+    """How much key poses of one role vary in an anchor's frame, in metres, plus the priors against it."""
     found = [(pose, layout) for pose, layout in members if all(name in layout for name in anchor.objects)]
     if not found:
         return np.inf
     poses = np.stack([se3.inverse(anchor.frame(layout)) @ pose.T_world_ee for pose, layout in found])
-    prior = (PRIOR_M * (anchor.place != suggested) + AXES_PRIOR_M * (anchor.axes != anchor.place)) / len(
-        found
-    )
-    return spread(poses) + prior + PRIOR_M * (1 - len(found) / len(members))
-
-
-def spread(T_obj_ee: Array) -> float:
-    """Median distance in metres of poses ``(n, 4, 4)`` from their medoid; 0 for a single one."""
-    return float(np.median(deviations(T_obj_ee)))
+    prior = PRIOR_M * (anchor.place != suggested) + AXES_PRIOR_M * (anchor.axes != anchor.place)
+    spread = float(np.median(deviations(poses)))
+    return spread + prior / len(found) + PRIOR_M * (1 - len(found) / len(members))
 
 
 def deviations(T_obj_ee: Array) -> Array:
@@ -139,8 +133,8 @@ def align_symmetric(
 ) -> list[Demonstration]:
     """Turn the frames of symmetric objects so that the demonstrations agree.
 
-    Perception cannot tell such an object from itself turned by its period, so each demonstration may hold
-    any choice. All are brought to that of the first demonstration in which the object was found.
+    Perception cannot tell such an object from itself turned by its period, so the choice may differ between
+    demonstrations. All follow the first demonstration in which the object was found.
     """
     references: dict[str, Array] = {}
     aligned = []
@@ -157,7 +151,7 @@ def align_symmetric(
             relative = [se3.inverse(T) @ np.stack(contacts) for T in equivalents]
             reference = references.setdefault(name, relative[0])
             n = min(len(reference), len(contacts))
-            # The contact nearest to the object tells most about which way round it is.
+            # The closest match among the contacts decides.
             costs = [float(np.min(se3.distance(T_obj_ee[:n], reference[:n]))) for T_obj_ee in relative]
             layout[name] = equivalents[int(np.argmin(costs))]
         aligned.append(Demonstration(demonstration.key_poses, layout))
@@ -180,7 +174,7 @@ def qualities(demonstrations: Sequence[Demonstration], anchors: Mapping[Role, An
     worst = np.zeros(len(demonstrations))
     for members in gathered.values():
         distances = deviations(np.stack([T for _, T in members]))
-        # Where all of them differ, as in where a push ends, differing says nothing against one.
+        # Where most of them deviate, such as at the end of a push, a deviation is no fault.
         if np.median(distances) > QUALITY_SCALE_M:
             continue
         for (i, _), distance in zip(members, distances, strict=True):

@@ -13,7 +13,7 @@ from lerobot_openspm.geometry.se3 import Array
 from lerobot_openspm.memory.entry import AXIS_KINDS, Anchor, Axis
 from lerobot_openspm.mining.anchors import Demonstration, Role, roles
 
-# A demonstration that moved an object less says nothing about the direction.
+# The direction of a smaller motion, in metres or radians, is noise.
 MIN_AMOUNT = {"slide": 0.02, "turn": np.deg2rad(10)}
 
 
@@ -22,8 +22,7 @@ def constrained_axes(
 ) -> list[dict[Role, Axis]]:
     """Axes of the constrained key poses of one task, per demonstration.
 
-    The direction, in the anchor's frame, is what the demonstrations have in common; how far each one went is
-    its own.
+    The direction, in the anchor's frame, is the demonstrations' median; the amount is each one's own.
     """
     motions: list[dict[Role, Array]] = [_motions(one, anchors) for one in demonstrations]
     gathered: dict[Role, list[Array]] = defaultdict(list)

@@ -1,31 +1,34 @@
 """Key poses from a multimodal model alone, without demonstrations: the paper's memory ablation.
 
 The model is told the instruction, the views, and where the objects are and how large. It answers with the
-hand's key poses. What it answers is checked as strictly as a file from a stranger, and refused as a whole.
+hand's key poses, which are checked as strictly as a file from a stranger, and refused as a whole.
 """
 
 from __future__ import annotations
 
 import json
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Protocol, cast
+from itertools import pairwise
+from typing import Any
 
 import numpy as np
 
-from lerobot_openspm.errors import JudgementError
+from lerobot_openspm.errors import PhaseLabelError
 from lerobot_openspm.geometry.se3 import Array
 from lerobot_openspm.memory.entry import PHASES
+from lerobot_openspm.mining.phase_labels.base import Picture
 from lerobot_openspm.mining.phase_labels.endpoint import ChatEndpoint
-from lerobot_openspm.mining.phase_labels.prompt import MEANINGS, Prompt, read_object
+from lerobot_openspm.mining.phase_labels.merge import FIRST, LAST, SUCCESSORS
+from lerobot_openspm.mining.phase_labels.prompt import MEANINGS_TEXT, Prompt, list_schema, read_object
 from lerobot_openspm.mining.phase_labels.qwen3vl import Qwen3VL
-from lerobot_openspm.mining.phase_labels.structure import FIRST, HOLDING, LAST, SUCCESSORS, check_sequence
-from lerobot_openspm.mining.phase_labels.types import Picture
 
 MAX_KEY_POSES = 32
 # No table is larger, and half a turn is as far as a hand can be turned.
 MAX_POSITION_M, MAX_ROTATION_RAD = 2.0, math.pi + 0.01
+# Phases with closed fingers around something.
+HOLDING = ("grasp", "lift", "pre-place", "place", "open", "turn")
 
 TEXT = """A robot hand shall do this: "{instruction}". The images show the scene, one for each camera.
 The scene as JSON (metres in the world, z up; an object's box is turned about z by its yaw in radians):
@@ -37,11 +40,18 @@ vector in radians about the world's axes, and turns the hand from pointing strai
 opening along the world's y; [0, 0, 0] leaves it so. closed says whether the gripper is closed on the way.
 Answer with JSON alone: {{"key_poses": [{{"phase": "approach", "position": [0.1, 0.0, 0.2], \
 "rotation": [0.0, 0.0, 0.0], "closed": false}}, ...]}}"""
+_TRIPLE = {"type": "array", "items": {"type": "number"}, "minItems": 3, "maxItems": 3}
+FIELDS: dict[str, Any] = {
+    "phase": {"type": "string", "enum": list(PHASES)},
+    "position": _TRIPLE,
+    "rotation": _TRIPLE,
+    "closed": {"type": "boolean"},
+}
 
 
 @dataclass(frozen=True)
 class SeenObject:
-    """An object as it is told to a model.
+    """An object as a model is told it.
 
     Attributes:
         name: As in the instruction.
@@ -58,12 +68,12 @@ class SeenObject:
 
 @dataclass(frozen=True)
 class SceneQuestion:
-    """What key poses does an instruction need in a scene?
+    """Which key poses does an instruction need in a scene?
 
     Attributes:
-        instruction: What shall be done.
+        instruction: The task.
         objects: The objects it names.
-        hand: Where the hand is ``(3,)``, metres.
+        hand: Position of the hand ``(3,)``, metres.
         fingers_m: How wide the gripper opens.
         pictures: One picture ``(height, width, 3)`` RGB by camera.
     """
@@ -87,45 +97,19 @@ class SceneQuestion:
         text = TEXT.format(
             instruction=self.instruction.replace('"', "'"),
             scene=json.dumps(scene, allow_nan=False),
-            phases="\n".join(f"- {phase}: {meaning}" for phase, meaning in MEANINGS.items()),
+            phases=MEANINGS_TEXT,
         )
-        pictures = [
-            (f"Camera {name.rpartition('.')[2]}:", picture) for name, picture in self.pictures.items()
-        ]
-        return Prompt(text, pictures, _schema())
+        pictures = [(f"Camera {name.rpartition('.')[2]}:", one) for name, one in self.pictures.items()]
+        return Prompt(text, pictures, list_schema("key_poses", FIELDS, 2, MAX_KEY_POSES))
 
 
 def _rounded(values: Array) -> list[float]:
     return [round(float(value), 4) for value in values]
 
 
-def _schema() -> dict[str, Any]:
-    """JSON schema of the answer."""
-    triple = {"type": "array", "items": {"type": "number"}, "minItems": 3, "maxItems": 3}
-    properties: dict[str, Any] = {
-        "phase": {"type": "string", "enum": list(PHASES)},
-        "position": triple,
-        "rotation": triple,
-        "closed": {"type": "boolean"},
-    }
-    pose = {
-        "type": "object",
-        "properties": properties,
-        "required": list(properties),
-        "additionalProperties": False,
-    }
-    poses = {"type": "array", "items": pose, "minItems": 2, "maxItems": MAX_KEY_POSES}
-    return {
-        "type": "object",
-        "properties": {"key_poses": poses},
-        "required": ["key_poses"],
-        "additionalProperties": False,
-    }
-
-
 @dataclass(frozen=True)
 class GuessedKeyPose:
-    """A key pose that a model made up; see :data:`TEXT` for its terms."""
+    """A key pose that a model made up; :data:`TEXT` defines the fields."""
 
     phase: str
     position: Array
@@ -133,98 +117,87 @@ class GuessedKeyPose:
     closed: bool
 
 
-class KeyPoseSource(Protocol):
-    """Something that makes up key poses."""
-
-    def guess(self, question: SceneQuestion) -> tuple[GuessedKeyPose, ...]:
-        """Key poses for an instruction in a scene.
-
-        Raises:
-            JudgementError: There is no answer, or it cannot be followed.
-        """
-        ...
+def guess_by_endpoint(question: SceneQuestion, endpoint: ChatEndpoint) -> tuple[GuessedKeyPose, ...]:
+    """Key poses from a model behind an endpoint. Raises PhaseLabelError where they cannot be followed."""
+    return read_key_poses(endpoint.complete(question.prompt()))
 
 
-@dataclass(frozen=True)
-class EndpointKeyPoses:
-    """Asks an OpenAI-compatible endpoint."""
-
-    endpoint: ChatEndpoint
-
-    def guess(self, question: SceneQuestion) -> tuple[GuessedKeyPose, ...]:
-        """See :class:`KeyPoseSource`."""
-        return read_key_poses(self.endpoint.complete(question.prompt()))
-
-
-@dataclass(frozen=True)
-class Qwen3VLKeyPoses:
-    """Asks Qwen3-VL in this process, which is held to key poses that can be followed."""
-
-    model: Qwen3VL
-
-    def guess(self, question: SceneQuestion) -> tuple[GuessedKeyPose, ...]:
-        """See :class:`KeyPoseSource`."""
-        written = self.model.write(question.prompt(), key_pose_grammar)
-        return read_key_poses("".join(piece.text for piece in written))
+def guess_by_qwen3vl(question: SceneQuestion, model: Qwen3VL) -> tuple[GuessedKeyPose, ...]:
+    """Key poses from Qwen3-VL in this process, constrained to those that can be followed."""
+    written = model.write(question.prompt(), key_pose_grammar)
+    return read_key_poses("".join(piece.text for piece in written))
 
 
 def read_key_poses(text: str) -> tuple[GuessedKeyPose, ...]:
     """The key poses in a model's JSON.
 
     Raises:
-        JudgementError: They are malformed, out of the world, or no hand can follow them.
+        PhaseLabelError: They are malformed, out of the world, or no hand can follow them.
     """
     answer = read_object(text)
     items = answer.get("key_poses")
     if set(answer) != {"key_poses"} or not isinstance(items, list) or not 2 <= len(items) <= MAX_KEY_POSES:
-        raise JudgementError(f"expected an object with 2 to {MAX_KEY_POSES} 'key_poses' and nothing else")
+        raise PhaseLabelError(f"expected an object with 2 to {MAX_KEY_POSES} 'key_poses' and nothing else")
     poses = tuple(_key_pose(item, f"key_poses[{i}]") for i, item in enumerate(items))
     check_sequence([pose.phase for pose in poses])
     return poses
 
 
+def check_sequence(phases: Sequence[str]) -> None:
+    """Raise PhaseLabelError on phases that no hand can follow, such as a release before a grasp."""
+    if phases[0] not in FIRST:
+        raise PhaseLabelError(f"the first phase is {phases[0]!r}, expected {' or '.join(FIRST)}")
+    for i, (before, after) in enumerate(pairwise(phases), start=2):
+        if after not in SUCCESSORS[before]:
+            raise PhaseLabelError(
+                f"phase {i} is {after!r} after {before!r}, expected {' or '.join(SUCCESSORS[before])}"
+            )
+    if phases[-1] not in LAST:
+        raise PhaseLabelError(f"the last phase is {phases[-1]!r}, expected {' or '.join(LAST)}")
+
+
 def _key_pose(item: Any, where: str) -> GuessedKeyPose:
-    fields = {"phase", "position", "rotation", "closed"}
-    if not isinstance(item, dict) or set(cast(dict[str, Any], item)) != fields:
-        raise JudgementError(f"{where} is no object with {', '.join(sorted(fields))} and nothing else")
+    if not isinstance(item, dict) or set(item) != set(FIELDS):
+        raise PhaseLabelError(f"{where} is no object with {', '.join(FIELDS)} and nothing else")
     phase, closed = item["phase"], item["closed"]
     if phase not in PHASES:
-        raise JudgementError(f"{where}: phase is {str(phase)[:40]!r}, expected one of {', '.join(PHASES)}")
+        raise PhaseLabelError(f"{where}: phase is {str(phase)[:40]!r}, expected one of {', '.join(PHASES)}")
     if not isinstance(closed, bool) or closed not in _grips(phase):
-        raise JudgementError(f"{where}: closed is {str(closed)[:40]!r}, which does not go with {phase!r}")
+        raise PhaseLabelError(f"{where}: closed is {str(closed)[:40]!r}, which does not go with {phase!r}")
     position, rotation = (_triple(item[name], f"{where}: {name}") for name in ("position", "rotation"))
     if np.abs(position).max() > MAX_POSITION_M:
-        raise JudgementError(f"{where}: position is {position}, expected within {MAX_POSITION_M} m")
+        raise PhaseLabelError(f"{where}: position is {position}, expected within {MAX_POSITION_M} m")
     if np.linalg.norm(rotation) > MAX_ROTATION_RAD:
-        raise JudgementError(f"{where}: rotation is {rotation}, expected up to half a turn")
+        raise PhaseLabelError(f"{where}: rotation is {rotation}, expected up to half a turn")
     return GuessedKeyPose(phase, position, rotation, closed)
 
 
 def _triple(values: Any, where: str) -> Array:
-    given = cast(list[Any], values) if isinstance(values, list) else []
-    numbers = [v for v in given if isinstance(v, int | float) and not isinstance(v, bool)]
-    if len(given) != 3 or len(numbers) != 3:
-        raise JudgementError(f"{where} is {str(values)[:60]}, expected three numbers")
+    if not isinstance(values, list) or [type(v) in (int, float) for v in values] != [True] * 3:
+        raise PhaseLabelError(f"{where} is {str(values)[:60]}, expected three numbers")
     try:
-        return np.array([float(v) for v in numbers])
+        return np.array([float(v) for v in values])
     except OverflowError as error:
-        raise JudgementError(f"{where} has a number that is too large") from error
+        raise PhaseLabelError(f"{where} has a number that is too large") from error
 
 
 def _grips(phase: str) -> tuple[bool, ...]:
-    """What the gripper may be on the way to a key pose; an empty hand may be a fist."""
+    """Whether the gripper may be closed on the way to a key pose; an empty hand may be closed too."""
     return (True,) if phase in HOLDING else (False,) if phase == "release" else (False, True)
 
 
 # How `key_pose_grammar` writes a pose: the phase, six numbers of four pieces each, the gripper, what follows.
 _BEGIN, _END, _NUMBER = '{"key_poses": [', "]}", 4
 _PIECES = 1 + 6 * _NUMBER + 1 + 1
-# After so many, the shortest way to an end is the only one.
+# After this many key poses only the shortest way to an end is left.
 _ENOUGH = 16
 
 
 def key_pose_grammar(written: tuple[str, ...]) -> tuple[str, ...]:
-    """JSON of key poses that :func:`read_key_poses` takes, with three decimals; see :data:`Grammar`."""
+    """JSON of key poses that :func:`read_key_poses` accepts, with three decimals.
+
+    See :data:`lerobot_openspm.mining.phase_labels.qwen3vl.Grammar`.
+    """
     if not written:
         return (_BEGIN,)
     if written[-1] == _END:
@@ -253,7 +226,7 @@ def _next(phases: list[str]) -> tuple[str, ...]:
 
 
 def _digits(number: int, place: int) -> tuple[str, ...]:
-    """One of four pieces of one of six numbers: what comes before the point, or a digit after it."""
+    """One of four pieces of one of six numbers: the integer part, or a digit after the point."""
     if place:
         return tuple("0123456789")
     before = '], "rotation": [' if number == 3 else "" if number == 0 else ", "

@@ -5,20 +5,21 @@ import random
 
 import numpy as np
 import pytest
-from tests.mining.phase_labels.loopback_chat import LoopbackChat, Reply, completion, question_of
-
-from lerobot_openspm.errors import JudgementError
-from lerobot_openspm.mining.phase_labels import zero_shot
-from lerobot_openspm.mining.phase_labels.endpoint import ChatEndpoint
-from lerobot_openspm.mining.phase_labels.qwen3vl import Qwen3VL
-from lerobot_openspm.mining.phase_labels.zero_shot import (
-    EndpointKeyPoses,
-    Qwen3VLKeyPoses,
+from benchmarks.libero import guessed_key_poses
+from benchmarks.libero.guessed_key_poses import (
     SceneQuestion,
     SeenObject,
+    check_sequence,
+    guess_by_endpoint,
+    guess_by_qwen3vl,
     key_pose_grammar,
     read_key_poses,
 )
+from tests.mining.phase_labels.loopback_chat import LoopbackChat, Reply, completion, question_of
+
+from lerobot_openspm.errors import PhaseLabelError
+from lerobot_openspm.mining.phase_labels.endpoint import ChatEndpoint
+from lerobot_openspm.mining.phase_labels.qwen3vl import Qwen3VL
 
 BOWL, PLATE = np.array([0.1, -0.2, 0.03]), np.array([0.05, 0.2, 0.01])
 QUESTION = SceneQuestion(
@@ -58,7 +59,7 @@ def test_a_server_that_answers_from_the_question():
         return Reply(completion(json.dumps({"key_poses": pick_and_place(question_of(request))})))
 
     with LoopbackChat(answer).running() as chat:
-        guessed = EndpointKeyPoses(ChatEndpoint(chat.api_base, "tiny-vl")).guess(QUESTION)
+        guessed = guess_by_endpoint(QUESTION, ChatEndpoint(chat.api_base, "tiny-vl"))
     phases = "approach approach grasp lift pre-place place release retreat"
     assert " ".join(g.phase for g in guessed) == phases
     np.testing.assert_allclose(guessed[2].position - BOWL, [0, 0, 0.03], atol=1e-9)
@@ -113,7 +114,7 @@ def changed(i: int, **fields) -> dict:
 )
 def test_what_is_malformed_or_cannot_be_followed_is_refused(answer: dict, words: str):
     assert len(read_key_poses(json.dumps({"key_poses": GOOD}))) == 4
-    with pytest.raises(JudgementError, match=words):
+    with pytest.raises(PhaseLabelError, match=words):
         read_key_poses(json.dumps(answer))
 
 
@@ -121,7 +122,7 @@ def test_what_is_malformed_or_cannot_be_followed_is_refused(answer: dict, words:
     "text", ["", "no", "[1]", '{"key_poses": [NaN, Infinity]}', '{"key_poses": ' + "[" * 99_999]
 )
 def test_what_is_no_json_is_refused(text: str):
-    with pytest.raises(JudgementError, match="the answer is no JSON"):
+    with pytest.raises(PhaseLabelError, match="the answer is no JSON"):
         read_key_poses(text)
 
 
@@ -134,8 +135,25 @@ def test_whatever_the_grammar_allows_is_taken(seed: int):
     assert len(read_key_poses("".join(written))) >= 2
 
 
-def test_qwen3vl_makes_up_key_poses_that_can_be_followed(tiny_qwen3vl_parts, monkeypatch):
-    monkeypatch.setattr(zero_shot, "_ENOUGH", 2)  # it knows no end of its own
-    guessed = Qwen3VLKeyPoses(Qwen3VL(*tiny_qwen3vl_parts, "tiny")).guess(QUESTION)
+def test_qwen3vl_makes_up_key_poses_that_can_be_followed(monkeypatch: pytest.MonkeyPatch):
+    from tests.mining.phase_labels import tiny_qwen3vl  # imports transformers, which takes seconds
+
+    processor = tiny_qwen3vl.processor()
+    model = Qwen3VL(tiny_qwen3vl.model(processor.tokenizer), processor, "tiny")
+    monkeypatch.setattr(guessed_key_poses, "_ENOUGH", 2)  # it knows no end of its own
+    guessed = guess_by_qwen3vl(QUESTION, model)
     assert guessed[0].phase == "approach"
     assert all(np.isfinite(g.position).all() for g in guessed)
+
+
+@pytest.mark.parametrize(
+    ("walk", "words"),
+    [
+        ("grasp lift", "first phase is 'grasp', expected approach"),
+        ("approach release", "phase 2 is 'release' after 'approach', expected approach or grasp or push"),
+        ("approach grasp place", "last phase is 'place'"),
+    ],
+)
+def test_sequences_that_no_hand_can_follow_are_named(walk: str, words: str):
+    with pytest.raises(PhaseLabelError, match=words):
+        check_sequence(walk.split())

@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from benchmarks.libero.guessed_key_poses import check_sequence
 from lerobot.annotations.steerable_pipeline.executor import Executor
 from lerobot.annotations.steerable_pipeline.reader import iter_episodes
 from lerobot.annotations.steerable_pipeline.staging import EpisodeStaging
@@ -20,7 +21,8 @@ from lerobot.policies.factory import make_policy
 from tests.mining.phase_labels.loopback_chat import LoopbackChat, Reply, question_of, say
 from tests.policy.lerobot_commands import CALIBRATION
 
-from lerobot_openspm.configuration_openspm import OpenSPMConfig
+from lerobot_openspm import training
+from lerobot_openspm.configuration_openspm import JudgeConfig, OpenSPMConfig
 from lerobot_openspm.errors import DatasetError, PerceptionError
 from lerobot_openspm.memory.entry import PHASES
 from lerobot_openspm.memory.memory import read_memory
@@ -28,9 +30,8 @@ from lerobot_openspm.mining.dataset import Demonstrations
 from lerobot_openspm.mining.key_poses import KeyPose
 from lerobot_openspm.mining.mined import MinedEpisode
 from lerobot_openspm.mining.phase_labels import question
-from lerobot_openspm.mining.phase_labels.judging import MAX_FAILURES
-from lerobot_openspm.mining.phase_labels.structure import check_sequence
-from lerobot_openspm.training import dataset_processor, judged, memory_of, training_set
+from lerobot_openspm.mining.phase_labels.labelling import MAX_FAILURES
+from lerobot_openspm.training import dataset_processor, labelled, memory_of, training_set
 
 NAME = "local/openspm_tabletop"
 
@@ -70,8 +71,16 @@ class Mined:
 
         self.demonstrations.pictures = pictures
 
-    def judged(self, first: int = 4, **options) -> tuple[MinedEpisode, ...]:
-        return judged(self.demonstrations, self.episodes[:first], self.robot, config(**options))
+    def judged(self, *judge, first: int = 4, **options) -> tuple[MinedEpisode, ...]:
+        chosen = config(judge=JudgeConfig(*judge, **options))
+        return labelled(self.demonstrations, self.episodes[:first], self.robot, chosen)
+
+
+@pytest.fixture(autouse=True)
+def answers(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """An empty folder of answers for each test."""
+    monkeypatch.setattr(training, "LABELS", tmp_path / "answers")
+    return training.LABELS
 
 
 @pytest.fixture(scope="module")
@@ -80,13 +89,11 @@ def mined(tiny_dataset: Path) -> Mined:
 
 
 @pytest.fixture
-def asked(mined: Mined, tmp_path: Path) -> Callable[..., tuple[MinedEpisode, ...]]:
+def asked(mined: Mined) -> Callable[..., tuple[MinedEpisode, ...]]:
     """Ask a server about the tiny dataset."""
 
     def asked(chat: LoopbackChat, **options) -> tuple[MinedEpisode, ...]:
-        endpoint = {"phase_judge": "openai", "phase_judge_api_base": chat.api_base}
-        folder = {"phase_judge_cache": str(tmp_path / "cache")}
-        return mined.judged(phase_judge_model_id="tiny-vl", **endpoint, **folder, **options)
+        return mined.judged("openai", chat.api_base, "tiny-vl", **options)
 
     return asked
 
@@ -125,7 +132,7 @@ def test_agreement_makes_every_key_pose_surer(mined: Mined, asked, caplog: pytes
     assert len(chat.requests) == len(mined.episodes) == 4
     pictures = [p for p in chat.requests[0]["messages"][0]["content"] if p["type"] == "image_url"]
     assert len(pictures) == 3
-    assert "openai tiny-vl v1 judged the phases of 4 of 4 episodes" in caplog.text
+    assert "openai tiny-vl v1 labelled the phases of 4 of 4 episodes" in caplog.text
 
 
 def test_nothing_is_asked_twice(mined: Mined, asked):
@@ -139,7 +146,7 @@ def test_nothing_is_asked_twice(mined: Mined, asked):
 
 def test_below_its_threshold_a_server_changes_nothing(mined: Mined, asked):
     with LoopbackChat(knowing(mined, 0.8)).running() as chat:
-        assert asked(chat, phase_judge_confidence=0.85) == mined.episodes
+        assert asked(chat, confidence=0.85) == mined.episodes
 
 
 def test_a_server_that_says_the_same_of_everything_breaks_nothing(mined: Mined, asked):
@@ -167,7 +174,7 @@ def test_a_server_that_says_the_same_of_everything_breaks_nothing(mined: Mined, 
 )
 def test_a_server_that_fails_is_asked_no_more_after_some_episodes(mined: Mined, asked, caplog, reply: Reply):
     with LoopbackChat(lambda _: reply).running() as chat:
-        assert asked(chat, phase_judge_timeout_s=0.5) == mined.episodes
+        assert asked(chat, timeout_s=0.5) == mined.episodes
     # There is no time for second attempts, so a request is an episode.
     assert len(chat.requests) == MAX_FAILURES < len(mined.episodes)
     assert caplog.text.count("gave no answer, mining goes on") == 1
@@ -183,12 +190,12 @@ def test_a_server_that_is_gone_costs_seconds(mined: Mined, asked, caplog: pytest
     assert "is asked no more" in caplog.text
 
 
-def test_the_flow_model_learns_the_phases_that_were_judged(mined: Mined, tmp_path: Path):
+def test_the_flow_model_learns_the_phases_that_were_judged(mined: Mined):
     def answer(request) -> Reply:
         return Reply(say(["pre-place"] * len(question_of(request)["candidates"]), 0.99))
 
-    def phases_learned(**options) -> set[str]:
-        chosen = config(memory_episodes=[0, 1], **options)
+    def phases_learned(*judge) -> set[str]:
+        chosen = config(memory_episodes=[0, 1], judge=JudgeConfig(*judge))
         found = dataset_processor(mined.meta, chosen).key_poses(held_out=True)
         episodes = [item.episode for item in found.episodes]
         frames = torch.cat([torch.arange(e.from_index, e.from_index + len(e)) for e in episodes])
@@ -196,8 +203,7 @@ def test_the_flow_model_learns_the_phases_that_were_judged(mined: Mined, tmp_pat
         return {PHASES[i] for i in conditions[:, -len(PHASES) :].argmax(dim=1).tolist()}
 
     with LoopbackChat(answer).running() as chat:
-        judge = {"phase_judge": "openai", "phase_judge_api_base": chat.api_base}
-        told = phases_learned(**judge, phase_judge_model_id="tiny-vl", phase_judge_cache=str(tmp_path))
+        told = phases_learned("openai", chat.api_base, "tiny-vl")
     assert len(chat.requests) == 2, "held-out episodes are not asked about"
     assert phases_learned() - told == {"lift"}
 
@@ -216,29 +222,23 @@ def test_a_server_that_fails_now_and_then_is_asked_on(mined: Mined, asked, caplo
 
 
 def test_qwen3vl_judges_in_this_process(
-    mined: Mined, tiny_qwen3vl_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    mined: Mined, tiny_qwen3vl_folder: Path, answers: Path, monkeypatch: pytest.MonkeyPatch
 ):
     # Its tokens are single letters, and a trajectory has thousands.
     monkeypatch.setattr(question, "TRAJECTORY_MOMENTS", 2)
-    found = mined.judged(
-        first=1,
-        phase_judge="qwen3vl",
-        phase_judge_model_id=str(tiny_qwen3vl_folder),
-        phase_judge_confidence=0.0,
-        phase_judge_cache=str(tmp_path),
-    )
-    (kept,) = (json.loads(path.read_text()) for path in tmp_path.rglob("*.json"))
+    found = mined.judged("qwen3vl", None, str(tiny_qwen3vl_folder), confidence=0.0, first=1)
+    (kept,) = (json.loads(path.read_text()) for path in answers.rglob("*.json"))
     assert kept["judge"] == f"qwen3vl {tiny_qwen3vl_folder} v1"
-    assert len(kept["answers"]) == len(found[0].key_poses)
-    assert {answer["phase"] for answer in kept["answers"]} <= set(PHASES)
+    assert len(kept["labels"]) == len(found[0].key_poses)
+    assert {answer["phase"] for answer in kept["labels"]} <= set(PHASES)
     # Random weights are sure of nothing, so there is nothing that they could change.
-    assert all(answer["confidence"] < 0.5 for answer in kept["answers"])
+    assert all(answer["confidence"] < 0.5 for answer in kept["labels"])
     assert found == mined.episodes[:1]
 
 
 def test_weights_that_are_not_there_are_an_error(mined: Mined, tmp_path: Path):
     with pytest.raises(PerceptionError, match="config"):
-        mined.judged(phase_judge="qwen3vl", phase_judge_model_id=str(tmp_path))
+        mined.judged("qwen3vl", None, str(tmp_path))
 
 
 @pytest.fixture(scope="module")
@@ -273,7 +273,7 @@ def test_annotations_are_evidence(annotated: Path):
     rows = with_rows.demonstrations.subtask_rows(0)
     assert [words for _, words in rows] == ["pick up the bowl", "put the bowl on the plate"]
     assert with_rows.demonstrations.subtask_rows(3) == []
-    found = with_rows.judged(phase_judge="annotations")
+    found = with_rows.judged("annotations")
     assert phases(found) == phases(with_rows.episodes)
     for before, after in zip(with_rows.episodes[:3], found[:3], strict=True):
         grown = [b.confidence < a.confidence for b, a in zip(before.key_poses, after.key_poses, strict=True)]
@@ -283,23 +283,21 @@ def test_annotations_are_evidence(annotated: Path):
 
 def test_a_dataset_without_annotations_is_an_error_with_the_command(mined: Mined):
     with pytest.raises(DatasetError, match="lerobot-annotate --root="):
-        mined.judged(phase_judge="annotations")
+        mined.judged("annotations")
 
 
 @pytest.mark.slow
 def test_a_checkpoint_holds_what_was_judged_and_not_where_it_was_asked(mined: Mined, tmp_path: Path):
     """From the options to the memory on disk, through everything in between."""
     chosen = {"memory_episodes": [0], "pretrained_path": None}
-    options = {"phase_judge": "openai", "phase_judge_model_id": "tiny-vl", **chosen}
     with LoopbackChat(knowing(mined, 0.9)).running() as chat:
-        places = {"phase_judge_api_base": chat.api_base, "phase_judge_cache": str(tmp_path / "cache")}
-        policy = make_policy(config(**options, **places), ds_meta=mined.meta)
+        judge = JudgeConfig("openai", chat.api_base, "tiny-vl")
+        policy = make_policy(config(judge=judge, **chosen), ds_meta=mined.meta)
     policy.save_pretrained(tmp_path / "checkpoint")
     assert len(chat.requests) == 1
 
     saved = json.loads((tmp_path / "checkpoint/config.json").read_text())
-    assert (saved["phase_judge"], saved["phase_judge_model_id"]) == ("openai", "tiny-vl")
-    assert (saved["phase_judge_api_base"], saved["phase_judge_cache"]) == (None, None)
+    assert saved["judge"].items() >= {"type": "openai", "model_id": "tiny-vl", "api_base": None}.items()
     unjudged = config(**chosen)
     plain = memory_of(dataset_processor(mined.meta, unjudged).mine(), unjudged)
     sure = read_memory(tmp_path / "checkpoint")

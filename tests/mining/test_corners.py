@@ -5,7 +5,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from lerobot_openspm.mining.path import corners
+from lerobot_openspm.mining.corners import corners
 
 STEP_M = 0.016
 

@@ -1,18 +1,17 @@
-"""What a judge of phases is asked, and what it answers."""
+"""What a judge of phases is asked about an episode, and the phase labels that it answers with."""
 
 from __future__ import annotations
 
 import hashlib
 import json
-import math
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from lerobot_openspm.errors import JudgementError
+from lerobot_openspm.errors import PhaseLabelError
 from lerobot_openspm.memory.entry import PHASES
 
 Picture = NDArray[np.uint8]
@@ -20,13 +19,13 @@ Picture = NDArray[np.uint8]
 
 @dataclass(frozen=True)
 class Moment:
-    """What the hand did at one frame of a demonstration.
+    """State of the hand at one frame of a demonstration.
 
     Attributes:
         time_s: Seconds since the start of the episode.
         position: Of the hand in the world, metres.
         rotation: Of the hand in the world, rotation vector, radians.
-        opening: Of the gripper, 0 for shut to 1 for as wide as it goes.
+        opening: Of the gripper, 0 for closed to 1 for fully open.
         closing: Whether the gripper is commanded to close.
     """
 
@@ -39,23 +38,22 @@ class Moment:
 
 @dataclass(frozen=True)
 class PhaseQuestion:
-    """Which phase ends at each candidate key pose of an episode? All of an episode's are one question.
+    """Which phase ends at each candidate key pose of an episode?
 
-    A model tells a lift from an approach by what comes before and after, and an episode of three contact
-    sheets costs it about as much as one high-resolution photograph: asking for each candidate alone would
-    cost ten times as much and say less. It is not asked where the boundaries are: the gripper and the hand's
-    path tell that to a frame or two, and pictures half a second apart do not.
+    There is one question per episode: a model tells a lift from an approach by what comes before and after,
+    and asking per candidate would cost ten times as much. The boundaries themselves are not in question,
+    because gripper and path give them to a frame or two, and pictures half a second apart do not.
 
     Attributes:
         dataset: Name of the dataset.
         episode: Index of the episode in it.
-        instruction: What the demonstration was asked to do.
+        instruction: The task of the demonstration.
         candidates: The moments at which a phase may end, in order.
-        trajectory: Moments in between, evenly spread over the episode.
+        trajectory: Moments spread evenly over the episode.
         sheets: By camera, up to three: contact sheets ``(height, width, 3)`` RGB with one numbered tile per
-            candidate. None for a judge that looks at no pictures.
-        kinematic: The phase that motion and gripper say ends at each candidate. No model is told: its
-            evidence would not be its own.
+            candidate. Empty for a judge that looks at no pictures.
+        kinematic: The phase that motion and gripper give each candidate. Models are not told, so that their
+            evidence stays independent.
     """
 
     dataset: str
@@ -83,7 +81,7 @@ class PhaseQuestion:
 
 
 def _rounded(moment: Moment) -> dict[str, object]:
-    """A moment as a model is told it: a tenth of a millimetre and of a degree are more than it can use."""
+    """A moment as JSON, to a tenth of a millimetre and to a millisecond."""
     fields = asdict(moment)
     for name in ("position", "rotation"):
         fields[name] = [round(float(x), 4) for x in fields[name]]
@@ -91,15 +89,15 @@ def _rounded(moment: Moment) -> dict[str, object]:
 
 
 @dataclass(frozen=True)
-class PhaseAnswer:
-    """What a judge says of one candidate.
+class PhaseLabel:
+    """The phase that ends at one candidate, and how sure that is.
 
     Attributes:
-        phase: The phase that ends there, one of :data:`lerobot_openspm.memory.entry.PHASES`.
+        phase: One of :data:`lerobot_openspm.memory.entry.PHASES`.
         confidence: The paper's ``gamma``, 0 to 1.
 
     Raises:
-        JudgementError: There is no such phase, or the confidence is none.
+        PhaseLabelError: The phase is unknown, or the confidence is not from 0 to 1.
     """
 
     phase: str
@@ -107,32 +105,45 @@ class PhaseAnswer:
 
     def __post_init__(self) -> None:
         if self.phase not in PHASES:
-            raise JudgementError(f"phase is {self.phase!r}, expected one of {', '.join(PHASES)}")
-        if not (math.isfinite(self.confidence) and 0 <= self.confidence <= 1):
-            raise JudgementError(f"confidence is {self.confidence}, expected 0 to 1")
+            raise PhaseLabelError(f"phase is {self.phase!r}, expected one of {', '.join(PHASES)}")
+        if not 0 <= self.confidence <= 1:
+            raise PhaseLabelError(f"confidence is {self.confidence}, expected 0 to 1")
+
+    @classmethod
+    def from_json(cls, data: Any) -> PhaseLabel:
+        """Read a label from JSON that may hold anything. Raises PhaseLabelError where it is no label."""
+        fields: dict[str, Any] = data if isinstance(data, dict) else {}
+        phase, confidence = fields.get("phase"), fields.get("confidence")
+        if (
+            not isinstance(phase, str)
+            or not isinstance(confidence, int | float)
+            or isinstance(confidence, bool)
+        ):
+            raise PhaseLabelError(f"got {str(data)[:80]}, expected an object with a phase and a confidence")
+        return cls(phase, confidence)
 
 
-# One for each candidate; None where the judge says nothing of it.
-Answers = tuple[PhaseAnswer | None, ...]
+# One per candidate; None where the judge says nothing about it.
+PhaseLabels = tuple[PhaseLabel | None, ...]
 
 
 class PhaseJudge(Protocol):
-    """Something that tells phases."""
+    """A source of phase labels."""
 
     @property
     def name(self) -> str:
-        """What it is, with the model's name: answers of different names are never mixed."""
+        """Kind, model and prompt version. Cached labels of different names are never mixed."""
         ...
 
     @property
     def looks(self) -> bool:
-        """Whether it looks at pictures."""
+        """Whether it needs pictures."""
         ...
 
-    def judge(self, question: PhaseQuestion) -> Answers:
-        """Say which phase ends at each candidate.
+    def judge(self, question: PhaseQuestion) -> PhaseLabels:
+        """Label each candidate of an episode.
 
         Raises:
-            JudgementError: There is no answer, or none that makes sense.
+            PhaseLabelError: There is no usable answer.
         """
         ...
