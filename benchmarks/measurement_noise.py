@@ -82,7 +82,7 @@ def collect(config: BenchConfig) -> list[Sample]:
                 def note(
                     _: int, __: Observation, row: EpisodeController, truth=truth, scene=scene, seed=seed
                 ) -> None:
-                    if row.scene.has_just_looked and row.scene.detections is not None:
+                    if row.scene.has_just_looked:
                         true = truth.now(scene.object_poses())
                         for name, estimate in row.scene.detections.estimates.items():
                             if (

@@ -45,7 +45,7 @@ def run_episode(policy: OpenSPMPolicy, simulator: LiberoSimulator) -> Episode:
 
     def note(step: int, observation: Observation, row: EpisodeController) -> None:
         if step == 0:
-            seen.update(row.planner.object_poses)
+            seen.update(row.scene.tracker.poses(observation.hand.T_world_ee))
             true.update(name_simulator_poses(simulator.object_poses(), list(dict.fromkeys(named)), models))
 
     done = run_in_world(policy, LiberoWorld(simulator), note=note)

@@ -28,7 +28,7 @@ from benchmarks.libero.episode import Episode, initial_states, run_episode
 from tqdm import tqdm
 
 from lerobot_openspm.cli.pipeline import digest, rate
-from lerobot_openspm.control.status import Status
+from lerobot_openspm.control.state import Status
 from lerobot_openspm.envs.libero.simulator import LiberoSimulator, tasks
 from lerobot_openspm.envs.seeds import TUNING_SEED_START
 from lerobot_openspm.files import write_beside
@@ -186,15 +186,15 @@ def _move_hand(simulator: LiberoSimulator, rng: np.random.Generator) -> None:
 
 def _told(episode: Episode) -> dict[str, Any]:
     """An episode as a line of JSON."""
-    executor, ranked = episode.row.executor, episode.row.planner.ranked
+    state, targets = episode.row.state, episode.row.executor.targets
     return {
         "steps": len(episode.actions),
         "success": episode.success,
-        "status": str(episode.row.status),
-        "key_pose": executor.index,
-        "phase": executor.plan[executor.index].key_pose.phase if executor.plan else None,
-        "attempts": executor.attempts,
-        "entry": ranked[0].entry.source if ranked else None,
+        "status": str(state.status),
+        "key_pose": state.index,
+        "phase": targets[state.index].key_pose.phase if targets else None,
+        "attempts": state.attempts,
+        "entry": state.ranked[0].entry.source if state.ranked else None,
         "seen": {name: _place(T) for name, T in episode.seen.items()},
         "true": {name: _place(T) for name, T in episode.true.items()},
     }

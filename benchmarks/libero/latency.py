@@ -39,7 +39,7 @@ def main() -> dict[str, Any]:
     with torch.inference_mode():
         first = _times(lambda: (acting.reset(), acting.act([observation])), LOOKS)
         row = acting.episodes[0].controller
-        chunk = _times(lambda: acting._chunk(row, row.query(hand)), CHUNKS)
+        chunk = _times(lambda: acting._chunk(row, hand), CHUNKS)
     horizon = acting.config.chunk_size
     return write(
         "libero_latency",

@@ -145,17 +145,18 @@ def search_scene(policy: OpenSPMPolicy, observation: Observation) -> Found:
         return in_words
     policy.reset()
     policy.act([observation])
-    row = policy.episodes[0].controller
-    if row.refusal:
-        return replace(in_words, parts=(), refusal=row.refusal, status=row.status.value)
-    sources = {id(one.entry): one.source for one in row.planner.parts[0]}
+    controller = policy.episodes[0].controller
+    state = controller.state
+    if state.refusal:
+        return replace(in_words, parts=(), refusal=state.refusal, status=state.status.value)
+    sources = {id(one.entry): one.source for one in state.parts[0]}
     ranked = tuple(
-        Hit(one.entry, sources[id(one.entry)], one.semantic, one.geometric, one.total)
-        for one in row.planner.ranked
+        Hit(one.entry, sources[id(one.entry)], one.semantic, one.geometric, one.total) for one in state.ranked
     )
     needed = dict.fromkeys(name for hit in ranked for name in hit.entry.objects)
-    seen = {name: name in row.planner.object_poses for name in needed}
-    return replace(in_words, parts=(ranked, *in_words.parts[1:]), seen=seen, status=row.status.value)
+    poses = controller.scene.tracker.poses(observation.hand.T_world_ee)
+    seen = {name: name in poses for name in needed}
+    return replace(in_words, parts=(ranked, *in_words.parts[1:]), seen=seen, status=state.status.value)
 
 
 def observation_of(

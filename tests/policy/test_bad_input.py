@@ -88,9 +88,9 @@ def test_an_instruction_that_is_refused_does_not_end_the_other_episodes(
     batch = batch_of([recorded[0][0], recorded[0][0]])
     actions = policy.select_action(batch | {"task": [batch["task"][0], task]})
     assert torch.equal(actions[:1], alone)
-    assert [one.controller.status.value for one in policy.episodes] == ["running", "not_understood"]
+    assert [one.controller.state.status.value for one in policy.episodes] == ["running", "not_understood"]
     assert torch.count_nonzero(actions[1, :6]) == 0
-    assert why in policy.episodes[1].controller.refusal
+    assert why in policy.episodes[1].controller.state.refusal
 
 
 @pytest.mark.parametrize(

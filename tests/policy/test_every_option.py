@@ -136,7 +136,7 @@ def status_far_away(trained: Trained, options: Options) -> Any:
     robot = replace(memory.robot, workspace=memory.robot.workspace + shift)
     policy.memory = replace(memory, robot=robot)
     act(policy, trained.recorded[:1])
-    return policy.episodes[0].controller.status
+    return policy.episodes[0].controller.state.status
 
 
 def entries(trained: Trained, options: Options) -> Any:

@@ -217,7 +217,7 @@ def test_fine_tuning_updates_the_memory_as_asked(
     assert torch.isfinite(loss)
     if BOWL not in expected:
         act(tuned, recorded[:1])
-        assert PUSH in tuned.episodes[0].controller.refusal
+        assert PUSH in tuned.episodes[0].controller.state.refusal
         return
     # What was known before is still found, and acts as before.
     assert torch.equal(act(tuned, recorded), act(load(), recorded))

@@ -116,7 +116,7 @@ def run_episode(
         poses = pose_vector(world.object_poses()) if policy.config.perception == "oracle" else None
         observation = Observation(world.instruction, vector, hand, LazyImages(world, cameras), poses)
         with torch.inference_mode():
-            action = action_layout.encode_actions(policy.act([observation])[0]).astype(np.float32)
+            action = action_layout.encode_actions(policy.act([observation])[0, 0]).astype(np.float32)
         if note is not None:
             note(len(actions), observation, policy.episodes[0].controller)
         over, success = world.step(action)

@@ -19,6 +19,7 @@ from lerobot_openspm.bench.object_frames import offset
 from lerobot_openspm.bench.truth import Truth, pose_error, true_period
 from lerobot_openspm.control.controller import EpisodeController
 from lerobot_openspm.envs.suites import find_suite
+from lerobot_openspm.episodes import step_s
 from lerobot_openspm.files import write_json
 from lerobot_openspm.geometry.se3 import Array
 from lerobot_openspm.modeling_openspm import OpenSPMPolicy
@@ -142,7 +143,7 @@ def measure_episode(
     samples: dict[str, list[Sample]] = {variant: [] for variant in VARIANTS}
 
     def compare(step: int, observation: Observation, row: EpisodeController) -> None:
-        if not row.planner.ranked:
+        if not row.state.ranked:
             return
         T_world_ee = observation.hand.T_world_ee
         true = truth.now(world.object_poses())
@@ -152,7 +153,7 @@ def measure_episode(
             "unfiltered": shadow.seen,
             "one_view": shadow.tracker.poses(T_world_ee),
         }
-        for name in (name for name in row.planner.ranked[0].entry.objects if name in offsets):
+        for name in (name for name in row.state.ranked[0].entry.objects if name in offsets):
             held = name in row.scene.tracker.held
             for variant, poses in known.items():
                 error: tuple[float | None, float | None] = (None, None)
@@ -171,7 +172,7 @@ class _Shadow:
         first = next(iter(memory.cameras))
         one_camera = replace(memory, cameras={first: memory.cameras[first]})
         self._eyes = Perception(one_camera, policy.config.hand_radius_m, policy.segmenter)
-        self._step_s = policy.step_s
+        self._step_s = step_s(policy.config)
         self.tracker = Tracker(memory.yaw_periods, TrackerSettings())
         self.seen: dict[str, Array] = {}
         self._time_s = self._looked_at_s = 0.0
@@ -181,7 +182,7 @@ class _Shadow:
         self._time_s += self._step_s
         self.tracker.predict(self._step_s)
         hand = observation.hand.T_world_ee
-        if row.scene.has_just_looked and row.scene.detections is not None:
+        if row.scene.has_just_looked:
             estimates = row.scene.detections.estimates
             self.seen |= {name: e.T_world_obj for name, e in estimates.items() if e.status == "found"}
             seen = self._eyes.detect(observation, list(estimates), self.tracker.poses(hand), self._time_s)

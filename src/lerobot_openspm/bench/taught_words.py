@@ -13,7 +13,7 @@ from functools import partial
 import numpy as np
 
 from lerobot_openspm.control.checks import TransferLimits
-from lerobot_openspm.control.planning_context import PlanningContext
+from lerobot_openspm.control.planning import PlanningContext
 from lerobot_openspm.control.strategies import ControlSettings
 from lerobot_openspm.errors import InstructionError, OpenSPMError
 from lerobot_openspm.geometry import se3
@@ -132,12 +132,12 @@ def acted_entries(
         parts = plan_parts(instruction, rated, names)
     except InstructionError:
         return ()
-    knowledge = PlanningContext(rated, {}, ROBOT, ScoreWeights(), TransferLimits(), ControlSettings())
+    context = PlanningContext(rated, {}, ROBOT, ScoreWeights(), TransferLimits(), ControlSettings())
     T_world_ee = se3.transform(_HAND_DOWN, [0.0, 0.0, 0.3])
     acted: list[MemoryEntry] = []
     for part in parts:
         rivals = sorted(part, key=lambda one: (not is_meant(one.source), one.semantic))
         layout = {name: T for one in rivals for name, T in one.entry.layout.items()}
-        best = knowledge.rank(part, layout, T_world_ee)[0].entry
+        best = context.rank(part, layout, T_world_ee)[0].entry
         acted.append(next(one.source for one in part if one.entry is best))
     return tuple(acted)

@@ -192,8 +192,8 @@ def run(folder: Path, task: str, demos: int, seed: int) -> Any:
     episode = run_episode(load(str(folder)), TabletopWorld(env, seed))
     env.close()
     return Result(
-        str(demos), task, seed, episode.success, len(episode.actions), episode.row.status.value,
-        episode.row.executor.attempts, None,
+        str(demos), task, seed, episode.success, len(episode.actions), episode.row.state.status.value,
+        episode.row.state.attempts, None,
     )  # fmt: skip
 
 

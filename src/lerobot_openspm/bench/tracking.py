@@ -79,8 +79,8 @@ def run(checkpoint: str, condition: Condition, task: str, seed: int) -> Result:
     episode = run_episode(policy, world, disturbance)
     env.close()
     return Result(
-        condition.name, task, seed, episode.success, len(episode.actions), episode.row.status.value,
-        episode.row.executor.attempts, disturbance.step if disturbance else None,
+        condition.name, task, seed, episode.success, len(episode.actions), episode.row.state.status.value,
+        episode.row.state.attempts, disturbance.step if disturbance else None,
     )  # fmt: skip
 
 
