@@ -29,7 +29,7 @@ from lerobot_openspm.mining.phase_labels.cache import AnswerCache
 from lerobot_openspm.mining.phase_labels.judging import judge_episodes
 from lerobot_openspm.mining.phase_labels.make import make_judge
 from lerobot_openspm.mining.processor import DatasetProcessor, MiningOptions
-from lerobot_openspm.perception.objects.object_shape import ShapeBackend
+from lerobot_openspm.perception.objects.base import ShapeBackend
 from lerobot_openspm.perception.objects.sam3d.size import Sam3dShape, worker_command
 from lerobot_openspm.types import Segmenter
 
@@ -171,7 +171,7 @@ def shapes_of(config: OpenSPMConfig) -> AbstractContextManager[ShapeBackend | No
             f"{config.sam3d_checkout!r}; pass --policy.sam3d_python=PYTHON and --policy.sam3d_checkout=DIR, "
             "see docs/sam3d.md"
         )
-    return Sam3dShape(worker_command(Path(config.sam3d_python), Path(config.sam3d_checkout)))
+    return nullcontext(Sam3dShape(worker_command(Path(config.sam3d_python), Path(config.sam3d_checkout))))
 
 
 def judged(

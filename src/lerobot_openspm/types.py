@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Literal, Protocol
+from typing import TYPE_CHECKING, Literal, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from lerobot_openspm.geometry.camera import Camera
-from lerobot_openspm.geometry.se3 import Array
+if TYPE_CHECKING:  # the configuration is imported by every command, and must not wait for SciPy
+    from lerobot_openspm.geometry.camera import Camera
+    from lerobot_openspm.geometry.se3 import Array
 
 Mask = NDArray[np.bool_]
 # What is learned of an object: its shape by the demonstrations' masks, the box around it, or a box of the
@@ -44,7 +45,7 @@ class View:
 
 @dataclass(frozen=True)
 class Segmentation:
-    """One instance of a phrase in one view: the paper's mask, bounding box and confidence.
+    """One instance of a phrase in one view: the paper's mask and confidence.
 
     Attributes:
         mask: Its pixels ``(H, W)``; at least one.
@@ -53,12 +54,6 @@ class Segmentation:
 
     mask: Mask
     confidence: float
-
-    @property
-    def box(self) -> Array:
-        """First and last column and row ``(4,)`` of the mask: u_min, v_min, u_max, v_max, pixels."""
-        u, v = np.flatnonzero(self.mask.any(0)), np.flatnonzero(self.mask.any(1))
-        return np.array([u[0], v[0], u[-1], v[-1]], float)
 
 
 class Segmenter(Protocol):
@@ -119,13 +114,13 @@ class Support:
     """What a pose estimate rests on: the grounds of the paper's observation covariance ``R_t``.
 
     Attributes:
-        kind: How the object is known.
+        kind: How the object is known; the noise of its poses was fitted for this kind.
         area_px: Pixels of the object that were used, over all views.
         consistency: From 0 to 1: whether the views tell the same.
         quality: From 0 to 1: how well the learned shape or patches explain the object's own demonstrations.
     """
 
-    kind: Literal["shape", "patches"]
+    kind: str
     area_px: float
     consistency: float
     quality: float
@@ -140,7 +135,6 @@ class PoseEstimate:
         T_world_obj: Upright pose ``(4, 4)``: origin at the footprint's centre on the support plane.
         covariance: ``(4, 4)`` over x, y, z in metres and yaw in radians.
         confidence: From 0 to 1; 1 is how well the object is typically found in its demonstrations.
-        masks: Foreground mask ``(H, W)`` by camera name.
         visible: Share of the object that is in sight in the view that shows it best, where the hand is not in
             the way: at its place if it was found, else where it was expected.
         support: What the estimate rests on; None where the covariance says all.
@@ -152,7 +146,6 @@ class PoseEstimate:
     T_world_obj: Array
     covariance: Array
     confidence: float
-    masks: dict[str, Mask]
     visible: float = 1.0
     support: Support | None = None
     others: tuple[Array, ...] = ()

@@ -22,9 +22,8 @@ from lerobot_openspm.envs.recording import source
 from lerobot_openspm.files import write_json
 from lerobot_openspm.geometry.se3 import Array
 from lerobot_openspm.modeling_openspm import OpenSPMPolicy
-from lerobot_openspm.perception.objects.localise import localise, prepare
 from lerobot_openspm.perception.observation import Observation
-from lerobot_openspm.perception.pipeline import Perception
+from lerobot_openspm.perception.pipeline import Perception, detect
 from lerobot_openspm.perception.tracking import kalman
 from lerobot_openspm.perception.tracking.tracker import Tracker, TrackerSettings
 from lerobot_openspm.training import open_demonstrations
@@ -242,15 +241,10 @@ def milliseconds(
         names: The objects to find.
         n: Runs.
     """
-    objects = policy.require_memory().objects
-    found = {name: localise(views, objects[name]).T_world_obj for name in names}
-
-    def look(expected: Mapping[str, Array]) -> None:
-        prepared = {camera: prepare(view) for camera, view in views.items()}
-        for name in names:
-            localise(prepared, objects[name], T_expected=expected.get(name))
-
-    first, followed = _times(lambda: look({}), n), _times(lambda: look(found), n)
+    objects = {name: policy.require_memory().objects[name] for name in names}
+    found = {name: one.T_world_obj for name, one in detect(views, objects).items()}
+    first = _times(lambda: detect(views, objects), n)
+    followed = _times(lambda: detect(views, objects, expected=found), n)
     return {"views": len(views), "objects": len(names), "first_ms": first, "followed_ms": followed}
 
 

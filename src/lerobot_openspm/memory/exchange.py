@@ -21,7 +21,7 @@ from lerobot_openspm.memory.memory import Memory, header_of, read_memory
 from lerobot_openspm.memory.merging import SOURCES
 from lerobot_openspm.memory.store import entry_from_fields
 from lerobot_openspm.memory.strict_json import loads
-from lerobot_openspm.perception.objects.model import KnownObject
+from lerobot_openspm.perception.objects.base import KnownObject
 from lerobot_openspm.perception.objects.store import to_parts as object_to_parts
 
 FORMAT = "openspm-entries"

@@ -11,7 +11,7 @@ from lerobot_openspm.memory.fields import MALFORMED, integer, known, readable, t
 from lerobot_openspm.memory.files import FORMAT, VERSION, Fields
 from lerobot_openspm.memory.robot import RobotModel
 from lerobot_openspm.memory.store import robot_from_dict, robot_to_dict
-from lerobot_openspm.perception.objects.learning import SHAPES
+from lerobot_openspm.perception.objects.kinds import SHAPES
 from lerobot_openspm.perception.segmentation.make import SEGMENTERS
 
 PERCEPTIONS = ("demonstrations", "oracle")

@@ -36,7 +36,7 @@ from lerobot_openspm.memory.header import Header, check_layouts, header_from_fie
 from lerobot_openspm.memory.old_versions import entries_from_parts
 from lerobot_openspm.memory.quality import with_outcome
 from lerobot_openspm.memory.robot import RobotModel
-from lerobot_openspm.perception.objects.model import KnownObject
+from lerobot_openspm.perception.objects.base import KnownObject
 from lerobot_openspm.perception.objects.store import from_parts as object_from_parts
 from lerobot_openspm.perception.objects.store import to_parts as object_to_parts
 

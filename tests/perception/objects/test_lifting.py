@@ -14,7 +14,7 @@ from lerobot_openspm.errors import ObservationError
 from lerobot_openspm.geometry import se3
 from lerobot_openspm.geometry.camera import intersect_plane
 from lerobot_openspm.perception.objects.box.box import Box
-from lerobot_openspm.perception.objects.lifting import depth_points, lift, support_height
+from lerobot_openspm.perception.objects.box.lifting import depth_points, lift, support_height
 
 PLACE = st.floats(-0.1, 0.1)
 YAW = st.floats(-np.pi, np.pi)

@@ -14,8 +14,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from lerobot_openspm.perception import colour
-from lerobot_openspm.perception.blobs import Blob, disc, find_blobs, grow
+from lerobot_openspm.perception import foreground as colour
+from lerobot_openspm.perception.foreground import Blob, disc, find_blobs, grow
+from lerobot_openspm.perception.objects.mask_association import column
 from lerobot_openspm.types import ContactCue, Mask, View
 
 SEED_RADIUS = 0.03
@@ -72,12 +73,6 @@ class Picture:
             for point in column(hint, self.floor) if hint.kind == "release" else [hint.point_world]:
                 mask |= disc(self.view, point, NEUTRAL_RADIUS)
         return mask
-
-
-def column(hint: ContactCue, floor: float) -> list[NDArray[np.float64]]:
-    """Points ``(3,)`` every 2 cm from a hint straight down to the world height ``floor``."""
-    heights = np.arange(hint.point_world[2], floor - 1e-9, -0.02)
-    return [np.array([*hint.point_world[:2], z], dtype=np.float64) for z in heights]
 
 
 def changed_pixels(first: View, later: View) -> Mask | None:

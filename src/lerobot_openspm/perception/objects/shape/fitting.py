@@ -16,6 +16,9 @@ from lerobot_openspm.types import UNKNOWN_YAW_STD, View
 
 LIMIT_PX = 40.0
 COARSE_PX, FINE_PX = 64.0, 160.0
+# Cuts of the residuals, one Gauss-Newton step each: from far off, and from nearby.
+COARSE_CUTS_PX = (30.0, 30.0, 20.0, 12.0)
+FINE_CUTS_PX = (6.0, 4.0, 3.0, 3.0)
 # Residuals along a contour are alike over several pixels: so many of them count as one observation.
 CORRELATED_PX = 4.0
 MIN_RESIDUAL_PX = 0.4

@@ -18,9 +18,9 @@ from lerobot_openspm.errors import ObservationError
 from lerobot_openspm.geometry import se3
 from lerobot_openspm.geometry.camera import intersect_plane, ray_directions
 from lerobot_openspm.geometry.se3 import Array
-from lerobot_openspm.perception.blobs import Blob, grow, reach, triangulate
+from lerobot_openspm.perception.foreground import Blob, grow, reach, triangulate
 from lerobot_openspm.perception.objects.mask_association import whole_mask
-from lerobot_openspm.perception.objects.shape import fitting, shape
+from lerobot_openspm.perception.objects.shape import fitting, hull
 from lerobot_openspm.perception.objects.shape.fitting import Cloud, Evidence
 from lerobot_openspm.types import Mask, View
 
@@ -180,7 +180,7 @@ def _hull(
         Evidence(views[name], blob.mask.astype(np.float32), camera=name) for name, blob in blobs.items()
     )
     T_world_cube = se3.from_yaw(centre, 0.0)
-    votes = shape.vote([shape.Posed(evidence, T_world_cube)], half_size)
+    votes = hull.vote([hull.Posed(evidence, T_world_cube)], half_size)
     cloud = votes.cloud(HULL_SHARE, (height - centre[2], np.inf))
     if cloud is None:
         return np.empty((0, 3)), votes.spacing
