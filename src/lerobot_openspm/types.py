@@ -14,11 +14,11 @@ if TYPE_CHECKING:  # the configuration is imported by every command, and must no
     from lerobot_openspm.geometry.se3 import Array
 
 Mask = NDArray[np.bool_]
-# What is learned of an object: its shape by the demonstrations' masks, the box around it, or a box of the
-# size that SAM 3D tells.
+# What is learned of an object: its shape from the demonstrations, the box around it, or a box of the size
+# that SAM 3D gives.
 Shape = Literal["demonstrations", "box", "sam3d"]
 
-# Standard deviation of a uniform angle: what is known of a yaw that cannot be seen.
+# Standard deviation of a uniform angle: of a yaw that cannot be seen.
 UNKNOWN_YAW_STD = float(np.pi / np.sqrt(3))
 
 
@@ -85,7 +85,7 @@ class ContactCue:
         point_world: Point ``(3,)`` between the fingertips, in metres.
         kind: ``"grasp"`` or ``"contact"``: part of the object was at this point in the first frame;
             ``"release"``: the object lies below or around this point.
-        place: Hints of one place touched the same spot of the object, as far as one can know.
+        place: Cues with the same place touched the same spot of the object, as far as one can know.
     """
 
     name: str
@@ -114,9 +114,9 @@ class Support:
     """What a pose estimate rests on: the grounds of the paper's observation covariance ``R_t``.
 
     Attributes:
-        kind: How the object is known; the noise of its poses was fitted for this kind.
+        kind: Kind of object whose fitted noise weights apply; a kind without weights gives no support.
         area_px: Pixels of the object that were used, over all views.
-        consistency: From 0 to 1: whether the views tell the same.
+        consistency: From 0 to 1: how well the views agree.
         quality: From 0 to 1: how well the learned shape or patches explain the object's own demonstrations.
     """
 
@@ -135,11 +135,11 @@ class PoseEstimate:
         T_world_obj: Upright pose ``(4, 4)``: origin at the footprint's centre on the support plane.
         covariance: ``(4, 4)`` over x, y, z in metres and yaw in radians.
         confidence: From 0 to 1; 1 is how well the object is typically found in its demonstrations.
-        visible: Share of the object that is in sight in the view that shows it best, where the hand is not in
-            the way: at its place if it was found, else where it was expected.
-        support: What the estimate rests on; None where the covariance says all.
-        others: Poses ``(4, 4)`` of further places that show such an object too, the surest first. Of objects
-            known by patches none are told.
+        visible: Share of the object that the best view shows and the hand does not hide, at its place if it
+            was found, else where it was expected.
+        support: What the estimate rests on; None where the covariance needs no correction.
+        others: Poses ``(4, 4)`` of further places that show such an object too, the most confident first;
+            empty for kinds that cannot see several.
     """
 
     status: Literal["found", "not_found", "ambiguous"]
@@ -205,7 +205,7 @@ class SubTask:
 
 @dataclass(frozen=True)
 class Fault:
-    """What is wrong with a camera, and seconds since its last sound picture."""
+    """What is wrong with a camera, and seconds since its last usable image."""
 
     reason: str
     seconds: float
@@ -213,11 +213,11 @@ class Fault:
 
 @dataclass(frozen=True)
 class Detections:
-    """What one look brought.
+    """What perception found in one observation.
 
     Attributes:
         estimates: By name, for the objects that were looked for.
-        faults: Cameras whose pictures cannot be used.
+        faults: Cameras whose images cannot be used.
     """
 
     estimates: Mapping[str, PoseEstimate]

@@ -22,8 +22,9 @@ from lerobot_openspm.envs.recording import source
 from lerobot_openspm.files import write_json
 from lerobot_openspm.geometry.se3 import Array
 from lerobot_openspm.modeling_openspm import OpenSPMPolicy
+from lerobot_openspm.perception.objects.base import Look
 from lerobot_openspm.perception.observation import Observation
-from lerobot_openspm.perception.pipeline import Perception, detect
+from lerobot_openspm.perception.pipeline import Perception
 from lerobot_openspm.perception.tracking import kalman
 from lerobot_openspm.perception.tracking.tracker import Tracker, TrackerSettings
 from lerobot_openspm.training import open_demonstrations
@@ -241,10 +242,14 @@ def milliseconds(
         names: The objects to find.
         n: Runs.
     """
-    objects = {name: policy.require_memory().objects[name] for name in names}
-    found = {name: one.T_world_obj for name, one in detect(views, objects).items()}
-    first = _times(lambda: detect(views, objects), n)
-    followed = _times(lambda: detect(views, objects, expected=found), n)
+    objects = [policy.require_memory().objects[name] for name in names]
+
+    def find(expected: Mapping[str, Array]) -> dict[str, Array]:
+        look = Look(views, expected=expected)
+        return {one.name: one.localise(look).T_world_obj for one in objects}
+
+    found = find({})
+    first, followed = _times(lambda: find({}), n), _times(lambda: find(found), n)
     return {"views": len(views), "objects": len(names), "first_ms": first, "followed_ms": followed}
 
 

@@ -12,7 +12,7 @@ import numpy as np
 from lerobot_openspm.geometry import se3
 from lerobot_openspm.geometry.camera import Camera, project
 from lerobot_openspm.geometry.se3 import Array
-from lerobot_openspm.perception.objects.base import KnownObject, Look
+from lerobot_openspm.perception.objects.base import KnownObject, look_at
 from lerobot_openspm.perception.observation import Observation
 from lerobot_openspm.perception.oracle import name_simulator_poses
 from lerobot_openspm.perception.tracking.camera_health import CameraWatch
@@ -100,7 +100,8 @@ class Perception:
             return Detections({}, faults)
         hidden = {camera: hand_mask(view, T_world_ee, self.hand_radius_m) for camera, view in sound.items()}
         known = {name: self.memory.objects[name] for name in names if name in self.memory.objects}
-        return Detections(detect(sound, known, self.segmenter, hidden, expected), faults)
+        look = look_at(sound, list(known), self.segmenter, hidden, expected)
+        return Detections({name: one.localise(look) for name, one in known.items()}, faults)
 
     def _simulator_poses(self, observation: Observation, names: Sequence[str]) -> dict[str, PoseEstimate]:
         poses = observation.simulator_poses(self.memory.simulator_objects)
@@ -110,27 +111,20 @@ class Perception:
 
 
 def detect(
-    views: Mapping[str, View],
-    objects: Mapping[str, KnownObject],
-    segmenter: Segmenter | None = None,
-    hidden: Mapping[str, Mask] | None = None,
-    expected: Mapping[str, Array] | None = None,
+    views: Mapping[str, View], objects: Mapping[str, KnownObject], segmenter: Segmenter | None = None
 ) -> dict[str, PoseEstimate]:
-    """Find objects in the views of one moment; a segmenter is asked once for all of them.
+    """Find objects in the views of one moment, nothing being known of where they may be.
 
     Args:
         views: Views by camera name.
         objects: The objects by phrase.
         segmenter: Finds the masks of objects that were learned from a segmenter's; None if none were.
-        hidden: Pixels ``(H, W)`` by camera name that something may be in front of.
-        expected: Poses ``(4, 4)`` by phrase at which objects are looked for first.
 
     Raises:
         ObservationError: There is no view, or one is malformed.
         PerceptionError: An object needs a segmenter and there is none, or the segmenter cannot be used.
     """
-    instances = segmenter.segment(views, list(objects)) if segmenter is not None and objects else {}
-    look = Look(views, instances, hidden or {}, expected or {})
+    look = look_at(views, list(objects), segmenter, {}, {})
     return {name: known.localise(look) for name, known in objects.items()}
 
 

@@ -102,6 +102,18 @@ class Look:
         return max(shares)
 
 
+def look_at(
+    views: Mapping[str, View],
+    phrases: Sequence[str],
+    segmenter: Segmenter | None,
+    hidden: Mapping[str, Mask],
+    expected: Mapping[str, Array],
+) -> Look:
+    """A :class:`Look` for objects. A segmenter is asked once for all of their phrases."""
+    found = segmenter.segment(views, phrases) if segmenter is not None and phrases else {}
+    return Look(views, found, hidden, expected)
+
+
 class KnownObject(Protocol):
     """An object that was learned. Every kind of object implements this."""
 
@@ -184,7 +196,7 @@ class Lesson:
     Attributes:
         names: The objects that are still to be learned.
         scenes: First frames and contact cues of the demonstrations of all tasks.
-        known: Objects that are known already; none of the new ones is one of them.
+        known: Objects that are known already; a new one is none of them.
         rng: Chooses among the demonstrations of an object where there are more than needed.
         segmenter: Finds the objects' masks; None where the demonstrations teach their looks.
         source: What a segmenter's masks are to teach.

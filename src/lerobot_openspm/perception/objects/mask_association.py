@@ -16,7 +16,7 @@ from lerobot_openspm.types import ContactCue, Mask, Scene, Segmentation, Segment
 # By camera: one object's mask.
 ObjectMasks = dict[str, Segmentation]
 
-# The hand touches an object within this distance of its mask.
+# A cue belongs to an instance within this distance of its mask.
 TOUCH_M = 0.04
 MIN_PIXELS = 12
 # Pieces of a mask smaller than this share of its largest are specks.

@@ -110,8 +110,21 @@ class ShapeModel:
         if T_expected is not None:
             there = fit(evidence, self.cloud, T_expected, _nearby(self, T_expected), NEARBY_CUTS_PX)
             fits = [there] if there.score >= NEARBY_CONFIDENCE * self.typical_overlap else []
-        fits = fits or search(evidence, self)
-        points = self.cloud.points[::SHARE_STEP]
+        if not fits:
+            prior, starts = PosePrior(yaw=0.0 if self.yaw_period == 0 else np.inf), list[Fit]()
+            for point in candidates(evidence, self):
+                poses = [se3.from_yaw(point, yaw) for yaw in self.search_yaws()]
+                turned = [fit(evidence, self.cloud, T, prior, COARSE_CUTS_PX, COARSE_PX) for T in poses]
+                starts.append(max(turned, key=lambda one: one.score))
+            enough = POOR_SHARE * max((one.score for one in starts), default=0.0)
+            good = [one.T_world_obj for one in starts if one.score > 0 and one.score >= enough]
+            fits = [fit(evidence, self.cloud, T, prior, FINE_CUTS_PX) for T in good]
+            fits = _distinct(sorted(fits, key=lambda one: -one.score), self.radius)
+        return self._estimate(look, evidence, fits)
+
+    def _estimate(self, look: Look, evidence: Sequence[Evidence], fits: Sequence[Fit]) -> PoseEstimate:
+        """What fits at distinct places say, the best first."""
+        T_expected, points = look.expected.get(self.name), self.cloud.points[::SHARE_STEP]
         if not fits:
             visible = 1.0 if T_expected is None else look.seen_share(se3.apply(T_expected, points))
             ignorance = np.diag([1.0, 1.0, 1.0, UNKNOWN_YAW_STD**2])
@@ -186,26 +199,6 @@ def _support(model: ShapeModel, evidence: Sequence[Evidence], best: Fit) -> Supp
     return Support(model.kind, area, consistency, model.typical_overlap)
 
 
-def search(evidence: Sequence[Evidence], model: ShapeModel) -> list[Fit]:
-    """Fits at distinct places, the best first."""
-    cloud, freedom = model.cloud, PosePrior(yaw=0.0 if model.yaw_period == 0 else np.inf)
-    starts = []
-    for point in candidates(evidence, model):
-        turned = [
-            fit(evidence, cloud, se3.from_yaw(point, yaw), freedom, COARSE_CUTS_PX, COARSE_PX)
-            for yaw in model.search_yaws()
-        ]
-        starts.append(max(turned, key=lambda one: one.score))
-    enough = POOR_SHARE * max((one.score for one in starts), default=0.0)
-    fits = [
-        fit(evidence, cloud, start.T_world_obj, freedom, FINE_CUTS_PX)
-        for start in starts
-        if start.score > 0 and start.score >= enough
-    ]
-    fits.sort(key=lambda one: -one.score)
-    return _distinct(fits, model.radius)
-
-
 def candidates(evidence: Sequence[Evidence], model: ShapeModel) -> list[Array]:
     """Places ``(3,)`` of the object's origin that patches of its colours suggest, the most likely first."""
     votes: list[tuple[Array, float]] = []
@@ -236,7 +229,8 @@ def candidates(evidence: Sequence[Evidence], model: ShapeModel) -> list[Array]:
     return [np.array([places[i][0], places[i][1], model.height]) for i in order]
 
 
-def _distinct(fits: list[Fit], radius: float) -> list[Fit]:
+def _distinct(fits: Sequence[Fit], radius: float) -> list[Fit]:
+    """Those that are not at the place of a better one."""
     kept: list[Fit] = []
     for one in fits:
         places = [other.T_world_obj[:2, 3] for other in kept]
