@@ -47,7 +47,7 @@ def smooth(counts: Array) -> Array:
     return gaussian_filter(counts.reshape(LAB_BINS), (0.7, 0.7, 0.7), mode="nearest", truncate=3.0).ravel()
 
 
-def foreground(bins: Bins, log_odds: NDArray[np.float32]) -> NDArray[np.float32]:
+def probability(bins: Bins, log_odds: NDArray[np.float32]) -> NDArray[np.float32]:
     """Soft foreground probability ``(H, W)``: the colour evidence, averaged lightly over neighbours."""
     table = 1.0 / (1.0 + np.exp(-log_odds))
     return np.asarray(cv2.GaussianBlur(table[bins].astype(np.float32), (3, 3), 0.6), np.float32)

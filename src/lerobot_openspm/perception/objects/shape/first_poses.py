@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 from lerobot_openspm.geometry import se3
 from lerobot_openspm.geometry.camera import intersect_plane
 from lerobot_openspm.geometry.se3 import Array
-from lerobot_openspm.perception.foreground import Blob, foreground, reach, triangulate
+from lerobot_openspm.perception import foreground
+from lerobot_openspm.perception.foreground import Blob, reach, triangulate
 from lerobot_openspm.perception.objects.base import Instances, Look
 from lerobot_openspm.perception.objects.mask_association import touched, whole_mask
 from lerobot_openspm.perception.objects.shape import colour_bootstrap
@@ -44,7 +45,7 @@ def coloured(pictures: Sequence[Picture], log_odds: NDArray[np.float32]) -> dict
     visible = colour_bootstrap.hiding_pixels(pictures, log_odds)
     groups: dict[int, list[Patched]] = {}
     for picture in pictures:
-        probability = foreground(picture.bins, log_odds)
+        probability = foreground.probability(picture.bins, log_odds)
         evidence = Evidence(picture.view, probability, visible.get(picture.camera), picture.camera)
         groups.setdefault(picture.scene, []).append(
             (evidence, colour_bootstrap.hinted_blob(picture, log_odds))

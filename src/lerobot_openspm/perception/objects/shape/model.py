@@ -17,7 +17,7 @@ from lerobot_openspm.errors import MemoryFormatError
 from lerobot_openspm.geometry import se3
 from lerobot_openspm.geometry.camera import intersect_plane
 from lerobot_openspm.geometry.se3 import Array
-from lerobot_openspm.perception.foreground import N_BINS, find_blobs, foreground
+from lerobot_openspm.perception import foreground
 from lerobot_openspm.perception.objects import records
 from lerobot_openspm.perception.objects.base import Look, Record
 from lerobot_openspm.perception.objects.shape.fitting import (
@@ -160,7 +160,7 @@ def from_record(fields: Mapping[str, Any], arrays: Mapping[str, NDArray[Any]], w
             f"{where}: 'foreground' of {name!r} is {source!r}, expected {COLOURS} or {SEGMENTER}"
         )
     numbers = records.numbers(fields, NUMBERS, where)
-    log_odds = records.array(arrays, "log_odds", (N_BINS,), where) if source == COLOURS else None
+    log_odds = records.array(arrays, "log_odds", (foreground.N_BINS,), where) if source == COLOURS else None
     points = records.array(arrays, "points", (-1, 3), where)
     if not 8 <= len(points) <= MAX_POINTS:
         raise MemoryFormatError(f"{where}: 'points' has {len(points)} rows, expected 8 to {MAX_POINTS}")
@@ -174,7 +174,9 @@ def _evidence(model: ShapeModel, look: Look) -> list[Evidence]:
         hidden = look.hidden.get(camera)
         visible = None if hidden is None else 1 - hidden.astype(np.float32)
         if model.log_odds is not None:
-            evidence.append(Evidence(view, foreground(look.bins(camera), model.log_odds), visible))
+            evidence.append(
+                Evidence(view, foreground.probability(look.bins(camera), model.log_odds), visible)
+            )
             continue
         mask = np.zeros(view.image.shape[:2], np.float32)
         for one in look.instances_of(model.name).get(camera, ()):
@@ -204,7 +206,7 @@ def candidates(evidence: Sequence[Evidence], model: ShapeModel) -> list[Array]:
     votes: list[tuple[Array, float]] = []
     middle = model.height + float(model.points[:, 2].mean())
     for one in evidence:
-        for blob in find_blobs(one.probability, 12, BLOBS_PER_VIEW):
+        for blob in foreground.find_blobs(one.probability, 12, BLOBS_PER_VIEW):
             point = intersect_plane(one.view.camera, one.view.T_world_cam, blob.centre, middle)
             distance = float(np.linalg.norm(point - one.view.T_world_cam[:3, 3]))
             expected = (one.view.camera.focal_px / distance) ** 2 * model.points.std(axis=0)[:2].prod() * 12
