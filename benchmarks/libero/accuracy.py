@@ -15,7 +15,7 @@ from lerobot_openspm.configuration_openspm import OpenSPMConfig
 from lerobot_openspm.envs.libero.simulator import tasks
 from lerobot_openspm.geometry import se3
 from lerobot_openspm.memory.io import read_memory
-from lerobot_openspm.perception.objects.model import PatchModel
+from lerobot_openspm.perception.objects.patches.model import PatchModel
 from lerobot_openspm.training import open_demonstrations
 
 # By which angle each object truly turns into itself.

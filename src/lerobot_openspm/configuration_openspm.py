@@ -269,7 +269,7 @@ class OpenSPMConfig(PreTrainedConfig):
         from lerobot_openspm.perception.segmentation.make import make_segmenter
 
         weights, labels = self.segmentation.weights or (), self.segmentation.labels or {}
-        return make_segmenter(self.perception, {}, labels, weights, str(self.device))
+        return make_segmenter(self.perception, labels, weights, str(self.device))
 
     def layouts(self) -> tuple[VectorLayout, VectorLayout]:
         """Layouts of state and action. Raises LayoutError when names are missing or make no sense."""

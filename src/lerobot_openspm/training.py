@@ -27,7 +27,7 @@ from lerobot_openspm.mining.entries import build_entries
 from lerobot_openspm.mining.mined import MinedDataset, MinedEpisode, MinedKeyPoses
 from lerobot_openspm.mining.phase_labels.labelling import LabelCache, label_phases, make_judge
 from lerobot_openspm.mining.processor import DatasetProcessor, MiningOptions
-from lerobot_openspm.perception.objects.object_shape import ShapeBackend
+from lerobot_openspm.perception.objects.base import ShapeBackend
 from lerobot_openspm.perception.objects.sam3d.size import Sam3dShape, worker_command
 from lerobot_openspm.types import Segmenter
 
@@ -176,7 +176,7 @@ def shapes_of(config: OpenSPMConfig) -> AbstractContextManager[ShapeBackend | No
             "pass --policy.segmentation.sam3d_python=PYTHON and --policy.segmentation.sam3d_checkout=DIR, "
             "see docs/sam3d.md"
         )
-    return Sam3dShape(worker_command(Path(python), Path(checkout)))
+    return nullcontext(Sam3dShape(worker_command(Path(python), Path(checkout))))
 
 
 def labelled(

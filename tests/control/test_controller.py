@@ -42,8 +42,8 @@ class Perception:
 
     def _estimate(self, name):
         if name not in self.layout:
-            return PoseEstimate("not_found", np.eye(4), COVARIANCE, 0.0, {}, self.visible)
-        return PoseEstimate("found", self.layout[name], COVARIANCE, self.confidence, {}, self.visible)
+            return PoseEstimate("not_found", np.eye(4), COVARIANCE, 0.0, self.visible)
+        return PoseEstimate("found", self.layout[name], COVARIANCE, self.confidence, self.visible)
 
 
 def controller(*entries, instruction=INSTRUCTION, seed=0, shown=7, **options):

@@ -24,7 +24,7 @@ NEAR, FAR = at(0.3, 0.18), at(0.0, -0.2)
 
 def seen(T, *others, status=None):
     status = status or ("ambiguous" if others else "found")
-    return PoseEstimate(status, T, 1e-6 * np.eye(4), 1.0, {}, others=tuple(others))
+    return PoseEstimate(status, T, 1e-6 * np.eye(4), 1.0, others=tuple(others))
 
 
 def look(grounding, bowl, layout=None):

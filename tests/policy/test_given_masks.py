@@ -24,7 +24,7 @@ from lerobot_openspm.memory.io import read_memory
 from lerobot_openspm.mining.dataset import Demonstrations
 from lerobot_openspm.mining.signals import Episode
 from lerobot_openspm.modeling_openspm import OpenSPMPolicy
-from lerobot_openspm.perception.objects.model import BoxModel
+from lerobot_openspm.perception.objects.box.model import BoxModel
 from lerobot_openspm.types import View
 
 LABELS = {noun: scene.OBJECT_LABELS[noun] for noun in ("bowl", "plate", "stove")}

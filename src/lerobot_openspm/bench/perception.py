@@ -23,7 +23,7 @@ from lerobot_openspm.episodes import step_s
 from lerobot_openspm.files import write_json
 from lerobot_openspm.geometry.se3 import Array
 from lerobot_openspm.modeling_openspm import OpenSPMPolicy
-from lerobot_openspm.perception.objects.localise import localise, prepare
+from lerobot_openspm.perception.objects.base import Look
 from lerobot_openspm.perception.observation import Observation
 from lerobot_openspm.perception.pipeline import Perception
 from lerobot_openspm.perception.tracking import kalman
@@ -243,15 +243,14 @@ def milliseconds(
         names: The objects to find.
         n: Runs.
     """
-    objects = policy.require_memory().objects
-    found = {name: localise(views, objects[name]).T_world_obj for name in names}
+    objects = [policy.require_memory().objects[name] for name in names]
 
-    def look(expected: Mapping[str, Array]) -> None:
-        prepared = {camera: prepare(view) for camera, view in views.items()}
-        for name in names:
-            localise(prepared, objects[name], T_expected=expected.get(name))
+    def find(expected: Mapping[str, Array]) -> dict[str, Array]:
+        look = Look(views, expected=expected)
+        return {one.name: one.localise(look).T_world_obj for one in objects}
 
-    first, followed = _times(lambda: look({}), n), _times(lambda: look(found), n)
+    found = find({})
+    first, followed = _times(lambda: find({}), n), _times(lambda: find(found), n)
     return {"views": len(views), "objects": len(names), "first_ms": first, "followed_ms": followed}
 
 

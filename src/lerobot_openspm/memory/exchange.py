@@ -31,7 +31,7 @@ from lerobot_openspm.memory.schema import (
     origin_of,
     record_of,
 )
-from lerobot_openspm.perception.objects.model import KnownObject
+from lerobot_openspm.perception.objects.base import KnownObject
 from lerobot_openspm.perception.objects.store import to_parts as object_to_parts
 
 FORMAT = "openspm-entries"

@@ -15,7 +15,7 @@ from lerobot_openspm.geometry.vector_layout import VectorLayout
 from lerobot_openspm.memory.entry import MemoryEntry
 from lerobot_openspm.memory.quality import with_outcome
 from lerobot_openspm.memory.robot import RobotModel
-from lerobot_openspm.perception.objects.model import KnownObject
+from lerobot_openspm.perception.objects.base import KnownObject
 
 Layouts = tuple[VectorLayout, VectorLayout]
 

@@ -23,7 +23,7 @@ from lerobot_openspm.geometry.vector_layout import VectorLayout
 from lerobot_openspm.mining.columns import TYPES, decode_key_poses
 from lerobot_openspm.mining.key_poses import KeyPose
 from lerobot_openspm.mining.signals import Episode
-from lerobot_openspm.perception.layers import DEPTH, MASKS, depth_of, labels_of
+from lerobot_openspm.perception.observation import DEPTH, MASKS, depth_of, labels_of
 from lerobot_openspm.perception.oracle import decode_object_poses
 from lerobot_openspm.types import View
 

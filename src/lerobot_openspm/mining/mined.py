@@ -12,7 +12,7 @@ from lerobot_openspm.memory.robot import RobotModel
 from lerobot_openspm.mining.anchors import Demonstration, Role
 from lerobot_openspm.mining.key_poses import KeyPose
 from lerobot_openspm.mining.signals import Episode
-from lerobot_openspm.perception.objects.model import KnownObject
+from lerobot_openspm.perception.objects.base import KnownObject
 from lerobot_openspm.types import SubTask
 
 

@@ -18,11 +18,10 @@ from lerobot_openspm.mining.dataset import Demonstrations
 from lerobot_openspm.mining.key_poses import KeyPose
 from lerobot_openspm.mining.mined import MinedEpisode
 from lerobot_openspm.mining.outcomes import carried_to
-from lerobot_openspm.perception.objects.learning import learn_objects
-from lerobot_openspm.perception.objects.localise import localise_all
-from lerobot_openspm.perception.objects.model import KnownObject
-from lerobot_openspm.perception.objects.object_shape import ShapeBackend
+from lerobot_openspm.perception.objects.base import KnownObject, ShapeBackend
+from lerobot_openspm.perception.objects.kinds import learn_objects
 from lerobot_openspm.perception.oracle import name_simulator_poses
+from lerobot_openspm.perception.pipeline import detect
 from lerobot_openspm.types import ContactCue, PoseEstimate, Scene, Segmenter, Shape
 
 logger = logging.getLogger(__name__)
@@ -91,7 +90,7 @@ def find_objects(
     for scene, item in tqdm(zip(scenes, mined, strict=True), "Finding objects", len(scenes), unit="episode"):
         wanted = dict.fromkeys(name for sub_task in item.sub_tasks for name in sub_task.objects)
         sought = {name: models[name] for name in wanted if name in models}
-        estimates = localise_all(scene.views, sought, segmenter)
+        estimates = detect(scene.views, sought, segmenter)
         places = {name: _place(name, estimate, scene.hints) for name, estimate in estimates.items()}
         found.append({name: T for name, T in places.items() if T is not None})
         ends.append(_ends(scene, item, found[-1], models, segmenter))
@@ -111,7 +110,7 @@ def _ends(
     sought = {name: models[name] for name in sorted(pushed) if name in models}
     if not sought or scene.later_views is None:
         return carried
-    seen = localise_all(scene.later_views, sought, segmenter)
+    seen = detect(scene.later_views, sought, segmenter)
     sure = {k: e for k, e in seen.items() if e.status == "found" and e.confidence >= MIN_END_CONFIDENCE}
     return {**carried, **{name: estimate.T_world_obj for name, estimate in sure.items()}}
 

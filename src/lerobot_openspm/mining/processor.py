@@ -47,8 +47,7 @@ from lerobot_openspm.mining.mined import MinedDataset, MinedEpisode, MinedKeyPos
 from lerobot_openspm.mining.objects import find_objects, learn_scenes, simulator_poses
 from lerobot_openspm.mining.outcomes import outcomes
 from lerobot_openspm.mining.signals import Episode, observe_robot
-from lerobot_openspm.perception.objects.model import KnownObject
-from lerobot_openspm.perception.objects.object_shape import ShapeBackend
+from lerobot_openspm.perception.objects.base import KnownObject, ShapeBackend
 from lerobot_openspm.types import Segmenter, Shape
 
 logger = logging.getLogger(__name__)

@@ -1,4 +1,4 @@
-"""Objects that hardly move between demonstrations: found again by matching small patches of the images.
+"""Small patches of images: cutting them out, and finding them again in another image.
 
 Where an object stays within a few centimetres and keeps its direction, the pixels around it look alike in all
 first frames, whatever its colours and its surroundings. A patch around the place that the hand touched is
@@ -8,7 +8,6 @@ Which patches to use is learned (:mod:`lerobot_openspm.perception.objects.patche
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 
 import cv2
@@ -16,26 +15,55 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lerobot_openspm.geometry import se3
-from lerobot_openspm.geometry.camera import project
+from lerobot_openspm.geometry.camera import Camera, project
 from lerobot_openspm.geometry.se3 import Array
-from lerobot_openspm.perception.objects.model import Patch, PatchModel, Picture, Probe
-from lerobot_openspm.types import UNKNOWN_YAW_STD, Mask, PoseEstimate, Support, View
+from lerobot_openspm.types import Mask, View
+
+Picture = NDArray[np.uint8]
 
 # How far from each patch's own place an object is sought.
 REACH_M = 0.035
 MIN_PATCH_PX = 7
 # A patch with less contrast than this, in CIELAB levels, is found everywhere.
 MIN_CONTRAST = 4.0
-# A patch is looked for at the height it was learned at; an object this much above or below is another matter.
-MAX_LIFT_M = 0.005
-# Probes whose places differ by this much are 1/e consistent.
-CONSISTENT_M = 0.005
-# Of the typical correlation.
-FOUND_CORRELATION = 0.5
 # A hand camera sees the patch as in the demonstrations only from the same place.
 MAX_CAMERA_SHIFT_M, MAX_CAMERA_TURN_RAD = 0.02, 0.10
 # A patch of which more is hidden is not looked for.
 MAX_HIDDEN_SHARE = 0.2
+
+
+@dataclass(frozen=True)
+class Patch:
+    """A piece of a demonstration's first frame.
+
+    Attributes:
+        image: CIELAB pixels ``(h, w, 3)``, uint8.
+        corner: Pixel ``(2,)`` of its upper left corner, horizontal first.
+        point_world: The object's reference point ``(3,)`` in that frame.
+    """
+
+    image: Picture
+    corner: Array
+    point_world: Array
+
+
+@dataclass(frozen=True)
+class Probe:
+    """Patches of one camera and size.
+
+    Attributes:
+        camera: Name of the camera.
+        calibration: The camera as the patches were seen with it.
+        T_world_cam: Its pose ``(4, 4)`` then.
+        patches: One per reference demonstration.
+        std_m: Spread of its estimates against the other probes', metres.
+    """
+
+    camera: str
+    calibration: Camera
+    T_world_cam: Array
+    patches: tuple[Patch, ...]
+    std_m: float
 
 
 @dataclass(frozen=True)
@@ -109,74 +137,7 @@ def _lab(image: NDArray[np.uint8]) -> Picture:
     return np.asarray(cv2.cvtColor(np.ascontiguousarray(image), cv2.COLOR_RGB2LAB), np.uint8)
 
 
-def localise_patches(
-    views: Mapping[str, View],
-    model: PatchModel,
-    hidden: Mapping[str, Mask] | None = None,
-    T_expected: Array | None = None,
-) -> PoseEstimate:
-    """Find an object known by patches in the views of one moment.
-
-    Args:
-        views: Views by camera name. Those of a camera that has moved since the patches were taken do not
-            help.
-        model: The object.
-        hidden: Pixels ``(H, W)`` by camera name that something may be in front of; patches there do not help.
-        T_expected: Pose ``(4, 4)`` at which the object is expected. Out of the patches' reach nothing can be
-            said of it.
-    """
-    information, weighted = np.zeros((2, 2)), np.zeros(2)
-    correlations, places, area_px = [], [], 0.0
-    for probe in model.probes:
-        view = as_seen(views.get(probe.camera), probe)
-        covered = (hidden or {}).get(probe.camera)
-        if view is None or (covered is not None and _is_covered(probe, covered)):
-            continue
-        found = [match(patch, probe, view) for patch in probe.patches]
-        sights = [one for one in found if one is not None]
-        if not sights:
-            continue
-        weight = np.eye(2) / probe.std_m**2
-        information += weight
-        places.append(np.median([one.point_world[:2] for one in sights], axis=0))
-        weighted += weight @ places[-1]
-        area_px += float(np.mean([patch.image[..., 0].size for patch in probe.patches]))
-        correlations.append(float(np.median([one.correlation for one in sights])))
-    unknown = np.diag([1.0, 1.0, 1.0, UNKNOWN_YAW_STD**2])
-    if not correlations:
-        return PoseEstimate("not_found", np.eye(4), unknown, 0.0, {}, visible=0.0)
-    confidence = float(np.clip(np.mean(correlations) / max(model.typical_correlation, 1e-3), 0, 1))
-    status = (
-        "found" if np.mean(correlations) >= FOUND_CORRELATION * model.typical_correlation else "not_found"
-    )
-    # Height and direction are taken to be the demonstrated ones; they are not measured.
-    covariance = np.diag([0.0, 0.0, REACH_M**2, UNKNOWN_YAW_STD**2])
-    # The probes look at the same pixels and err together: many are no surer than one.
-    covariance[:2, :2] = len(correlations) * np.linalg.inv(information)
-    place = np.linalg.solve(information, weighted)
-    T_world_obj = se3.from_yaw(np.append(place, model.height), 0.0)
-    visible = float(_can_tell(model, status == "found", T_expected))
-    apart = np.linalg.norm(np.stack(places) - place, axis=1).max()
-    quality = float(np.clip(model.typical_correlation, 0, 1))
-    support = Support("patches", area_px, float(np.exp(-apart / CONSISTENT_M)), quality)
-    return PoseEstimate(status, T_world_obj, covariance, confidence, {}, visible, support)
-
-
-def _can_tell(model: PatchModel, found: bool, T_expected: Array | None) -> bool:
-    """Whether patches say anything of an object that is expected somewhere.
-
-    A lifted object looks like one that has moved sideways, and what is expected out of the patches' reach is
-    not missed there.
-    """
-    if T_expected is None:
-        return True
-    if abs(T_expected[2, 3] - model.height) > MAX_LIFT_M:
-        return False
-    places = np.stack([patch.point_world[:2] for probe in model.probes for patch in probe.patches])
-    return found or bool(np.linalg.norm(places - T_expected[:2, 3], axis=1).min() <= REACH_M)
-
-
-def _is_covered(probe: Probe, hidden: Mask) -> bool:
+def is_covered(probe: Probe, hidden: Mask) -> bool:
     """Whether much of where a probe's patches lie may be hidden."""
     height, width = hidden.shape
     scale = np.array([width / probe.calibration.width, height / probe.calibration.height])

@@ -3,25 +3,18 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import get_args
 
 import numpy as np
 from numpy.random import Generator
 from numpy.typing import NDArray
 
-from lerobot_openspm.errors import DatasetError
 from lerobot_openspm.geometry import se3
 from lerobot_openspm.geometry.se3 import Array
-from lerobot_openspm.perception.objects.box.learn import learn_boxes
-from lerobot_openspm.perception.objects.localise import COARSE_CUTS_PX, FINE_CUTS_PX
+from lerobot_openspm.perception.objects.base import Kind, Lesson
 from lerobot_openspm.perception.objects.mask_association import segmented
-from lerobot_openspm.perception.objects.model import KnownObject, ObjectModel
-from lerobot_openspm.perception.objects.object_shape import ShapeBackend
-from lerobot_openspm.perception.objects.patches.learn import learn_patches
-from lerobot_openspm.perception.objects.shape import colour_bootstrap as seeding
-from lerobot_openspm.perception.objects.shape import shape
+from lerobot_openspm.perception.objects.shape import colour_bootstrap, hull
 from lerobot_openspm.perception.objects.shape.first_poses import (
     Patched,
     coloured,
@@ -30,7 +23,9 @@ from lerobot_openspm.perception.objects.shape.first_poses import (
     pictures_of,
 )
 from lerobot_openspm.perception.objects.shape.fitting import (
+    COARSE_CUTS_PX,
     COARSE_PX,
+    FINE_CUTS_PX,
     FINE_PX,
     Cloud,
     Fit,
@@ -39,9 +34,10 @@ from lerobot_openspm.perception.objects.shape.fitting import (
     measure,
     score,
 )
-from lerobot_openspm.perception.objects.shape.shape import Posed, Votes
+from lerobot_openspm.perception.objects.shape.hull import Posed, Votes
+from lerobot_openspm.perception.objects.shape.model import ShapeModel, from_record
 from lerobot_openspm.perception.objects.yaw import search_range, yaw_range
-from lerobot_openspm.types import Scene, Segmenter, Shape
+from lerobot_openspm.types import Scene, Segmenter
 
 log = logging.getLogger(__name__)
 
@@ -67,80 +63,45 @@ NEAR_YAWS = np.deg2rad([-30.0, -10.0, 10.0, 30.0])
 TURN_GAIN = 0.008
 
 
-SHAPES: tuple[Shape, ...] = get_args(Shape)
+def learn_shapes(lesson: Lesson) -> dict[str, ShapeModel]:
+    """Learn the shapes of a lesson's objects, from a segmenter's masks or from the objects' colours."""
+    if lesson.source != "demonstrations" and lesson.segmenter is not None:
+        return {}
+    floor = min([lesson.floor, *(one.height for one in lesson.known)])
+    if lesson.segmenter is not None:
+        found = _learn_masked(lesson.names, lesson.scenes, floor, lesson.segmenter)
+    else:
+        found = {name: _learn_coloured(name, lesson.scenes, floor, lesson.rng) for name in lesson.names}
+    return {name: model for name, model in found.items() if model is not None}
 
 
-def learn_objects(
-    scenes: Sequence[Scene],
-    rng: Generator,
-    known: Collection[KnownObject] = (),
-    segmenter: Segmenter | None = None,
-    shape_source: Shape = "demonstrations",
-    shapes: ShapeBackend | None = None,
-) -> dict[str, KnownObject]:
-    """Learn every object that some scene hints at and that is not known.
-
-    Args:
-        scenes: First frames and hints of the demonstrations of all tasks.
-        rng: Chooses among the demonstrations of an object where there are more than needed.
-        known: Objects that are known already; none of the new ones is one of them.
-        segmenter: Finds the objects' masks; by default the demonstrations teach their colours and patches.
-        shape_source: With a segmenter, "box" learns the boxes around the objects and "demonstrations" their
-            shapes; without one, there is only the latter. "sam3d" learns boxes of the sizes that `shapes`
-            tells.
-        shapes: Tells the size of an object from one view of it, for "sam3d".
-
-    Returns:
-        Models by name. An object that cannot be learned (never visible, no consistent colour) is left out,
-        and the log says so.
-
-    Raises:
-        DatasetError: No scene has a hint.
-    """
-    hints = [hint for scene in scenes for hint in scene.hints]
-    names = sorted({hint.name for hint in hints} - {model.name for model in known})
-    if not hints:
-        raise DatasetError(
-            "no demonstration shows a grasp, contact or release; perception has nothing to learn from"
-        )
-    if segmenter is not None and shape_source != "demonstrations":
-        return {**learn_boxes(names, scenes, segmenter, shapes)}
-    floor = min([float(hint.point_world[2]) - 0.02 for hint in hints] + [model.height for model in known])
-    if segmenter is not None:
-        return _learn_masked(names, scenes, floor, segmenter)
-    models: dict[str, KnownObject] = {**learn_patches(names, scenes, known)}
-    for name in names:
-        model = models.get(name) or learn_object(name, scenes, floor, rng)
-        if model is not None:
-            models[name] = model
-    return models
+SHAPE = Kind(ShapeModel.kind, learn_shapes, from_record)
 
 
-def learn_object(name: str, scenes: Sequence[Scene], floor: float, rng: Generator) -> ObjectModel | None:
-    """Learn an object's colours and shape from scenes with hints at it; None, with a warning, if in vain."""
+def _learn_coloured(name: str, scenes: Sequence[Scene], floor: float, rng: Generator) -> ShapeModel | None:
+    """Colours and shape of an object from scenes with contact cues; None, with a warning, if in vain."""
     hinted = [i for i, scene in enumerate(scenes) if any(hint.name == name for hint in scene.hints)]
     if len(hinted) > MAX_SCENES:
         hinted = sorted(rng.choice(hinted, MAX_SCENES, replace=False).tolist())
     pictures = [picture for i in hinted for picture in pictures_of(i, name, scenes[i], floor)]
-    log_odds = seeding.learn_colours(pictures)
+    log_odds = colour_bootstrap.learn_colours(pictures)
     return _learn_shape(name, log_odds, coloured(pictures, log_odds), len(hinted))
 
 
 def _learn_masked(
     names: Sequence[str], scenes: Sequence[Scene], floor: float, segmenter: Segmenter
-) -> dict[str, KnownObject]:
+) -> dict[str, ShapeModel | None]:
     """Shapes of objects from a segmenter's masks."""
-    models: dict[str, KnownObject] = {}
+    models: dict[str, ShapeModel | None] = {}
     for name, pairs in segmented(names, scenes, segmenter).items():
         groups = {i: masked(name, scene, floor, found) for i, (scene, found) in enumerate(pairs)}
-        if model := _learn_shape(name, None, groups, len(pairs)):
-            models[name] = model
+        models[name] = _learn_shape(name, None, groups, len(pairs))
     return models
 
 
 def _learn_shape(
     name: str, log_odds: NDArray[np.float32] | None, groups: Mapping[int, list[Patched]], count: int
-) -> ObjectModel | None:
+) -> ShapeModel | None:
     posed, half_size = first_poses(groups)
     if not posed:
         log.warning("perception: %r was not found near the hints of its %d demonstrations", name, count)
@@ -162,7 +123,7 @@ def _bootstrap(posed: list[Posed], half_size: float) -> tuple[Cloud, list[Posed]
     judges = [posed[i] for i in order[:JUDGES]]
     best: tuple[float, Cloud] | None = None
     for reference in order[:REFERENCES]:
-        cloud = shape.vote([posed[reference]], half_size).cloud(0.9)
+        cloud = hull.vote([posed[reference]], half_size).cloud(0.9)
         if cloud is None:
             continue
         total = float(np.median([_fit_yaws(scene, cloud, yaws).score for scene in judges]))
@@ -189,7 +150,7 @@ def _finish(posed: list[Posed], half_size: float, cloud: Cloud) -> tuple[Cloud, 
     for round_index in range(ROUNDS):
         if round_index == 2:
             posed = _aligned_axis(posed, half_size, cloud, limits)
-        votes = shape.vote(_reliable(posed, cloud), half_size, shape.around(cloud, half_size))
+        votes = hull.vote(_reliable(posed, cloud), half_size, hull.around(cloud, half_size))
         reliable = _reliable(posed, cloud)
         cloud, threshold = _best_cloud(reliable, votes, limits, cloud)
         limits = _trimmed(reliable, votes, threshold)
@@ -212,7 +173,7 @@ def _aligned_axis(
     _, halfwidth = yaw_range(np.array([se3.yaw_of(scene.T_world_obj) for scene in posed]), 2 * np.pi)
     if halfwidth > NARROW_YAW:
         return posed
-    worth_asking = shape.around(cloud, half_size)
+    worth_asking = hull.around(cloud, half_size)
 
     def shifted(scenes: Sequence[Posed], x: float, y: float) -> list[Posed]:
         T_world_moved = se3.from_yaw([x, y, 0.0], 0.0)
@@ -220,8 +181,8 @@ def _aligned_axis(
 
     def value(x: float, y: float) -> float:
         moved = shifted(judges, x, y)
-        hull, _ = _best_cloud(moved, shape.vote(moved, half_size, worth_asking), limits, cloud)
-        return float(np.mean([score(measure(s.evidence, hull, s.T_world_obj, FINE_PX)) for s in moved]))
+        body, _ = _best_cloud(moved, hull.vote(moved, half_size, worth_asking), limits, cloud)
+        return float(np.mean([score(measure(s.evidence, body, s.T_world_obj, FINE_PX)) for s in moved]))
 
     reliable = _reliable(posed, cloud)
     judges = reliable[:: max(1, len(reliable) // AXIS_JUDGES)]
@@ -251,7 +212,7 @@ def _symmetrise(
         turned, moved = cloud, posed
         for _ in range(SYMMETRY_ROUNDS):
             reliable = _reliable(moved, turned)
-            votes = shape.vote(reliable, half_size, shape.around(turned, half_size)).turned(order)
+            votes = hull.vote(reliable, half_size, hull.around(turned, half_size)).turned(order)
             turned, _ = _best_cloud(reliable, votes, limits, turned)
             moved = _moved(moved, [_refit(scene, turned, period) for scene in moved])
         worth = float(
@@ -315,7 +276,7 @@ def _centred(
 ) -> tuple[list[Posed], Cloud, tuple[float, float]]:
     """The same with the frame's axis through the footprint's centre and the origin half way up."""
     middle = (float(cloud.points[:, 2].min()) + float(cloud.points[:, 2].max())) / 2
-    shift = np.array([*shape.footprint(cloud.points)[0], middle])
+    shift = np.array([*hull.footprint(cloud.points)[0], middle])
     T_old_new = se3.from_yaw(shift, 0.0)
     moved = [replace(scene, T_world_obj=scene.T_world_obj @ T_old_new) for scene in posed]
     return moved, Cloud(cloud.points - shift, cloud.spacing), (limits[0] - middle, limits[1] - middle)
@@ -358,9 +319,9 @@ def _model(
     posed: list[Posed],
     period: float,
     scores: Array,
-) -> ObjectModel:
+) -> ShapeModel:
     """Put the frame at the footprint's centre, x along its long side; summarise the demonstrations."""
-    centre, turn, _ = shape.footprint(cloud.points)
+    centre, turn, _ = hull.footprint(cloud.points)
     bottom = float(cloud.points[:, 2].min()) - cloud.spacing / 2
     turn = 0.0 if period == 0 else turn
     T_old_new = se3.from_yaw([*centre, bottom], turn)
@@ -370,7 +331,7 @@ def _model(
     )
     yaw_centre, halfwidth = search_range(yaws, period)
     height = float(np.median([scene.T_world_obj[2, 3] for scene in posed])) + bottom
-    return ObjectModel(
+    return ShapeModel(
         name, log_odds, points.astype(np.float32), cloud.spacing, height, period, yaw_centre, halfwidth,
         float(np.median(scores)),
     )  # fmt: skip

@@ -18,10 +18,10 @@ from lerobot_openspm.errors import ObservationError
 from lerobot_openspm.geometry import se3
 from lerobot_openspm.geometry.camera import intersect_plane, ray_directions
 from lerobot_openspm.geometry.se3 import Array
-from lerobot_openspm.perception.blobs import Blob, grow, reach, triangulate
+from lerobot_openspm.perception.foreground import Blob, grow, reach, triangulate
 from lerobot_openspm.perception.objects.mask_association import whole_mask
-from lerobot_openspm.perception.objects.shape import fitting, shape
-from lerobot_openspm.perception.objects.shape.fitting import Cloud, Evidence
+from lerobot_openspm.perception.objects.shape import hull
+from lerobot_openspm.perception.objects.shape.fitting import Evidence
 from lerobot_openspm.types import Mask, View
 
 Source = Literal["depth", "hull", "plane"]
@@ -51,15 +51,12 @@ class Lifted:
         spacing: Distance between neighbouring points, metres.
         ray_gap_m: Largest distance of the rays through the centres of its whole masks from the point nearest
             to all; NaN where fewer than two masks end before the image does.
-        overlaps: By camera, intersection over union of the mask with the points drawn in that view; NaN where
-            they are out of sight.
     """
 
     points_world: Array
     source: Source
     spacing: float
     ray_gap_m: float
-    overlaps: dict[str, float]
 
 
 def lift(views: Mapping[str, View], masks: Mapping[str, Mask], height: float) -> Lifted | None:
@@ -89,7 +86,7 @@ def lift(views: Mapping[str, View], masks: Mapping[str, Mask], height: float) ->
     points, spacing, source = _points(seen, blobs, centre, height)
     if len(points) < MIN_POINTS:
         return None
-    return Lifted(points, source, spacing, gap, _overlaps(seen, blobs, points, spacing))
+    return Lifted(points, source, spacing, gap)
 
 
 def _points(
@@ -180,20 +177,11 @@ def _hull(
         Evidence(views[name], blob.mask.astype(np.float32), camera=name) for name, blob in blobs.items()
     )
     T_world_cube = se3.from_yaw(centre, 0.0)
-    votes = shape.vote([shape.Posed(evidence, T_world_cube)], half_size)
+    votes = hull.vote([hull.Posed(evidence, T_world_cube)], half_size)
     cloud = votes.cloud(HULL_SHARE, (height - centre[2], np.inf))
     if cloud is None:
         return np.empty((0, 3)), votes.spacing
     return se3.apply(T_world_cube, cloud.points), votes.spacing
-
-
-def _overlaps(
-    views: Mapping[str, View], blobs: Mapping[str, Blob], points: Array, spacing: float
-) -> dict[str, float]:
-    evidence = [Evidence(views[name], blob.mask.astype(np.float32)) for name, blob in blobs.items()]
-    centre = points.mean(axis=0)
-    values = fitting.measure(evidence, Cloud(points - centre, spacing), se3.from_yaw(centre, 0.0))
-    return {name: float(value) for name, value in zip(blobs, values, strict=True)}
 
 
 def _pixel_m(view: View, point_world: Array) -> float:
