@@ -45,8 +45,7 @@ class VelocityField(nn.Module):
     def forward(self, actions: Tensor, time: Tensor, latent: Tensor) -> Tensor:
         """Velocity of noisy chunks, both ``(b, H, action_dim)``, at flow times ``(b,)`` in [0, 1].
 
-        `latent` is ``encoder(condition)``, ``(b, width)``, computed once a chunk however many times the field
-        is evaluated.
+        `latent` is ``encoder(condition)``, ``(b, width)``, computed once per chunk for all Euler steps.
         """
         b, h = actions.shape[0], self.chunk_size
         context = torch.cat([latent, actions.flatten(1), _time_features(time)], dim=-1)
