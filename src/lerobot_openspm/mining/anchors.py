@@ -33,11 +33,17 @@ class Demonstration:
 
     Attributes:
         key_poses: Its key poses, in order.
-        layout: Pose ``T_world_obj`` ``(4, 4)`` of every object found in its first frame.
+        object_poses: ``T_world_obj`` ``(4, 4)`` of every object found in its first frame.
     """
 
     key_poses: tuple[KeyPose, ...]
-    layout: Mapping[str, Array]
+    object_poses: Mapping[str, Array]
+
+    def in_frame(self, anchor: Anchor, pose: KeyPose) -> Array | None:
+        """A key pose in an anchor's frame, ``T_anchor_ee`` ``(4, 4)``; None if an object was not found."""
+        if any(name not in self.object_poses for name in anchor.objects):
+            return None
+        return se3.inverse(anchor.frame(self.object_poses)) @ pose.T_world_ee
 
 
 def roles(key_poses: Sequence[KeyPose]) -> list[Role]:
@@ -97,10 +103,10 @@ def consensus(demonstrations: Sequence[Demonstration], sub_tasks: Sequence[SubTa
     """
     names = list(dict.fromkeys(name for sub_task in sub_tasks for name in sub_task.objects))
     candidates = [Anchor(place, axes) for place in names for axes in (place, WORLD, *names)]
-    gathered: dict[Role, list[tuple[KeyPose, Mapping[str, Array]]]] = defaultdict(list)
+    gathered: dict[Role, list[tuple[KeyPose, Demonstration]]] = defaultdict(list)
     for demonstration in demonstrations:
         for role, pose in zip(roles(demonstration.key_poses), demonstration.key_poses, strict=True):
-            gathered[role].append((pose, demonstration.layout))
+            gathered[role].append((pose, demonstration))
     anchors: dict[Role, Anchor] = {}
     for role, members in gathered.items():
         suggested = suggested_anchor(members[0][0], sub_tasks)
@@ -111,14 +117,14 @@ def consensus(demonstrations: Sequence[Demonstration], sub_tasks: Sequence[SubTa
     return anchors
 
 
-def _cost(anchor: Anchor, members: Sequence[tuple[KeyPose, Mapping[str, Array]]], suggested: str) -> float:
+def _cost(anchor: Anchor, members: Sequence[tuple[KeyPose, Demonstration]], suggested: str) -> float:
     """How much key poses of one role vary in an anchor's frame, in metres, plus the priors against it."""
-    found = [(pose, layout) for pose, layout in members if all(name in layout for name in anchor.objects)]
+    placed = [demonstration.in_frame(anchor, pose) for pose, demonstration in members]
+    found = [T for T in placed if T is not None]
     if not found:
         return np.inf
-    poses = np.stack([se3.inverse(anchor.frame(layout)) @ pose.T_world_ee for pose, layout in found])
     prior = PRIOR_M * (anchor.place != suggested) + AXES_PRIOR_M * (anchor.axes != anchor.place)
-    spread = float(np.median(deviations(poses)))
+    spread = float(np.median(deviations(np.stack(found))))
     return spread + prior / len(found) + PRIOR_M * (1 - len(found) / len(members))
 
 
@@ -139,12 +145,12 @@ def align_symmetric(
     references: dict[str, Array] = {}
     aligned = []
     for demonstration in demonstrations:
-        layout = dict(demonstration.layout)
+        object_poses = dict(demonstration.object_poses)
         with_roles = zip(demonstration.key_poses, roles(demonstration.key_poses), strict=True)
         contacts = [
             p.T_world_ee for p, role in with_roles if p.phase in CONTACT_PHASES and not _is_turn(role)
         ]
-        for name, T_world_obj in layout.items():
+        for name, T_world_obj in object_poses.items():
             equivalents = se3.yaw_equivalents(T_world_obj, yaw_periods.get(name, 2 * np.pi))
             if len(equivalents) == 1 or not contacts:
                 continue
@@ -153,8 +159,8 @@ def align_symmetric(
             n = min(len(reference), len(contacts))
             # The closest match among the contacts decides.
             costs = [float(np.min(se3.distance(T_obj_ee[:n], reference[:n]))) for T_obj_ee in relative]
-            layout[name] = equivalents[int(np.argmin(costs))]
-        aligned.append(Demonstration(demonstration.key_poses, layout))
+            object_poses[name] = equivalents[int(np.argmin(costs))]
+        aligned.append(Demonstration(demonstration.key_poses, object_poses))
     return aligned
 
 
@@ -164,13 +170,10 @@ def qualities(demonstrations: Sequence[Demonstration], anchors: Mapping[Role, An
     for i, demonstration in enumerate(demonstrations):
         for role, pose in zip(roles(demonstration.key_poses), demonstration.key_poses, strict=True):
             anchor = anchors.get(role)
-            if (
-                pose.phase in CONTACT_PHASES
-                and not _is_turn(role)
-                and anchor
-                and all(n in demonstration.layout for n in anchor.objects)
-            ):
-                gathered[role].append((i, se3.inverse(anchor.frame(demonstration.layout)) @ pose.T_world_ee))
+            if anchor is None or pose.phase not in CONTACT_PHASES or _is_turn(role):
+                continue
+            if (T_obj_ee := demonstration.in_frame(anchor, pose)) is not None:
+                gathered[role].append((i, T_obj_ee))
     worst = np.zeros(len(demonstrations))
     for members in gathered.values():
         distances = deviations(np.stack([T for _, T in members]))

@@ -45,10 +45,11 @@ def _motions(demonstration: Demonstration, anchors: Mapping[Role, Anchor]) -> di
     named = list(zip(roles(demonstration.key_poses), demonstration.key_poses, strict=True))
     for (_, before), (role, pose) in pairwise(named):
         anchor, kind = anchors.get(role), AXIS_KINDS.get(pose.phase)
-        if kind is None or anchor is None or any(n not in demonstration.layout for n in anchor.objects):
+        if kind is None or anchor is None:
             continue
-        T_anchor_world = se3.inverse(anchor.frame(demonstration.layout))
-        start, end = T_anchor_world @ before.T_world_ee, T_anchor_world @ pose.T_world_ee
+        start, end = (demonstration.in_frame(anchor, one) for one in (before, pose))
+        if start is None or end is None:
+            continue
         slide = end[:3, 3] - start[:3, 3]
         vector = slide if kind == "slide" else se3.log_so3(end[:3, :3] @ start[:3, :3].T)
         if float(np.linalg.norm(vector)) >= MIN_AMOUNT[kind]:

@@ -26,7 +26,7 @@ def carried_to(demonstration: Demonstration, sub_tasks: Sequence[SubTask]) -> di
     No image is needed, so this also works for demonstrations that end with the hand around the object. Of an
     object that was carried twice, the last place counts.
     """
-    poses = dict(demonstration.layout)
+    poses = dict(demonstration.object_poses)
     carried: dict[str, Array] = {}
     T_ee_obj: tuple[str, Array] | None = None
     for pose in demonstration.key_poses:
@@ -73,18 +73,18 @@ def _outcomes(
     ends: Sequence[Mapping[str, Array]],
 ) -> dict[int, Outcome]:
     """The outcome of one sub-task by demonstration; empty where too few show it, or they disagree."""
-    layouts = [{**one.layout, **end} for one, end in zip(demonstrations, ends, strict=True)]
+    final_poses = [{**one.object_poses, **end} for one, end in zip(demonstrations, ends, strict=True)]
     known = [
         i
-        for i, (end, layout) in enumerate(zip(ends, layouts, strict=True))
-        if sub_task.target in end and sub_task.landmark in layout
+        for i, (end, poses) in enumerate(zip(ends, final_poses, strict=True))
+        if sub_task.target in end and sub_task.landmark in poses
     ]
     if not known or 2 * len(known) < len(demonstrations):
         return {}
     places = np.stack([ends[i][sub_task.target][:3, 3] for i in known])
     choices = []
     for anchor in (Anchor(sub_task.landmark, sub_task.landmark), Anchor(sub_task.landmark, WORLD)):
-        T_anchor_world = se3.inverse(np.stack([anchor.frame(layouts[i]) for i in known]))
+        T_anchor_world = se3.inverse(np.stack([anchor.frame(final_poses[i]) for i in known]))
         shown = se3.apply(T_anchor_world, places[:, None])[:, 0]
         middle = np.median(shown, axis=0)
         choices.append((float(np.linalg.norm(shown - middle, axis=-1).max()), anchor, middle, shown))
