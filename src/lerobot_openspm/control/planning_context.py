@@ -13,7 +13,6 @@ from lerobot_openspm.control.transfer import Target, transfer
 from lerobot_openspm.geometry import se3
 from lerobot_openspm.geometry.se3 import Array
 from lerobot_openspm.language.names import TABLE_NAMES, NameSimilarity
-from lerobot_openspm.language.vocabulary import SURFACES
 from lerobot_openspm.memory.compose import Candidate
 from lerobot_openspm.memory.entry import MemoryEntry
 from lerobot_openspm.memory.retrieval import Scored, ScoreWeights, retrieve
@@ -64,7 +63,7 @@ class PlanningContext:
         """The table under its names, at the middle of where the hand was in the demonstrations."""
         low, high = self.robot.workspace
         middle = se3.transform(np.eye(3), [*(low[:2] + high[:2]) / 2, low[2]])
-        return dict.fromkeys(SURFACES, middle)
+        return dict.fromkeys(self.names.lexicon.surfaces, middle)
 
     def rank(
         self, candidates: Sequence[Candidate], layout: Mapping[str, Array], T_world_ee: Array
@@ -81,7 +80,7 @@ class PlanningContext:
         def score(entry: MemoryEntry) -> float:
             return geometric_score(entry, layout, self.yaw_periods, T_world_ee, self.robot, self.limits)
 
-        return retrieve(scored, score, self.weights)
+        return retrieve(scored, score, self.weights, self.names)
 
     def transfer(
         self,

@@ -11,7 +11,8 @@ import numpy as np
 from lerobot_openspm.errors import MemoryFormatError
 from lerobot_openspm.geometry import se3
 from lerobot_openspm.geometry.se3 import Array
-from lerobot_openspm.language.vocabulary import REFERENCES, RELATIONS, VERBS
+from lerobot_openspm.language.lexicon import OPERATIONS as VERBS
+from lerobot_openspm.language.lexicon import REFERENCES, RELATIONS
 from lerobot_openspm.memory.entry import (
     PHASES,
     Anchor,
