@@ -153,7 +153,10 @@ class OpenSPMConfig(PreTrainedConfig):
         memory_update: What happens to a checkpoint's memory when training goes on from it: "keep" it,
             "append" the dataset's episodes, or "rebuild" it from them.
         name_embeddings: Folder or Hub name of a model2vec model that recognises names of objects which the
-            table of words does not know; needs the extra ``[text]``. None: the table alone.
+            lexicon does not know; needs the extra ``[text]``. None: the lexicon alone.
+        lexicon: File of words that instructions are read by beside the built-in ones, of the form of
+            ``lerobot_openspm/language/lexicon.yaml``: other names of things, verbs, wordings. A checkpoint
+            keeps its contents here.
         judge: What says, beside motion and gripper, which phase ends at a key pose.
         chunk_size: Actions per chunk, the paper's H.
         n_action_steps: Actions executed before the next chunk, 1 to ``chunk_size``.
@@ -192,6 +195,7 @@ class OpenSPMConfig(PreTrainedConfig):
     memory_episodes: list[int] | None = None
     memory_update: MemoryUpdate = "keep"
     name_embeddings: str | None = None
+    lexicon: str | None = None
     judge: JudgeConfig = field(default_factory=JudgeConfig)
 
     # Flow model.

@@ -25,6 +25,10 @@ class InstructionError(OpenSPMError):
     """An instruction that the memory holds no memory for."""
 
 
+class LexiconError(OpenSPMError):
+    """A file of words is missing, or holds what does not belong there."""
+
+
 class ObservationError(OpenSPMError):
     """An observation lacks a camera, has images of another size, or is not finite."""
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from copy import deepcopy
+from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -22,6 +23,7 @@ from lerobot_openspm.errors import DatasetError, MemoryFormatError, OpenSPMError
 from lerobot_openspm.flow.condition import CONDITION_DIM, encode, to_world_frame
 from lerobot_openspm.flow.network import VelocityField
 from lerobot_openspm.flow.training_set import TrainingSet
+from lerobot_openspm.language.lexicon import read_lexicon
 from lerobot_openspm.language.names import NameSimilarity, names_from
 from lerobot_openspm.memory.entry import MemoryEntry
 from lerobot_openspm.memory.indexed_entries import indexed
@@ -167,8 +169,8 @@ class OpenSPMPolicy(PreTrainedPolicy):
 
     @cached_property
     def names(self) -> NameSimilarity:
-        """What tells which names mean the same thing: the table of words, or with embeddings beside it."""
-        return names_from(self.config.name_embeddings)
+        """What tells which names mean the same thing: the lexicon, or with embeddings beside it."""
+        return names_from(self.config.name_embeddings, read_lexicon(self.config.lexicon))
 
     # Learning.
 
@@ -252,8 +254,9 @@ class OpenSPMPolicy(PreTrainedPolicy):
     def _save_pretrained(self, save_directory: Path, state_dict: dict[str, Tensor] | None = None) -> None:
         memory = self.require_memory()  # before anything is written
         super()._save_pretrained(save_directory, state_dict=state_dict)
-        # The calibration travels as a file of the checkpoint.
-        self.config.without_places()._save_pretrained(Path(save_directory))
+        # The calibration travels with the memory, the user's own words in the configuration.
+        saved = replace(self.config.without_places(), lexicon=self.names.lexicon.added or None)
+        saved._save_pretrained(Path(save_directory))
         write_memory(memory, Path(save_directory))
 
     @classmethod

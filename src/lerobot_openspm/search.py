@@ -90,7 +90,7 @@ def search_memory(
         plan = plan_parts(instruction, entries, names)
     except InstructionError as error:
         refusal = str(error)
-    parts = tuple(_ranked(part, weights) for part in plan)
+    parts = tuple(_ranked(part, weights, names) for part in plan)
     keys = {one.source.key.sub_tasks for part in plan for one in part}
     others = [
         _without_scene(entry, entry, score(asked, entry.key.sub_tasks), weights)
@@ -101,11 +101,11 @@ def search_memory(
     return Found(asked, parts, tuple(others), refusal, {})
 
 
-def _ranked(part: Sequence[Candidate], weights: ScoreWeights) -> tuple[Hit, ...]:
+def _ranked(part: Sequence[Candidate], weights: ScoreWeights, names: NameSimilarity) -> tuple[Hit, ...]:
     """What a part can be carried out by, in the order of retrieval, where nothing is known of the scene."""
     sources = {id(one.entry): one.source for one in part}
     found = retrieve(
-        [(one.entry, one.semantic) for one in part], lambda _: 1.0, replace(weights, geometric=0.0)
+        [(one.entry, one.semantic) for one in part], lambda _: 1.0, replace(weights, geometric=0.0), names
     )
     return tuple(Hit(one.entry, sources[id(one.entry)], one.semantic, None, one.total) for one in found)
 

@@ -19,6 +19,7 @@ from lerobot_openspm.errors import PerceptionError
 from lerobot_openspm.flow.samples import perturbed, segment_frames
 from lerobot_openspm.flow.training_set import TrainingSet
 from lerobot_openspm.geometry.camera import Camera, load_cameras
+from lerobot_openspm.language.lexicon import read_lexicon
 from lerobot_openspm.memory.indexed_entries import known_names
 from lerobot_openspm.memory.memory import Memory
 from lerobot_openspm.memory.robot import RobotModel
@@ -101,6 +102,7 @@ def dataset_processor(
         episodes=config.memory_episodes,
         known_objects=known.objects if known else {},
         known_names=known_names(known.entries) if known else (),
+        lexicon=read_lexicon(config.lexicon),
         known_robot=known.robot if known else None,
         judge=None if config.judge.type == "none" else partial(labelled, config=config),
         segmenter=segmenter or config.make_segmenter(),

@@ -11,6 +11,7 @@ import draccus
 
 from lerobot_openspm.cli.memory import LimitOption
 from lerobot_openspm.errors import OpenSPMError
+from lerobot_openspm.language.lexicon import read_lexicon
 from lerobot_openspm.language.names import TABLE_NAMES, NameSimilarity, names_from
 from lerobot_openspm.memory.io import read_memory
 from lerobot_openspm.memory.retrieval import ScoreWeights
@@ -87,7 +88,7 @@ def _names(path: str) -> NameSimilarity:
     from lerobot_openspm.configuration_openspm import OpenSPMConfig
 
     config: Any = OpenSPMConfig.from_pretrained(path)
-    return names_from(config.name_embeddings)
+    return names_from(config.name_embeddings, read_lexicon(config.lexicon))
 
 
 def _lines(found: Found, limit: int) -> list[str]:

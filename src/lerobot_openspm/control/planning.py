@@ -13,7 +13,6 @@ from lerobot_openspm.control.transfer import Target, pushed_by_landmark, transfe
 from lerobot_openspm.geometry import se3
 from lerobot_openspm.geometry.se3 import Array
 from lerobot_openspm.language.names import TABLE_NAMES, NameSimilarity
-from lerobot_openspm.language.vocabulary import SURFACES
 from lerobot_openspm.memory.compose import Candidate
 from lerobot_openspm.memory.entry import WORLD, MemoryEntry, MemoryKeyPose, Outcome, RetrievalKey
 from lerobot_openspm.memory.retrieval import Scored, ScoreWeights, retrieve
@@ -67,7 +66,7 @@ class PlanningContext:
         """The table under its names, at the middle of where the hand was in the demonstrations."""
         low, high = self.robot.workspace
         middle = se3.transform(np.eye(3), [*(low[:2] + high[:2]) / 2, low[2]])
-        return dict.fromkeys(SURFACES, middle)
+        return dict.fromkeys(self.names.lexicon.surfaces, middle)
 
     def rank(
         self, candidates: Sequence[Candidate], object_poses: Mapping[str, Array], T_world_ee: Array
@@ -79,7 +78,7 @@ class PlanningContext:
         scene = object_poses, self.yaw_periods, T_world_ee, self.robot, self.limits
         geometric = {id(one.entry): geometric_score(one.entry, *scene) for one in candidates}
         semantic = [(one.entry, one.semantic) for one in candidates]
-        return tuple(retrieve(semantic, lambda entry: geometric[id(entry)], self.weights))
+        return tuple(retrieve(semantic, lambda entry: geometric[id(entry)], self.weights, self.names))
 
 
 @dataclass(frozen=True)

@@ -137,11 +137,14 @@ def _plan_by_words(
     try:
         return (_about(asked, instruction, [Candidate(entry, 0.0, entry) for entry in close], names),)
     except InstructionError as error:
-        splits = ([one for one in joint.split(instruction) if normal_words(one)] for joint in (_NEXT, _AND))
+        splits = (
+            [one for one in joint.split(instruction) if normal_words(one, names.lexicon)]
+            for joint in (_NEXT, _AND)
+        )
         with suppress(InstructionError):
             if sentences := next((pieces for pieces in splits if len(pieces) > 1), None):
                 return tuple(part for one in sentences for part in plan_parts(one, entries, names))
-        why = why_unread(instruction, entries)
+        why = why_unread(instruction, entries, names)
         raise InstructionError(f"{why}; and {error}" if why else str(error)) from error
 
 

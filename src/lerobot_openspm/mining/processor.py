@@ -31,6 +31,7 @@ from lerobot_openspm.geometry.camera import Camera, check_sizes
 from lerobot_openspm.geometry.se3 import Array
 from lerobot_openspm.geometry.vector_layout import VectorLayout
 from lerobot_openspm.language.instruction import read_tasks
+from lerobot_openspm.language.lexicon import ENGLISH, Lexicon
 from lerobot_openspm.memory.robot import RobotModel
 from lerobot_openspm.mining.anchors import (
     Demonstration,
@@ -68,6 +69,7 @@ class MiningOptions:
         episodes: Episodes to remember and learn from; all if not given.
         known_objects: Objects by name that are recognised instead of learned.
         known_names: Names of objects in the memory, by which instructions are read.
+        lexicon: The words that instructions are read by.
         known_robot: Model of the same robot from earlier demonstrations; says which gripper command closes
             where these episodes do not show it.
         judge: Labels phases, beside motion and gripper.
@@ -84,6 +86,7 @@ class MiningOptions:
     episodes: Sequence[int] | None = None
     known_objects: Mapping[str, KnownObject] = field(default_factory=dict[str, KnownObject])
     known_names: Collection[str] = frozenset()
+    lexicon: Lexicon = ENGLISH
     known_robot: RobotModel | None = None
     judge: LabelPhases | None = None
     segmenter: Segmenter | None = None
@@ -173,7 +176,7 @@ class DatasetProcessor:
         else:
             find = partial(find_key_poses, robot=robot)
         names = set(self._options.known_names)
-        mined, skipped = mine_episodes(allowed, find, names)
+        mined, skipped = mine_episodes(allowed, find, names, self._options.lexicon)
         if not mined:
             raise DatasetError(
                 f"no key poses in the {len(allowed)} episodes of dataset {name}: "
@@ -186,7 +189,7 @@ class DatasetProcessor:
         if held_out:
             left = sorted(set(range(self._meta.total_episodes)) - {one.index for one in allowed})
             names |= {name for item in mined for sub_task in item.sub_tasks for name in sub_task.objects}
-            others, reasons = mine_episodes(demonstrations.episodes(left), find, names)
+            others, reasons = mine_episodes(demonstrations.episodes(left), find, names, self._options.lexicon)
             skipped |= reasons
         for index, reason in skipped.items():
             logger.warning("skipping episode %d of %s: %s", index, name, reason)
@@ -210,6 +213,7 @@ def mine_episodes(
     episodes: Sequence[Episode],
     find: Callable[[Episode], Sequence[KeyPose]],
     names: Collection[str] = frozenset(),
+    lexicon: Lexicon = ENGLISH,
 ) -> tuple[tuple[MinedEpisode, ...], dict[int, str]]:
     """Find the key poses of episodes, and read their instructions.
 
@@ -217,12 +221,13 @@ def mine_episodes(
         episodes: The demonstrations.
         find: Gives an episode's key poses.
         names: Names of objects in the memory, by which instructions are read.
+        lexicon: The words that they are read by.
 
     Returns:
         The episodes with key poses, and by index the reason why the others have none.
     """
     found, skipped = list[tuple[Episode, Sequence[KeyPose]]](), dict[int, str]()
-    tasks = read_tasks((episode.task for episode in episodes), names)
+    tasks = read_tasks((episode.task for episode in episodes), names, lexicon)
     for episode in episodes:
         if episode.task not in tasks:
             skipped[episode.index] = f"its task {episode.task!r} says nothing"
