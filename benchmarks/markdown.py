@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
+from benchmarks.results import PROVENANCE
 from benchmarks.staleness import read_result
-
-from lerobot_openspm.bench.results import PROVENANCE
 
 NO_FIGURES = {*PROVENANCE, "interval"}
 
@@ -61,7 +59,7 @@ def chapter(introduction: str, sections: Iterable[str]) -> list[str]:
 
 
 def _origin(result: dict[str, Any]) -> str:
-    machine, command = result["machine"], re.sub(r" --started_at=\S+", "", result["command"])
+    machine, command = result["machine"], result["command"]
     changed = ", with changes that are not in it" if result["dirty"] else ""
     return (
         f"`{command}` on {result['date'][:10]}, commit `{result['commit']}`{changed}; "

@@ -5,7 +5,6 @@ from __future__ import annotations
 from typing import Any
 
 from benchmarks.markdown import Quoted, chapter, percent, section, table
-
 from lerobot_openspm.cli.pipeline import rate
 
 INTRODUCTION = """# Memory and language
@@ -65,16 +64,20 @@ def _key_poses(result: Quoted) -> str:
         for name, one in (*result["phases"].items(), ("all", result))
     ]
     note = (
-        f"{result['episodes']} episodes of an operator who is {result['operator']}: tremor, pauses, "
-        f"overshoot, fingers closed twice. n counts true events."
+        f"{result['episodes']} episodes of an unsteady operator: tremor, pauses, overshoot, fingers closed "
+        "twice. n counts true events."
     )
     return f"{table(heads, rows)}\n\n{note}"
 
 
 def _teach(result: Quoted) -> str:
     found = result["demonstrations"]
-    rows = [[task.replace("_", " "), *(f"{100 * x:.0f} %" for x in ones)] for task, ones in _tasks(result)]
-    totals = [f"{100 * result[name]:.1f} %" for name in ("success_1_demo", "success_3_demos")]
+    tasks = next(iter(found.values()))["per_task"]
+    rows = [
+        [task.replace("_", " "), *(f"{100 * one['per_task'][task]:.0f} %" for one in found.values())]
+        for task in tasks
+    ]
+    totals = [percent(one) for one in found.values()]
     note = (
         f"Each task is taught to a policy that was trained on the nine others; {result['n']} episodes for "
         f"each number of demonstrations ({', '.join(found)}). The longest lesson took "
@@ -82,10 +85,6 @@ def _teach(result: Quoted) -> str:
     )
     heads = ["Task", "1 demonstration", "3 demonstrations"]
     return f"{table(heads, [*rows, ['mean', *totals]])}\n\n{note}"
-
-
-def _tasks(result: Quoted) -> list[tuple[str, list[float]]]:
-    return [(task, list(ones.values())) for task, ones in result["tasks"].items()]
 
 
 def _memory(result: Quoted) -> str:

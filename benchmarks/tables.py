@@ -62,7 +62,7 @@ def tabletop_sections() -> list[str]:
     """Success rates on the tabletop."""
     parts = "Instructions of which only the parts were demonstrated, from pixels"
     return [
-        section("`make demo`, from pixels", "tabletop", _demo),
+        section("The ten tasks, from pixels", "tabletop", _demo),
         section("How key poses are followed, from pixels", "execution", _execution),
         section("Object poses from the simulator (oracle)", "oracle", _with_tasks),
         section("What the flow model is told, from pixels", "conditioning", _with_tasks),
@@ -127,10 +127,9 @@ def _in_s(seconds: float | None, result: Quoted) -> str:
 
 
 def _demo(result: Quoted) -> str:
-    set_up = "set-up, " if "--started_at=" in result["command"] else ""  # as `make demo` starts it
     seconds = {
         "mining and training": result["train_s"],
-        f"with {set_up}recording and evaluating": result["total_s"],
+        "with recording and evaluating": result["total_s"],
     }
     told = ", ".join(f"{what} {s:.0f} s" for what, s in seconds.items() if s is not None)
     return f"{rates({'all ten tasks': result})}\n\n{told.capitalize()}.\n\n{_per_task({'success': result})}"

@@ -78,14 +78,14 @@ def _latency(result: Quoted) -> str:
     rows = [[name, size, length, None, hz] for name, size, length, _, hz in PUBLISHED]
     chunk, first = result["chunk_ms"], result["first_action_ms"]
     ours = [
-        "**OpenSPM**", f"{result['parameters'] / 1e6:.2f} M", result["chunk_size"], chunk["median"],
+        "**OpenSPM**", f"{result['parameters'] / 1e6:.2f} M", result["chunk_size"], f"{chunk['median']:.2f}",
         result["equivalent_hz"],
     ]  # fmt: skip
     heads = ["", "Parameters", "Chunk H", "Chunk t, ms", "Actions per second, 1000 H / t"]
     note = (
-        f"The rows above ours are quoted from the paper. A chunk's 99th percentile is {chunk['p99']} ms (n = "
-        f"{chunk['n']}). An episode's first action, for which the objects are found in the images, takes "
-        f"{first['median']} ms ({first['p99']}, n = {first['n']}). One thread."
+        f"The rows above ours are quoted from the paper. A chunk's 99th percentile is {chunk['p99']:.2f} ms "
+        f"(n = {chunk['n']}). An episode's first action, for which the objects are found in the images, "
+        f"takes {first['median']:.2f} ms ({first['p99']:.2f}, n = {first['n']}). One thread."
     )
     return f"{table(heads, [*rows, ours])}\n\n{note}"
 
@@ -153,11 +153,11 @@ def _memory(result: Quoted) -> str:
 
 def _accuracy(result: Quoted) -> str:
     objects = [
-        [name, row["n"], row["position_mm_mean"], row["position_mm_p95"], row["yaw_deg_mean"]]
+        [name, row["poses"], row["position_mm_mean"], row["position_mm_p95"], row["orientation_deg_mean"]]
         for name, row in result["objects"].items()
     ]
     tasks = [
-        [task.replace("_", " "), row["n"], row["position_mm_mean"], row["position_mm_p95"], paper]
+        [task.replace("_", " "), row["poses"], row["position_mm_mean"], row["position_mm_p95"], paper]
         for (task, row), paper in zip(result["tasks"].items(), PAPER_MM, strict=True)
     ]
     heads = ["n", "Mean, mm", "95th percentile, mm"]

@@ -1,8 +1,8 @@
 """The second reading: elements wherever they stand, every word explained."""
 
 import pytest
+from benchmarks.language import known_instructions
 
-from lerobot_openspm.bench.language import known_instructions
 from lerobot_openspm.errors import InstructionError
 from lerobot_openspm.language.instruction import parse_instruction
 from lerobot_openspm.language.loose_reading import read_loosely

@@ -4,9 +4,9 @@ import pickle
 
 import numpy as np
 import pytest
+from benchmarks.synthetic import synthetic_memory
 from tests.memory.memories import a_memory
 
-from lerobot_openspm.bench.synthetic_bank import synthetic_experience
 from lerobot_openspm.memory import memory as module
 from lerobot_openspm.memory.bank import EntryBank
 from lerobot_openspm.memory.columns import columns_of
@@ -19,7 +19,7 @@ from lerobot_openspm.memory.retrieval import semantic_score
 def large(monkeypatch, tmp_path):
     """A memory of which no entry is read when it is loaded."""
     monkeypatch.setattr(module, "READ_AT_LOAD", 0)
-    made = synthetic_experience(300, np.random.default_rng(0))
+    made = synthetic_memory(300, np.random.default_rng(0))
     write_memory(made, tmp_path)
     return made, tmp_path
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from importlib.util import find_spec
 from typing import Any, Protocol
 
 import numpy as np
@@ -107,6 +108,11 @@ def pose_names(objects: Sequence[str]) -> list[str]:
     return [f"{name}.{component}" for name in objects for component in POSE_COMPONENTS]
 
 
+def has_libero() -> bool:
+    """Whether LIBERO is installed."""
+    return find_spec("libero") is not None
+
+
 def source(env_type: str) -> Source:
     """The source of an environment type.
 
@@ -118,11 +124,9 @@ def source(env_type: str) -> Source:
 
         return TabletopSource()
     if env_type == "libero":
-        try:
-            from lerobot_openspm.envs.libero.recording import LiberoSource
-        except ImportError as error:
-            raise ValueError(
-                f"env.type=libero needs LIBERO ({error}); install it with: pip install 'lerobot[libero]'"
-            ) from error
+        if not has_libero():
+            raise ValueError("env.type=libero needs LIBERO; install it with: pip install 'lerobot[libero]'")
+        from lerobot_openspm.envs.libero.recording import LiberoSource
+
         return LiberoSource()
     raise ValueError(f"env.type is {env_type!r}, expected openspm_tabletop or libero")
