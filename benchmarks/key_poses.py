@@ -11,8 +11,7 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
-from pathlib import Path
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -22,16 +21,12 @@ from benchmarks.contact_events import PHASES, ContactEvent, contact_events
 from benchmarks.harness import each
 from benchmarks.recording import Job, Recording, record
 from benchmarks.results import run, write
-from benchmarks.stages import EnvironmentOption
-from lerobot_openspm.cli.pipeline import digest, discard_unless
+from benchmarks.stages import EpisodesConfig
 from lerobot_openspm.envs.recording import Names, source
 from lerobot_openspm.geometry.vector_layout import RotationKind, parse_layout
 from lerobot_openspm.mining.key_poses import KeyPose, find_key_poses
 from lerobot_openspm.mining.signals import Episode, observe_robot
 
-# The package's files that make a recording what it is, and those beside this one.
-RECORDED_BY = ("envs/**/*.py", "geometry/se3.py")
-RECORDED_HERE = ("recording.py", "contact_sensor.py")
 TOLERANCE_STEPS = 3
 # LIBERO's names of the rotation's numbers are wrong, as in the public dataset.
 ROTATIONS: Mapping[str, RotationKind | None] = {"openspm_tabletop": None, "libero": "axis_angle"}
@@ -50,28 +45,10 @@ GOALS: Mapping[tuple[str, ...], tuple[str, ...]] = {
 
 
 @dataclass
-class KeyPosesConfig:
-    """Compare mined key poses with a simulator's contacts.
+class KeyPosesConfig(EpisodesConfig):
+    """Compare mined key poses with a simulator's contacts."""
 
-    Args:
-        env: The simulator and its tasks.
-        episodes: In all, the tasks in turn.
-        seed: Of the first scene of every task.
-        workers: Episodes at a time, each in a process of its own.
-        output: Folder for the recordings; they are kept until what records them changes.
-    """
-
-    env: EnvironmentOption = field(default_factory=EnvironmentOption)
-    episodes: int = 100
     seed: int = 30_000
-    workers: int = 2
-    output: str = "outputs/bench/key_poses"
-
-    def __post_init__(self) -> None:
-        if self.episodes < 1 or self.workers < 1:
-            raise ValueError(
-                f"episodes and workers must be at least 1, got {self.episodes} and {self.workers}"
-            )
 
 
 @dataclass(frozen=True)
@@ -86,16 +63,10 @@ class Verdict:
 
 
 def main(config: KeyPosesConfig) -> dict[str, Any]:
-    """Record what is missing, mine it, compare, write and return the result."""
-    folder, tasks = Path(config.output) / config.env.type, config.env.tasks()
-    here = [Path(__file__).with_name(name) for name in RECORDED_HERE]
-    discard_unless(folder, digest(here, [], RECORDED_BY))
-    folder.mkdir(parents=True, exist_ok=True)
-    turns = [divmod(i, len(tasks)) for i in range(config.episodes)]
-    jobs = [Job(config.env.type, tasks[i], config.seed + turn) for turn, i in turns]
-    left = [(job, folder) for job in jobs if not job.file(folder).is_file()]
-    list(each(config.workers, record, left))
-    recordings = [Recording.read(job.file(folder)) for job in jobs]
+    """Record, mine, compare, write and return the result."""
+    jobs = [Job(config.env.type, task, seed) for task, seed in config.turns()]
+    made = {one.job: one for one in each(config.workers, record, [(job,) for job in jobs])}
+    recordings = [made[job] for job in jobs]
     compared = compare(recordings)
     verdicts = [verdict for own in compared for verdict in own]
     by_phase: dict[str, list[Verdict]] = defaultdict(list)

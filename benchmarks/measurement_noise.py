@@ -19,7 +19,7 @@ from scipy.optimize import minimize
 from scipy.stats import chi2
 
 from benchmarks.episodes import load, run_episode
-from benchmarks.perception import PerceptionConfig, demonstrations
+from benchmarks.perception import PerceptionConfig
 from benchmarks.results import run, write
 from benchmarks.truth import Truth, offsets, true_period
 from benchmarks.worlds import WORLDS
@@ -57,7 +57,7 @@ class Sample:
 def collect(config: PerceptionConfig) -> list[Sample]:
     """Run the policy on tuning seeds and note every estimate of objects that the hand does not hold."""
     checkpoint = config.checkpoint()
-    T_sim_obj = offsets(checkpoint, demonstrations(config))
+    T_sim_obj = offsets(checkpoint, config.demonstrations())
     policy, samples = load(str(checkpoint)), list[Sample]()
     periods = policy.require_memory().yaw_periods
     for task in config.env.tasks():

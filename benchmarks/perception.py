@@ -16,7 +16,7 @@ import numpy as np
 from benchmarks.episodes import IMAGES, load, run_episode
 from benchmarks.harness import Row, checkpoint_files, measured_folder, resume
 from benchmarks.results import run, write
-from benchmarks.stages import SimulatedConfig, dataset
+from benchmarks.stages import CheckpointConfig, DatasetOption, dataset
 from benchmarks.truth import Error, Truth, offsets, pose_error, summary, true_period
 from benchmarks.worlds import WORLDS, World
 from lerobot_openspm.bench.latency import times_ms
@@ -41,35 +41,33 @@ type Sample = tuple[str, int, str, bool, *Error]
 
 
 @dataclass
-class DatasetOption:
-    """The demonstrations, whose simulator poses tell where on each object its learned frame stands."""
+class PerceptionConfig(CheckpointConfig):
+    """Compare a checkpoint's poses with a simulator's.
 
-    root: str | None = None  # those of `make demo` or `make libero` if not given
-
-
-@dataclass
-class PerceptionConfig(SimulatedConfig):
-    """Compare a checkpoint's poses with a simulator's."""
+    Args:
+        dataset: The demonstrations, whose simulator poses tell where on each object its learned frame stands.
+    """
 
     dataset: DatasetOption = field(default_factory=DatasetOption)
+
+    def demonstrations(self) -> Path:
+        """Folder of the demonstrations, recorded if they are the default ones."""
+        return Path(self.dataset.root) if self.dataset.root else dataset(self.env.type)
 
 
 def main(config: PerceptionConfig) -> dict[str, Any]:
     """Measure, write and return the result."""
-    checkpoint, root = config.checkpoint(), demonstrations(config)
+    checkpoint, root = config.checkpoint(), config.demonstrations()
     offsets(checkpoint, root)  # what is wrong with them is said here, not by every worker
     files = [*checkpoint_files(checkpoint), Path(__file__).with_name("truth.py"), root / "meta/info.json"]
     folder = measured_folder(config.folder("perception"), files, [str(root)], __file__)
-    jobs = {f"{task} {seed}": (config.env.type, checkpoint, root, task, seed) for task, seed in config.jobs()}
+    jobs = {
+        f"{task} {seed}": (config.env.type, checkpoint, root, task, seed) for task, seed in config.turns()
+    }
     rows = resume(folder / "episodes.jsonl", jobs, compared_episode, config.workers)
     figures = {**summarise(rows), **costs(config.env, checkpoint), "episodes": len(rows)}
     name = config.env.type.removeprefix("openspm_")
     return write(f"perception_{name}", {"seed": config.seed, **figures}, THREADS)
-
-
-def demonstrations(config: PerceptionConfig) -> Path:
-    """Folder of the demonstrations."""
-    return Path(config.dataset.root) if config.dataset.root else dataset(config.env.type)
 
 
 def compared_episode(env_type: str, checkpoint: Path, root: Path, task: str, seed: int) -> Row:

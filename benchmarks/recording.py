@@ -1,21 +1,16 @@
-"""Demonstrations of an unsteady scripted expert, with everything that the hand touches, a file each."""
+"""Demonstrations of an unsteady scripted expert, with everything that the hand touches."""
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass
-from pathlib import Path
+from dataclasses import dataclass
 
 import numpy as np
-import safetensors
 from numpy.typing import NDArray
-from safetensors.numpy import save
 
 from benchmarks.contact_sensor import ContactSensor, ThingTrack
 from lerobot_openspm.envs.unsteady import UnsteadyHand
 from lerobot_openspm.errors import OpenSPMError
-from lerobot_openspm.files import write_beside
 from lerobot_openspm.geometry.se3 import Array
 
 MAX_STEPS = 900
@@ -30,10 +25,6 @@ class Job:
     env_type: str
     task: str
     seed: int
-
-    def file(self, folder: Path) -> Path:
-        """Where it is kept."""
-        return folder / f"{self.env_type}_{self.task}_{self.seed}.safetensors"
 
 
 @dataclass(frozen=True)
@@ -60,34 +51,9 @@ class Recording:
     opening: Array
     tracks: tuple[ThingTrack, ...]
 
-    def write(self, folder: Path) -> None:
-        """Write it down, as a whole or not at all."""
-        tensors = {name: getattr(self, name) for name in ("state", "action", "T_world_ee", "opening")}
-        for i, track in enumerate(self.tracks):
-            for name in ("T_world_thing", "squeezed", "touched"):
-                tensors[f"{i}.{name}"] = np.ascontiguousarray(getattr(track, name))
-        things = [{"name": track.name, "kind": track.kind} for track in self.tracks]
-        about = {"job": asdict(self.job), "instruction": self.instruction, "failures": self.failures}
-        blob = save(tensors, {"about": json.dumps({**about, "things": things})})
-        write_beside(self.job.file(folder), blob)
 
-    @classmethod
-    def read(cls, path: Path) -> Recording:
-        """Read what :meth:`write` wrote."""
-        with safetensors.safe_open(path, framework="np") as file:
-            about = json.loads(file.metadata()["about"])
-            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 (no mapping)
-        tracks = [
-            ThingTrack(**thing, **{n: tensors[f"{i}.{n}"] for n in ("T_world_thing", "squeezed", "touched")})
-            for i, thing in enumerate(about["things"])
-        ]
-        own = {name: tensors[name] for name in ("state", "action", "T_world_ee", "opening")}
-        job = Job(**about["job"])
-        return cls(job, about["instruction"], about["failures"], **own, tracks=tuple(tracks))
-
-
-def record(job: Job, folder: Path) -> None:
-    """Record a demonstration and write it down.
+def record(job: Job) -> Recording:
+    """Record a demonstration.
 
     The operator finishes what they do: unlike :mod:`lerobot_openspm.envs.recording`, nothing is cut when the
     goal is first reached.
@@ -100,8 +66,7 @@ def record(job: Job, folder: Path) -> None:
         steps = scene(job.task, job.seed + NEXT_SEED * failures)
         recording = _gather(job, failures, steps)
         if recording is not None:
-            recording.write(folder)
-            return
+            return recording
     raise OpenSPMError(
         f"the expert of {job.env_type} did not do {job.task} in {MAX_ATTEMPTS} scenes from seed {job.seed} "
         "on; choose another --seed"

@@ -12,6 +12,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from lerobot_openspm.cli.collect import SUMMARY_FILE
+from lerobot_openspm.cli.options import require_checkpoint
 from lerobot_openspm.cli.pipeline import TRAIN_CONFIG, collect_dataset, train
 from lerobot_openspm.envs.recording import source
 
@@ -55,24 +56,27 @@ class PolicyOption:
 
 
 @dataclass
-class SimulatedConfig:
-    """Options of a benchmark that runs a checkpoint in a simulator.
+class DatasetOption:
+    """The demonstrations; those of `make demo` or `make libero` if not given."""
+
+    root: str | None = None
+
+
+@dataclass
+class EpisodesConfig:
+    """Options of a benchmark that runs episodes in a simulator.
 
     Args:
         env: The simulator and its tasks.
-        policy: The checkpoint.
-        episodes: In all, the tasks in turn; where things are disturbed, of each kind.
+        episodes: In all, the tasks in turn; of each kind, where there are kinds.
         seed: Of the first scene of every task.
         workers: Episodes at a time, each in a process of its own.
-        output: Folder for what is measured; outputs/bench/NAME_SIMULATOR if not given.
     """
 
     env: EnvironmentOption = field(default_factory=EnvironmentOption)
-    policy: PolicyOption = field(default_factory=PolicyOption)
     episodes: int = 100
     seed: int = 5000  # no success rate was taken on these
     workers: int = 2
-    output: str | None = None
 
     def __post_init__(self) -> None:
         if self.episodes < 1 or self.workers < 1:
@@ -80,23 +84,34 @@ class SimulatedConfig:
                 f"episodes and workers must be at least 1, got {self.episodes} and {self.workers}"
             )
 
+    def turns(self, tasks: Sequence[str] | None = None) -> list[tuple[str, int]]:
+        """Task and seed of every episode: the selected tasks, or those given, in turn from the same seeds."""
+        names = self.env.tasks() if tasks is None else tasks
+        return [(names[i % len(names)], self.seed + i // len(names)) for i in range(self.episodes)]
+
+
+@dataclass
+class CheckpointConfig(EpisodesConfig):
+    """Options of a benchmark that runs a checkpoint in a simulator.
+
+    Args:
+        policy: The checkpoint.
+        output: Folder for what is measured; outputs/bench/NAME_SIMULATOR if not given.
+    """
+
+    policy: PolicyOption = field(default_factory=PolicyOption)
+    output: str | None = None
+
     def checkpoint(self) -> Path:
         """The checkpoint, trained if it is the default one. Raises FileNotFoundError when there is none."""
         if self.policy.path is None:
             return policy(self.env.type)[0]
-        path = Path(self.policy.path)
-        if not (path / "memory.json").is_file():
-            raise FileNotFoundError(f"no checkpoint of this policy at {path}; pass another --policy.path")
-        return path
+        require_checkpoint(Path(self.policy.path), "--policy.path")
+        return Path(self.policy.path)
 
     def folder(self, name: str) -> Path:
         """Where what is measured goes."""
         return Path(self.output or f"outputs/bench/{name}_{self.env.type}")
-
-    def jobs(self) -> list[tuple[str, int]]:
-        """Task and seed of every episode, the tasks in turn, each from the same seeds."""
-        tasks = self.env.tasks()
-        return [(tasks[i % len(tasks)], self.seed + i // len(tasks)) for i in range(self.episodes)]
 
 
 def run_folder(simulator: str, demos: int = DEMOS, selected: Sequence[str] | None = None) -> Path:

@@ -12,7 +12,7 @@ from typing import Any
 
 from benchmarks.figures import FIGURES
 from benchmarks.libero.tables import libero_sections
-from benchmarks.markdown import Quoted, chapter, interval, percent, quoted, rates, section, table
+from benchmarks.markdown import STEPS, Quoted, chapter, grid, interval, percent, quoted, section, table
 from benchmarks.memory_tables import memory_sections
 from benchmarks.perception_tables import perception_sections
 from benchmarks.staleness import ROOT, origin, read_result
@@ -132,22 +132,23 @@ def _demo(result: Quoted) -> str:
         "with recording and evaluating": result["total_s"],
     }
     told = ", ".join(f"{what} {s:.0f} s" for what, s in seconds.items() if s is not None)
-    return f"{rates({'all ten tasks': result})}\n\n{told.capitalize()}.\n\n{_per_task({'success': result})}"
+    overall = grid({"all ten tasks": result}, STEPS)
+    return f"{overall}\n\n{told.capitalize()}.\n\n{_per_task({'success': result})}"
 
 
 def _execution(result: Quoted) -> str:
     note = f"The demonstrations take {result['expert_steps']} steps on average."
-    return f"{rates(result['runs'])}\n\n{note}\n\n{_per_task(result['runs'])}"
+    return f"{grid(result['runs'], STEPS)}\n\n{note}\n\n{_per_task(result['runs'])}"
 
 
 def _with_tasks(result: Quoted) -> str:
-    return f"{rates(result['runs'])}\n\n{_per_task(result['runs'])}"
+    return f"{grid(result['runs'], STEPS)}\n\n{_per_task(result['runs'])}"
 
 
 def _selection(result: Quoted) -> str:
     ((name, run),) = result["runs"].items()
     rows = [[text, f"{100 * run['per_task'][task]:.0f} %"] for task, text in result["instructions"].items()]
-    return f"{rates(result['runs'])}\n\n{NOTES[name]}\n\n{table(['Instruction', 'Success'], rows)}"
+    return f"{grid(result['runs'], STEPS)}\n\n{NOTES[name]}\n\n{table(['Instruction', 'Success'], rows)}"
 
 
 def _per_task(runs: dict[str, Any]) -> str:

@@ -18,9 +18,15 @@ from typing import Any
 
 from benchmarks.episodes import load, run_episode
 from benchmarks.harness import Row, measured_folder, resume
-from benchmarks.perception import DatasetOption
 from benchmarks.results import run, write
-from benchmarks.stages import TABLETOP, EnvironmentOption, dataset, demonstrations_of, first_episodes
+from benchmarks.stages import (
+    TABLETOP,
+    DatasetOption,
+    EpisodesConfig,
+    dataset,
+    demonstrations_of,
+    first_episodes,
+)
 from benchmarks.worlds import tabletop
 from lerobot_openspm.cli.pipeline import REPO_ID, THREADS, Episode, success, train
 from lerobot_openspm.errors import DatasetError, OpenSPMError
@@ -34,32 +40,22 @@ OPTIONS: tuple[str, ...] = ()
 
 
 @dataclass
-class TeachConfig:
-    """Measure teaching on the tabletop.
+class TeachConfig(EpisodesConfig):
+    """Measure teaching on the tabletop; as many episodes for each number of demonstrations.
 
     Args:
-        env: Its tasks.
         dataset: The demonstrations.
-        episodes: For each number of demonstrations, the tasks in turn.
-        seed: Of the first scene of every task.
-        workers: Episodes at a time, each in a process of its own.
         output: Folder for policies and what is measured.
     """
 
-    env: EnvironmentOption = field(default_factory=EnvironmentOption)
     dataset: DatasetOption = field(default_factory=DatasetOption)
-    episodes: int = 100
     seed: int = 9000  # no other rate was taken on these
-    workers: int = 2
     output: str = "outputs/bench/teach"
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         if self.env.type != TABLETOP:
             raise ValueError(f"teaching is measured on {TABLETOP}, got env.type={self.env.type}")
-        if self.episodes < 1 or self.workers < 1:
-            raise ValueError(
-                f"episodes and workers must be at least 1, got {self.episodes} and {self.workers}"
-            )
 
 
 def main(config: TeachConfig) -> dict[str, Any]:
@@ -77,10 +73,9 @@ def main(config: TeachConfig) -> dict[str, Any]:
         workers=1,  # because it is timed
     )
     errors = {(row["task"], row["demonstrations"]): row["error"] for row in lessons}
-    turns = [(tasks[i % len(tasks)], config.seed + i // len(tasks)) for i in range(config.episodes)]
     jobs = {
         f"{taught[task, demos].name} {seed}": (taught[task, demos], errors[task, demos], task, demos, seed)
-        for task, seed in turns
+        for task, seed in config.turns()
         for demos in DEMOS
     }
     rows = resume(folder / "episodes.jsonl", jobs, taught_episode, config.workers)

@@ -16,7 +16,7 @@ from benchmarks.disturbances import GRASPED, Disturbance, move_cameras
 from benchmarks.episodes import load, run_episode
 from benchmarks.harness import Row, checkpoint_files, measured_folder, resume
 from benchmarks.results import run, write
-from benchmarks.stages import TABLETOP, SimulatedConfig
+from benchmarks.stages import TABLETOP, CheckpointConfig
 from benchmarks.worlds import tabletop
 from lerobot_openspm.cli.pipeline import THREADS, rate
 from lerobot_openspm.envs.tabletop.tasks import TASK_NAMES
@@ -58,7 +58,7 @@ CONDITIONS = {
 
 
 @dataclass
-class TrackingConfig(SimulatedConfig):
+class TrackingConfig(CheckpointConfig):
     """Disturb a checkpoint's episodes on the tabletop.
 
     Args:
@@ -105,8 +105,7 @@ def jobs_of(config: TrackingConfig) -> list[tuple[Condition, str, int]]:
                 f"env.task={config.env.task}: nothing can be {condition.name} there, expected some of "
                 f"{', '.join(condition.tasks)}"
             )
-        turns = [divmod(i, len(tasks)) for i in range(config.episodes)]
-        found.append([(condition, tasks[i], config.seed + turn) for turn, i in turns])
+        found.append([(condition, *turn) for turn in config.turns(tasks)])
     # In turns, so that an interrupted run has as many of each.
     return [job for turn in zip(*found, strict=True) for job in turn]
 

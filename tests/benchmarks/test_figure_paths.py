@@ -51,9 +51,6 @@ OF_FIGURE = {
         f"{PACKAGE}/perception/",
         f"{PACKAGE}/cli/options.py",
     ),
-    # It uses one function of these.
-    "teach": ("benchmarks/perception.py", "benchmarks/truth.py"),
-    "libero_new_task": ("benchmarks/perception.py", "benchmarks/truth.py"),
 }
 
 

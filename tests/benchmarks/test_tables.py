@@ -134,7 +134,8 @@ def test_a_result_that_is_there_is_read():
 
 def test_what_had_no_episode_is_a_dash():
     none = {"success": None, "interval": None, "n": 0, "mean_steps": None}
-    assert markdown.rates({"moved late": none}).splitlines()[-1] == "| moved late | - | - | 0 | - |"
+    told = markdown.grid({"moved late": none}, markdown.STEPS)
+    assert told.splitlines()[-1] == "| moved late | - | - | 0 | - |"
 
 
 def test_the_time_of_the_whole_is_told_where_nothing_was_kept(results):

@@ -13,7 +13,7 @@ from lerobot_openspm.memory.memory import read_memory
 
 
 def config(root: Path, output: Path, task: str = "all") -> TeachConfig:
-    made = TeachConfig(EnvironmentOption(task=task), episodes=1, seed=2_000_000, workers=1)
+    made = TeachConfig(EnvironmentOption(task=task), 1, 2_000_000, 1)
     made.dataset.root, made.output = str(root), str(output)
     return made
 

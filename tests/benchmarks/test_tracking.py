@@ -25,7 +25,9 @@ def test_mistakes_are_told():
 
 
 def test_a_checkpoint_that_is_not_there_is_told(tmp_path: Path):
-    with pytest.raises(FileNotFoundError, match=r"no checkpoint of this policy at .*nowhere"):
+    with pytest.raises(
+        FileNotFoundError, match=r"no checkpoint of this policy at .*nowhere: .* pass --policy.path=FOLDER"
+    ):
         config(tmp_path / "nowhere", tmp_path, "all").checkpoint()
 
 

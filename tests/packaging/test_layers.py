@@ -30,7 +30,7 @@ ALLOWED = {
 }
 BELOW_CLI = {*ALLOWED, "envs", "bench"}
 ALLOWED |= {
-    "envs": {"geometry", "language"},
+    "envs": {"geometry"},
     "bench": {"perception", "policy"},
     "cli": BELOW_CLI,
 }
