@@ -24,6 +24,8 @@ from lerobot_openspm.files import write_json
 
 ROOT = Path(__file__).parents[1]
 RESULTS = ROOT / "benchmarks/results"
+# What was measured with other options than those of the published figure.
+TRIALS = Path("outputs/bench/results")
 # What a result file tells of its own origin. `seed` and `n` come from whoever measured; the seed is None
 # where nothing is drawn.
 PROVENANCE = ("commit", "dirty", "command", "date", "machine", "seed", "n")
@@ -52,6 +54,8 @@ def run(config_class: type, main: Callable[[Any], Any]) -> None:
 def write(name: str, measured: Mapping[str, Any], threads: int | None = None) -> dict[str, Any]:
     """Write ``benchmarks/results/NAME.json`` with its provenance, and return both.
 
+    With other options than those that the figure is published with, it is written into `TRIALS` instead.
+
     Args:
         name: The figure's name.
         measured: The figures, with ``seed`` (None where nothing is drawn) and ``n``, over how many they were
@@ -61,7 +65,8 @@ def write(name: str, measured: Mapping[str, Any], threads: int | None = None) ->
     Raises:
         OpenSPMError: ``seed`` or ``n`` is missing, or a figure has the name of a piece of provenance.
     """
-    path = RESULTS / f"{name}.json"
+    command = command_line(sys.orig_argv, sys.argv)
+    path = (RESULTS if is_published(name, command) else TRIALS) / f"{name}.json"
     missing = [key for key in ("seed", "n") if key not in measured]
     taken = sorted({"commit", "dirty", "command", "date", "machine"} & set(measured))
     if missing or taken:
@@ -73,7 +78,7 @@ def write(name: str, measured: Mapping[str, Any], threads: int | None = None) ->
     content = {
         "commit": commit,
         "dirty": dirty,
-        "command": command_line(sys.orig_argv, sys.argv),
+        "command": command,
         "date": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
         "machine": machine(threads),
         "seed": measured["seed"],
@@ -83,6 +88,13 @@ def write(name: str, measured: Mapping[str, Any], threads: int | None = None) ->
     path.parent.mkdir(parents=True, exist_ok=True)
     write_json(path, content)
     return content
+
+
+def is_published(name: str, command: str) -> bool:
+    """Whether a command line takes the published figure; the order of its options does not matter."""
+    from benchmarks.figures import FIGURES
+
+    return name in FIGURES and set(shlex.split(command)) == set(shlex.split(FIGURES[name].command))
 
 
 def code_version() -> tuple[str | None, bool | None]:

@@ -14,6 +14,7 @@ def test_perception_is_measured(
     checkpoint: Path, tiny_dataset: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
     monkeypatch.setattr(results, "RESULTS", tmp_path)
+    monkeypatch.setattr(results, "is_published", lambda *_: True)
     config = PerceptionConfig(episodes=1, seed=2_000_000, workers=1, output=str(tmp_path / "out"))
     config.policy.path, config.dataset.root = str(checkpoint), str(tiny_dataset)
     config.env.task = "turn_on_stove"

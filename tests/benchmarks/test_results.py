@@ -9,6 +9,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from benchmarks.figures import FIGURES
 from benchmarks.results import PROVENANCE, code_version, command_line, machine, run, write
 
 from benchmarks import results
@@ -19,6 +20,7 @@ from lerobot_openspm.errors import OpenSPMError
 def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """Where results go."""
     monkeypatch.setattr(results, "RESULTS", tmp_path / "results")
+    monkeypatch.setattr(results, "is_published", lambda *_: True)
     return tmp_path / "results"
 
 
@@ -43,6 +45,22 @@ def test_a_result_without_its_number_or_with_a_made_up_origin_is_refused(folder,
     with pytest.raises(OpenSPMError, match=message):
         write("speed", measured)
     assert not folder.exists()
+
+
+def test_what_was_taken_with_other_options_does_not_replace_the_published_figure(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.setattr(results, "RESULTS", tmp_path / "published")
+    monkeypatch.setattr(results, "TRIALS", tmp_path / "trials")
+    typed = FIGURES["tracking"].command.split()[3:]
+    for options, folder in ((typed, "published"), ([*typed, "--episodes=2"], "trials")):
+        words = ["benchmarks/tracking.py", *options]
+        monkeypatch.setattr(sys, "argv", words)
+        monkeypatch.setattr(sys, "orig_argv", ["python", "-m", "benchmarks.tracking", *options])
+        write("tracking", {"seed": 0, "n": 1})
+        assert (tmp_path / folder / "tracking.json").is_file()
+        (tmp_path / folder / "tracking.json").unlink()
+    assert list(tmp_path.rglob("*.json")) == []
 
 
 @dataclass

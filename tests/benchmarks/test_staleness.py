@@ -230,6 +230,7 @@ def test_a_result_that_does_not_say_where_it_comes_from_is_seen(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str, changed: dict[str, Any], found: list[str]
 ):
     monkeypatch.setattr(results, "RESULTS", tmp_path)
+    monkeypatch.setattr(results, "is_published", lambda *_: True)
     written = write("memory", {"seed": None, "n": 3})
     assert complaints(name, {**written, "command": FIGURES["memory"].command, **changed}) == found
     del written["date"]
@@ -338,6 +339,7 @@ def test_cameras_are_estimated_of_one_simulator_at_a_time(
     monkeypatch.setattr(calibration, "dataset", lambda *given: recorded.append(given))
     monkeypatch.setattr(calibration, "read", lambda *_: SimpleNamespace(cameras={}))
     monkeypatch.setattr(results, "RESULTS", tmp_path)
+    monkeypatch.setattr(results, "is_published", lambda *_: True)
     config = calibration.CalibrationConfig()
     config.env.type = simulator
     calibration.main(config)

@@ -18,6 +18,7 @@ EPISODES = [Episode("a", 1000, 100, True, "done"), Episode("b", 1000, 300, False
 def _stages(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(results, "RESULTS", tmp_path)
+    monkeypatch.setattr(results, "is_published", lambda *_: True)
     monkeypatch.setattr(results, "_threads", lambda: 7)
 
     def collect(root: Path, *_: Any) -> dict[str, Any]:
