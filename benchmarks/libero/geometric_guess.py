@@ -11,17 +11,13 @@ writes a checkpoint whose memory holds one guess a task; evaluate it with `bench
 
 from __future__ import annotations
 
-import json
 import logging
-import os
-import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Literal
 
-import draccus
 import numpy as np
 from benchmarks.libero.guessed_key_poses import (
     GuessedKeyPose,
@@ -30,9 +26,10 @@ from benchmarks.libero.guessed_key_poses import (
     guess_by_endpoint,
     guess_by_qwen3vl,
 )
+from benchmarks.results import run
 
 from lerobot_openspm.envs.libero.simulator import OBJECTS, LiberoSimulator, tasks
-from lerobot_openspm.errors import OpenSPMError, PhaseLabelError
+from lerobot_openspm.errors import PhaseLabelError
 from lerobot_openspm.geometry import se3
 from lerobot_openspm.geometry.se3 import Array
 from lerobot_openspm.language.instruction import parse_instruction
@@ -273,9 +270,4 @@ def main(config: GuessConfig) -> dict[str, object]:
 
 
 if __name__ == "__main__":
-    logging.basicConfig(level=logging.INFO, format="%(levelname)s %(message)s")
-    os.environ.setdefault("MUJOCO_GL", "egl")
-    try:
-        print(json.dumps(main(draccus.parse(GuessConfig, args=sys.argv[1:]))))
-    except OpenSPMError as error:
-        sys.exit(f"geometric_guess: {error}")
+    run(GuessConfig, main)

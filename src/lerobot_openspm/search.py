@@ -160,16 +160,16 @@ def search_scene(policy: OpenSPMPolicy, observation: Observation) -> Found:
 
 
 def observation_of(
-    policy: OpenSPMPolicy, dataset: Any, episode: int, frame: int, instruction: str
+    policy: OpenSPMPolicy, dataset: Any, episode: int, frame: int, instruction: str | None = None
 ) -> Observation:
-    """One frame of a LeRobotDataset as the policy would see it, with another instruction.
+    """One frame of a LeRobotDataset as the policy would see it.
 
     Args:
         policy: Says how the state vector is laid out.
         dataset: The ``LeRobotDataset``.
         episode: Number of the episode.
         frame: Number of the frame in it.
-        instruction: What is asked.
+        instruction: What is asked; the episode's own task if not given.
 
     Raises:
         DatasetError: There is no such episode or frame.
@@ -185,4 +185,5 @@ def observation_of(
         )
     item: dict[str, Any] = dataset[first + frame]
     batch = {name: value[None] for name, value in item.items() if name.startswith("observation.")}
-    return split_batch(batch | {"task": [instruction]}, policy.config.layouts()[0])[0]
+    task = item["task"] if instruction is None else instruction
+    return split_batch(batch | {"task": [task]}, policy.config.layouts()[0])[0]

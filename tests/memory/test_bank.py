@@ -8,11 +8,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from benchmarks.synthetic import synthetic_memory
 from tests.memory.builders import entry
 from tests.memory.memories import a_memory, same
 from tests.memory.memory_files import edit_arrays, edit_entries, names
 
-from lerobot_openspm.bench.synthetic_bank import synthetic_experience
 from lerobot_openspm.errors import MemoryFormatError
 from lerobot_openspm.memory import io as module
 from lerobot_openspm.memory.bank import MAX_LINE_BYTES, EntryBank, key_digest
@@ -121,7 +121,7 @@ def test_saving_again_makes_equal_files(bank, tmp_path):
 
 def test_one_entry_of_each_key_is_read_to_index_them(tmp_path, monkeypatch):
     monkeypatch.setattr(module, "READ_AT_LOAD", 0)
-    made = synthetic_experience(300, np.random.default_rng(0))
+    made = synthetic_memory(300, np.random.default_rng(0))
     write_memory(made, tmp_path)
     read = []
     text = EntryBank._text

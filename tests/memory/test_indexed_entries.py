@@ -2,9 +2,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from benchmarks.synthetic import distinct_keys, said_otherwise
 from tests.memory.builders import entry, semantic_candidates
 
-from lerobot_openspm.bench.synthetic_keys import distinct_keys, said_otherwise
 from lerobot_openspm.errors import InstructionError
 from lerobot_openspm.language.instruction import parse_instruction
 from lerobot_openspm.memory import indexed_entries as module

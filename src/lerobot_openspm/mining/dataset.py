@@ -44,7 +44,7 @@ def dataset_metadata(repo_id: str, root: str | None) -> LeRobotDatasetMetadata:
     # LeRobot would ask the Hub for a local dataset that is not there.
     if root is not None and not (Path(root) / "meta/info.json").is_file():
         raise DatasetError(
-            f"no dataset in {root}: it has no meta/info.json; pass the folder of a LeRobotDataset"
+            f"no dataset in {root}: it has no meta/info.json; pass --dataset.root=FOLDER of a LeRobotDataset"
         )
     with _one_line(repo_id, root):
         return LeRobotDatasetMetadata(repo_id, root=root)
@@ -71,7 +71,7 @@ def _one_line(repo_id: str, root: object) -> Generator[None]:
         reason = (str(error).strip().splitlines() or [type(error).__name__])[0]
         raise DatasetError(
             f"dataset {repo_id!r} is not whole in {root or 'the cache of LeRobot'}, nor can it be had from "
-            f"the Hub ({reason}); check its name and its folder"
+            f"the Hub ({reason}); check --dataset.repo_id and --dataset.root"
         ) from error
 
 

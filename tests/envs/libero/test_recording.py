@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from benchmarks.libero.episode import initial_states
+from benchmarks.worlds import initial_states
 
 from lerobot_openspm.envs.libero import recording
 from lerobot_openspm.envs.libero.recording import LiberoGoal
