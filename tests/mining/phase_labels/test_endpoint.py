@@ -3,6 +3,7 @@
 import json
 import logging
 import socket
+import ssl
 import time
 
 import numpy as np
@@ -49,6 +50,22 @@ def test_a_server_that_answers():
     assert [a.phase for a in answers] == ["approach"] * 2 + ["grasp"] + ["lift"] * 3 + ["release", "retreat"]
     assert {a.confidence for a in answers} == {0.9}
     assert len(chat.requests) == 1
+
+
+def test_the_root_certificates_are_read_once_and_not_within_the_timeout(monkeypatch: pytest.MonkeyPatch):
+    read, original = [], ssl.create_default_context
+
+    def slow(*args, **options) -> ssl.SSLContext:
+        read.append(args)
+        time.sleep(1.5)
+        return original(*args, **options)
+
+    monkeypatch.setattr(ssl, "create_default_context", slow)
+    with LoopbackChat(sensible).running() as chat:
+        asking = judge(chat.api_base, timeout_s=1.0)
+        for _ in range(2):
+            assert asking.judge(pick_and_place()) is not None
+    assert len(read) == 1
 
 
 def test_what_is_sent(monkeypatch: pytest.MonkeyPatch):

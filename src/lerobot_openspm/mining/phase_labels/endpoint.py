@@ -54,6 +54,8 @@ class ChatEndpoint:
         self._timeout_s, self._backoff_s = timeout_s, backoff_s
         self._key = os.environ.get(API_KEY_VARIABLE, "")
         self._with_schema = True
+        # Reading all root certificates is slow on a loaded machine, and no part of waiting for an answer.
+        self._tls = httpx.create_ssl_context()
         self.model_id = model_id
 
     def complete(self, prompt: Prompt) -> str:
@@ -76,7 +78,7 @@ class ChatEndpoint:
         try:
             async with (
                 asyncio.timeout(self._timeout_s) as limit,
-                httpx.AsyncClient(headers=headers, timeout=timeout) as http,
+                httpx.AsyncClient(headers=headers, timeout=timeout, verify=self._tls) as http,
             ):
                 return await self._attempts(http, prompt, limit.when() or 0.0)
         except TimeoutError as error:
