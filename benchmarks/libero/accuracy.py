@@ -10,11 +10,11 @@ from typing import Any
 from benchmarks.harness import Row
 from benchmarks.stages import LIBERO
 from benchmarks.truth import Error, offsets, pose_error, summary, true_period
-from lerobot_openspm.perception.objects.model import PatchModel
 
 from lerobot_openspm.envs.libero.simulator import tasks
 from lerobot_openspm.geometry import se3
 from lerobot_openspm.memory.io import read_memory
+from lerobot_openspm.perception.objects.patches.model import PatchModel
 
 
 def accuracy(checkpoint: Path, dataset: Path, episodes: Sequence[Row]) -> dict[str, Any]:

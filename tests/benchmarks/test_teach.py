@@ -9,7 +9,7 @@ from benchmarks.teach import TeachConfig, main
 
 from benchmarks import results, teach
 from lerobot_openspm.errors import DatasetError
-from lerobot_openspm.memory.memory import read_memory
+from lerobot_openspm.memory.io import read_memory
 
 
 def config(root: Path, output: Path, task: str = "all") -> TeachConfig:
