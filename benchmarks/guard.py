@@ -100,7 +100,8 @@ def caught(n: int, lowest: int, power: float = POWER) -> float:
     """The success rate at which fewer than ``lowest`` of ``n`` succeed with a probability of ``power``."""
     if lowest == 0:
         return 0.0
-    return float(brentq(lambda rate: binom.cdf(lowest - 1, n, rate) - power, 0.0, 1.0))
+    root: Any = brentq(lambda rate: binom.cdf(lowest - 1, n, rate) - power, 0.0, 1.0)
+    return float(root)
 
 
 @dataclass(frozen=True)

@@ -16,7 +16,7 @@ class Quoted(dict[str, Any]):
 
     def __init__(self, name: str, content: dict[str, Any]) -> None:
         super().__init__(content)
-        self.name, self.read = name, dict.fromkeys(())
+        self.name, self.read = name, dict[str, None]()
 
     def __getitem__(self, key: str) -> Any:
         if key not in NO_FIGURES:

@@ -106,10 +106,10 @@ def measure_episode(
         for name in (name for name in controller.state.ranked[0].entry.objects if name in T_sim_obj):
             held = name in controller.scene.tracker.held
             for variant, poses in known.items():
-                error: Error = (None, None)
+                metres, radians = None, None
                 if name in poses:
-                    error = pose_error(true[name], poses[name], true_period(name, env_type))
-                samples[variant].append((task, step, name, held, *error))
+                    metres, radians = pose_error(true[name], poses[name], true_period(name, env_type))
+                samples[variant].append((task, step, name, held, metres, radians))
 
     return run_episode(policy, world, note=compare).success, samples
 

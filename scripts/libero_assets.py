@@ -37,7 +37,7 @@ class AssetsError(Exception):
 
 def main() -> int:
     """Return 0 when LIBERO has its assets and its configuration, else 1 with the reason on stderr."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("--wheels", type=Path, default=WHEELS, help="pip requirements with hashes")
     wheels = parser.parse_args().wheels
     try:

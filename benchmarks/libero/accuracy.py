@@ -40,8 +40,9 @@ def accuracy(checkpoint: Path, dataset: Path, episodes: Sequence[Row]) -> dict[s
             by_object[name].append(error)
             found.append(error)
         by_task[episode["task"]] += found
-        metres = [metres for metres, _ in found]
-        off_mm.append(None if None in metres else round(1000 * max(metres, default=0.0), 1))
+        metres = [metres for metres, _ in found if metres is not None]
+        is_complete = len(metres) == len(found)
+        off_mm.append(round(1000 * max(metres, default=0.0), 1) if is_complete else None)
     overall = summary([error for errors in by_object.values() for error in errors])
     return {
         **{key: overall[key] for key in ("position_mm_mean", "position_mm_p95")},

@@ -35,7 +35,7 @@ def main(_: LossesConfig) -> dict[str, Any]:
     root = dataset(LIBERO)
     meta = dataset_metadata("local/libero", str(root))
     learned = first_episodes(root, DEMOS - HELD_OUT)
-    last, _ = policy(LIBERO, "losses", f"--save_freq={EVERY}", episodes=learned)
+    last = policy(LIBERO, "losses", f"--save_freq={EVERY}", episodes=learned)[0]
     config = OpenSPMPolicy.from_pretrained(last).config
     config.memory_episodes = learned
     frames = _frames(meta, config, learned)
