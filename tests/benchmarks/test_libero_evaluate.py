@@ -19,7 +19,7 @@ TASKS = {name: name.replace("_", " ") for name in ("push_the_plate", "put_the_bo
 def suite(monkeypatch: pytest.MonkeyPatch) -> None:
     for module in (harness, run):
         monkeypatch.setattr(module, "tasks", lambda: TASKS)
-    monkeypatch.setattr(stages, "source", lambda _: SimpleNamespace(all_tasks=lambda: list(TASKS)))
+    monkeypatch.setattr(stages, "find_suite", lambda _: SimpleNamespace(tasks=lambda _: list(TASKS)))
 
 
 @pytest.fixture

@@ -147,7 +147,7 @@ HEADERS = {
     "shape of another kind": (setting("shape", value=["box"]), r"got `array` - at `\$\.shape`"),
     "a box of no size": (setting("objects", 3, "size", value=[0, 0, 0]), "'size'"),
     "a box without a side": (without("objects", 3, "size", 0), "'size'.*'rack'"),
-    "a shape without its foreground": (without("objects", 4, "foreground"), "log_odds"),
+    "a shape without its foreground": (without("objects", 4, "foreground"), "'foreground' of 'mug'"),
     "objects of another kind": (setting("objects", value={}), r"at `\$\.objects`"),
     "an object of another kind": (setting("objects", 0, value=3), r"at `\$\.objects\[0\]`"),
     "an object renamed": (setting("objects", 0, "name", value="cup"), "log_odds"),

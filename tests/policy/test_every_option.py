@@ -16,12 +16,14 @@ from tests.policy.conftest import Frame, act
 from tests.policy.lerobot_commands import CALIBRATION
 from tests.policy.test_learning import new_config
 
+from lerobot_openspm import episodes as running
 from lerobot_openspm import training
 from lerobot_openspm.configuration_openspm import JudgeConfig, OpenSPMConfig, SegmentationConfig
 from lerobot_openspm.errors import OpenSPMError
 from lerobot_openspm.geometry.camera import Camera
 from lerobot_openspm.mining.mined import MinedKeyPoses
 from lerobot_openspm.modeling_openspm import OpenSPMPolicy
+from lerobot_openspm.perception.objects.base import Appearance
 from lerobot_openspm.types import Segmentation, View
 
 Options = dict[str, Any]
@@ -124,7 +126,7 @@ def refusal(trained: Trained, options: Options) -> Any:
 
 def step_s(trained: Trained, options: Options) -> Any:
     """Seconds that the policy takes a step for."""
-    return trained.with_options(options).step_s
+    return running.step_s(trained.with_options(options).config)
 
 
 def status_far_away(trained: Trained, options: Options) -> Any:
@@ -137,6 +139,13 @@ def status_far_away(trained: Trained, options: Options) -> Any:
     policy.memory = replace(memory, robot=robot)
     act(policy, trained.recorded[:1])
     return policy.episodes[0].controller.state.status
+
+
+def understood(trained: Trained, options: Options) -> Any:
+    """Why an instruction with a made-up verb is refused; "" where it is not."""
+    policy = trained.with_options(options)
+    act(policy, [[{**trained.recorded[0][0], "task": "blick the bowl on the plate"}]])
+    return policy.episodes[0].controller.state.refusal
 
 
 def entries(trained: Trained, options: Options) -> Any:
@@ -195,7 +204,7 @@ def shape_worker(trained: Trained, options: Options) -> Any:
     def describe() -> Any:
         with training.shapes_of(config(options)) as shapes:
             mask = Segmentation(np.ones((8, 8), bool), 1.0)
-            return None if shapes is None else shapes.describe(view(), mask, np.eye(3))
+            return None if shapes is None else shapes.describe([Appearance(view(), mask, np.eye(3))])
 
     return result(describe)
 
@@ -266,6 +275,7 @@ CASES = {
     "segmentation.sam3d_checkout": Case(shape_worker, "here", "there", SAM3D),
     "memory_episodes": Case(episodes, [0], [1, 4]),
     "memory_update": Case(entries, "keep", "rebuild"),
+    "lexicon": Case(understood, None, '{"verbs": {"put": ["blick"]}}'),
     "name_embeddings": Case(refusal, None, "nowhere"),
     "judge.type": Case(evidence, "none", "annotations"),
     "judge.api_base": Case(judgement, "the first server", SECOND_SERVER),
