@@ -16,12 +16,12 @@ import shlex
 import subprocess
 import sys
 from dataclasses import dataclass, replace
+from importlib.util import find_spec
 from pathlib import Path
 
 from benchmarks.results import MEASURED_CODE, code_version
 from benchmarks.staleness import origin
 from lerobot_openspm.cli.pipeline import LIBERO_ASSETS, RECORDED_BY
-from lerobot_openspm.envs.suites import has_libero
 from lerobot_openspm.errors import OpenSPMError
 
 logger = logging.getLogger(__name__)
@@ -72,8 +72,10 @@ LIBERO = (
 DISTURBED = (*TABLETOP, *EPISODES, *_benchmarks("disturbances", "tracking"))
 ALONG = (*EPISODES, *_benchmarks("perception", "truth"), *_package("bench"))
 KEY_POSES = (
-    *_package("geometry", "mining", "types.py", "memory/robot.py", "envs/unsteady.py"),
-    *_benchmarks("key_poses", "recording", "contact_events", "contact_sensor", "harness", "stages"),
+    *_package("geometry", "mining", "types.py", "memory/robot.py"),
+    *_benchmarks(
+        "key_poses", "recording", "contact_events", "contact_sensor", "harness", "stages", "unsteady"
+    ),
 )
 LANGUAGE = (
     *_package("control", "geometry", "language", "memory", "mining", "types.py"),
@@ -168,7 +170,7 @@ FIGURES: dict[str, Figure] = {
 
 def takeable() -> list[str]:
     """All figures, but for those on LIBERO where that is not installed; which these are is told."""
-    if has_libero():
+    if find_spec("libero") is not None:
         return list(FIGURES)
     left_out = [name for name, figure in FIGURES.items() if needs_libero(figure)]
     logger.warning("LIBERO is not installed; run: make libero-setup. Left out: %s", ", ".join(left_out))

@@ -2,7 +2,7 @@
 
     python -m benchmarks.key_poses [--env.type=libero]
 
-Scripted experts, led by an unsteady operator (:mod:`lerobot_openspm.envs.unsteady`), give demonstrations;
+Scripted experts, led by an unsteady operator (:mod:`benchmarks.unsteady`), give demonstrations;
 mining sees of them what a dataset holds, and is judged by what the simulator saw
 (:mod:`benchmarks.contact_events`).
 """

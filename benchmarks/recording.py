@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.contact_sensor import ContactSensor, ThingTrack
-from lerobot_openspm.envs.unsteady import UnsteadyHand
+from benchmarks.unsteady import UnsteadyHand
 from lerobot_openspm.errors import OpenSPMError
 from lerobot_openspm.geometry.se3 import Array
 

@@ -12,9 +12,7 @@ from functools import partial
 
 import numpy as np
 
-from lerobot_openspm.control.checks import TransferLimits
 from lerobot_openspm.control.planning import PlanningContext
-from lerobot_openspm.control.strategies import ControlSettings
 from lerobot_openspm.errors import InstructionError, OpenSPMError
 from lerobot_openspm.geometry import se3
 from lerobot_openspm.geometry.se3 import Array
@@ -22,7 +20,6 @@ from lerobot_openspm.language.instruction import read_tasks
 from lerobot_openspm.memory.compose import plan_parts
 from lerobot_openspm.memory.entry import MemoryEntry
 from lerobot_openspm.memory.indexed_entries import known_names
-from lerobot_openspm.memory.retrieval import ScoreWeights
 from lerobot_openspm.memory.robot import RobotModel
 from lerobot_openspm.memory.schema import entry_from_json, entry_to_json
 from lerobot_openspm.mining.anchors import Demonstration
@@ -130,7 +127,7 @@ def acted_entries(
         parts = plan_parts(instruction, rated)
     except InstructionError:
         return ()
-    context = PlanningContext(rated, {}, ROBOT, ScoreWeights(), TransferLimits(), ControlSettings())
+    context = PlanningContext(rated, {}, ROBOT)
     T_world_ee = se3.transform(_HAND_DOWN, [0.0, 0.0, 0.3])
     acted: list[MemoryEntry] = []
     for part in parts:

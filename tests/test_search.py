@@ -5,7 +5,6 @@ from tests.memory.test_compound import drawer_entry
 
 from lerobot_openspm.errors import InstructionError
 from lerobot_openspm.language.names import names_from
-from lerobot_openspm.memory.retrieval import ScoreWeights
 from lerobot_openspm.search import search_memory
 
 BOWL, STOVE = "put the bowl on the plate", "turn on the stove"
@@ -22,23 +21,23 @@ def sources(hits):
 
 
 def test_what_retrieval_considers_is_ordered_by_its_score():
-    found = search_memory("place the bowl onto the plate", BANK, ScoreWeights(semantic=2.0, quality=0.5))
+    found = search_memory("place the bowl onto the plate", BANK)
     assert (found.refusal, found.status, found.seen) == ("", "", {})
     (part,) = found.parts
     assert sources(part) == ["good", "poor"]
     best = part[0]
     assert (best.semantic, best.geometric) == (pytest.approx(1), None)
-    assert best.total == pytest.approx(2.0 * 1 + 0.5 * 0.8)
+    assert best.total == pytest.approx(1.0 * 1 + 0.5 * 0.8)
     assert (found.asked[0].target, found.asked[0].landmark) == ("bowl", "plate")
 
 
 def test_then_comes_the_best_entry_of_each_other_task_the_nearest_first():
-    found = search_memory(BOWL, BANK, ScoreWeights())
+    found = search_memory(BOWL, BANK)
     assert sources(found.others) == ["rack", "stove"]
 
 
 def test_where_nothing_is_considered_the_reason_and_the_nearest_are_named():
-    found = search_memory("put the mug on the plate", BANK, ScoreWeights())
+    found = search_memory("put the mug on the plate", BANK)
     assert found.parts == ()
     assert "the memory holds no memory for the instruction 'put the mug on the plate'" in found.refusal
     assert sources(found.others) == ["good", "rack", "stove"]
@@ -47,7 +46,7 @@ def test_where_nothing_is_considered_the_reason_and_the_nearest_are_named():
 
 def test_an_instruction_of_which_only_the_parts_are_known_is_found_part_by_part():
     both = drawer_entry(source="both")
-    found = search_memory(f"open the top drawer and {BOWL}", (*BANK, both), ScoreWeights())
+    found = search_memory(f"open the top drawer and {BOWL}", (*BANK, both))
     assert found.refusal == ""
     opened, placed = found.parts
     assert [(hit.entry.language, hit.source is both) for hit in opened] == [
@@ -56,28 +55,28 @@ def test_an_instruction_of_which_only_the_parts_are_known_is_found_part_by_part(
     assert sources(placed) == ["good", "poor"]
     assert all(hit.source is hit.entry for hit in placed)
     assert sorted(sources(found.others)) == ["rack", "stove"]
-    refused = search_memory(f"open the bottom drawer and {BOWL}", BANK, ScoreWeights())
+    refused = search_memory(f"open the bottom drawer and {BOWL}", BANK)
     assert (refused.parts, "is a part of the instruction" in refused.refusal) == ((), True)
 
 
 def test_names_that_embeddings_alone_know_are_found(tmp_path):
     model = make_model(tmp_path, {"tureen": (1.0, 0.1), "bowl": (1.0, 0.0), "plate": (0.0, 1.0)})
     instruction = "put the tureen on the plate"
-    assert search_memory(instruction, BANK, ScoreWeights()).parts == ()
-    found = search_memory(instruction, BANK, ScoreWeights(), names_from(str(model)))
+    assert search_memory(instruction, BANK).parts == ()
+    found = search_memory(instruction, BANK, names_from(str(model)))
     assert [sources(part) for part in found.parts] == [["good", "poor"]]
 
 
 def test_what_cannot_be_read_is_refused_and_says_why():
-    found = search_memory("sing a song", BANK, ScoreWeights())
+    found = search_memory("sing a song", BANK)
     assert found.parts == ()
     assert "no verb I know in 'sing a song'" in found.refusal
     assert "it knows: " in found.refusal
     with pytest.raises(InstructionError, match="says nothing"):
-        search_memory("...", BANK, ScoreWeights())
+        search_memory("...", BANK)
 
 
 def test_an_empty_memory_knows_nothing():
-    found = search_memory(BOWL, (), ScoreWeights())
+    found = search_memory(BOWL, ())
     assert (found.parts, found.others) == ((), ())
     assert "nothing yet" in found.refusal

@@ -9,7 +9,6 @@ from lerobot_openspm.configuration_openspm import OpenSPMConfig
 from lerobot_openspm.control.checks import TransferLimits
 from lerobot_openspm.control.controller import EpisodeController
 from lerobot_openspm.control.planning import PlanningContext
-from lerobot_openspm.control.strategies import ControlSettings
 from lerobot_openspm.language.names import NameSimilarity
 from lerobot_openspm.memory.entry import MemoryEntry
 from lerobot_openspm.memory.memory import Memory
@@ -59,7 +58,7 @@ def new_episode(
         memory.yaw_periods,
         memory.robot,
         limits=TransferLimits(config.reach_margin_m, config.min_clearance_m),
-        settings=ControlSettings(config.execution),
+        execution=config.execution,
         tracking=config.tracking,
         step_s=step_s(config),
         names=names,

@@ -15,7 +15,7 @@ from lerobot_openspm.memory.compose import Candidate, plan_parts
 from lerobot_openspm.memory.entry import MemoryEntry
 from lerobot_openspm.memory.indexed_entries import indexed, near
 from lerobot_openspm.memory.key_vector import key_vector, key_vectors
-from lerobot_openspm.memory.retrieval import ScoreWeights, read_instruction, retrieve, semantic_score
+from lerobot_openspm.memory.retrieval import LAMBDAS, read_instruction, retrieve, semantic_score
 from lerobot_openspm.perception.observation import Observation, split_batch
 from lerobot_openspm.types import SubTask
 
@@ -65,17 +65,13 @@ class Found:
 
 
 def search_memory(
-    instruction: str,
-    entries: Sequence[MemoryEntry],
-    weights: ScoreWeights,
-    names: NameSimilarity = TABLE_NAMES,
+    instruction: str, entries: Sequence[MemoryEntry], names: NameSimilarity = TABLE_NAMES
 ) -> Found:
     """What an instruction would be carried out by, without a scene: by ``S_sem`` and quality.
 
     Args:
         instruction: What is asked.
         entries: The memory.
-        weights: Of the terms of the score.
         names: Says which names mean the same thing.
 
     Raises:
@@ -90,10 +86,10 @@ def search_memory(
         plan = plan_parts(instruction, entries, names)
     except InstructionError as error:
         refusal = str(error)
-    parts = tuple(_ranked(part, weights, names) for part in plan)
+    parts = tuple(_ranked(part, names) for part in plan)
     keys = {one.source.key.sub_tasks for part in plan for one in part}
     others = [
-        _without_scene(entry, entry, score(asked, entry.key.sub_tasks), weights)
+        _without_scene(entry, entry, score(asked, entry.key.sub_tasks))
         for entry in _one_of_each_key(asked, entries)
         if entry.key.sub_tasks not in keys
     ]
@@ -101,17 +97,16 @@ def search_memory(
     return Found(asked, parts, tuple(others), refusal, {})
 
 
-def _ranked(part: Sequence[Candidate], weights: ScoreWeights, names: NameSimilarity) -> tuple[Hit, ...]:
+def _ranked(part: Sequence[Candidate], names: NameSimilarity) -> tuple[Hit, ...]:
     """What a part can be carried out by, in the order of retrieval, where nothing is known of the scene."""
     sources = {id(one.entry): one.source for one in part}
-    found = retrieve(
-        [(one.entry, one.semantic) for one in part], lambda _: 1.0, replace(weights, geometric=0.0), names
-    )
-    return tuple(Hit(one.entry, sources[id(one.entry)], one.semantic, None, one.total) for one in found)
+    found = retrieve([(one.entry, one.semantic) for one in part], lambda _: 1.0, names)
+    return tuple(_without_scene(one.entry, sources[id(one.entry)], one.semantic) for one in found)
 
 
-def _without_scene(entry: MemoryEntry, source: MemoryEntry, semantic: float, weights: ScoreWeights) -> Hit:
-    return Hit(entry, source, semantic, None, weights.semantic * semantic + weights.quality * entry.quality)
+def _without_scene(entry: MemoryEntry, source: MemoryEntry, semantic: float) -> Hit:
+    lambda_s, _, lambda_r = LAMBDAS
+    return Hit(entry, source, semantic, None, lambda_s * semantic + lambda_r * entry.quality)
 
 
 def _one_of_each_key(asked: Sequence[SubTask], entries: Sequence[MemoryEntry]) -> list[MemoryEntry]:
@@ -135,12 +130,8 @@ def search_scene(policy: OpenSPMPolicy, observation: Observation) -> Found:
         InstructionError: There is not a word in the instruction.
         ObservationError: The observation lacks a camera, or its images are no pictures.
     """
-    in_words = search_memory(
-        observation.instruction,
-        policy.require_memory().entries,
-        ScoreWeights(),
-        policy.names,
-    )
+    entries = policy.require_memory().entries
+    in_words = search_memory(observation.instruction, entries, policy.names)
     if in_words.refusal:
         return in_words
     policy.reset()

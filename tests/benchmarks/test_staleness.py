@@ -321,7 +321,7 @@ def test_no_figure_is_taken_of_changes_that_are_not_committed(
 def test_without_names_all_figures_are_taken_and_those_left_out_are_told(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture, installed: bool
 ):
-    monkeypatch.setattr(figures, "has_libero", lambda: installed)
+    monkeypatch.setattr(figures, "find_spec", lambda name: name if installed else None)
     names = figures.takeable()
     assert {"calibration", "tabletop"} <= set(names)
     left_out = sorted(set(FIGURES) - set(names))

@@ -99,7 +99,7 @@ def test_show(openspm: Openspm, memory: Path):
     assert code == 0
     assert out.count(" mm, ") == len(merged_entry().key_poses) == out.count("  spread ")
     assert "done when the bowl is within 20.0 mm of 0.0 0.0 10.0 mm from the plate (axes of the plate)" in out
-    assert json.loads(out.splitlines()[-1]) == {"entries": 1, "shown": 1}
+    assert json.loads(out.splitlines()[-1]) == {"entries": 1, "shown": 1, "per_task": {shown.language: 1}}
     assert "holds nothing from 'elsewhere#1'" in refused(openspm, memory, "show", "--source=elsewhere#1")
 
 

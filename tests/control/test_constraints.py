@@ -6,7 +6,6 @@ from tests.memory.builders import OPEN_WIDTH, entry, hand_pose, key_pose, robot
 
 from lerobot_openspm.control.executor import Executor
 from lerobot_openspm.control.state import EpisodeState
-from lerobot_openspm.control.strategies import ControlSettings
 from lerobot_openspm.control.transfer import transfer
 from lerobot_openspm.geometry import se3
 from lerobot_openspm.memory.entry import Axis
@@ -27,7 +26,7 @@ def drawer(axis=None):
     ]
     layout = {"cabinet": se3.from_yaw([0.05, 0.1, 0.0], 0.6)}
     memory = entry("open the top drawer of the cabinet", key_poses=poses, layout=layout)
-    executor = Executor(ControlSettings(), ROBOT, EpisodeState())
+    executor = Executor("closed_loop_trc", ROBOT, EpisodeState())
     executor.begin(transfer(memory, layout, {}, HOME), Hand(HOME, OPEN_WIDTH))
     return executor, layout["cabinet"]
 
@@ -45,7 +44,7 @@ def test_a_drawer_is_pulled_along_its_axis_from_where_its_handle_was_taken():
 
 def test_the_open_loop_follows_an_axis_from_where_the_hand_should_be():
     executor, _ = drawer()
-    executor = Executor(ControlSettings(execution="open_loop"), ROBOT, EpisodeState())
+    executor = Executor("open_loop", ROBOT, EpisodeState())
     executor.begin(drawer()[0].targets, Hand(HOME, OPEN_WIDTH))
     executor.begin(executor.targets, Hand(HOME, OPEN_WIDTH), 2)
     assert_allclose(executor.targets[2].T_world_ee, drawer()[0].targets[2].T_world_ee, atol=1e-9)

@@ -10,9 +10,7 @@ from lerobot_openspm.control.controller import EpisodeController
 from lerobot_openspm.control.planning import MOVED_M, PlanningContext
 from lerobot_openspm.control.scene import BLIND_S, GIVE_UP_S, LOOK_AGAIN_S
 from lerobot_openspm.control.state import Status
-from lerobot_openspm.control.strategies import ControlSettings
 from lerobot_openspm.geometry import se3
-from lerobot_openspm.memory.retrieval import ScoreWeights
 from lerobot_openspm.perception.tracking.tracker import TrackStatus
 from lerobot_openspm.types import Detections, Fault, Hand, PoseEstimate
 
@@ -25,9 +23,8 @@ LOOK_AGAIN_STEPS = round(LOOK_AGAIN_S / STEP_S)
 
 def planning_context(*entries, limits=None, execution="closed_loop_trc", **options):
     return PlanningContext(
-        entries or (entry(),), {}, robot(), ScoreWeights(), limits or TransferLimits(),
-        ControlSettings(execution=execution), **options,
-    )  # fmt: skip
+        entries or (entry(),), {}, robot(), limits or TransferLimits(), execution, **options
+    )
 
 
 class Perception:

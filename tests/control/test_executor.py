@@ -7,9 +7,11 @@ from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 from tests.memory.builders import OPEN_WIDTH, entry, hand_pose, key_pose, robot
 
+from lerobot_openspm.control import executor as executing
+from lerobot_openspm.control import strategies
 from lerobot_openspm.control.executor import Executor
 from lerobot_openspm.control.state import EpisodeState, Status
-from lerobot_openspm.control.strategies import ControlSettings
+from lerobot_openspm.control.strategies import PASSING_M, PASSING_RAD, RESIDUAL_M, RESIDUAL_RAD
 from lerobot_openspm.control.transfer import transfer
 from lerobot_openspm.errors import OpenSPMError
 from lerobot_openspm.geometry import se3
@@ -50,9 +52,9 @@ class World:
         self.step_count += 1
 
 
-def make(settings=None, key_poses=None, hand=HOME):
+def make(execution="closed_loop_trc", key_poses=None, hand=HOME):
     memory = entry(key_poses=key_poses)
-    executor = Executor(settings or ControlSettings(), ROBOT, EpisodeState())
+    executor = Executor(execution, ROBOT, EpisodeState())
     executor.begin(transfer(memory, memory.layout, {}, hand), Hand(hand, OPEN_WIDTH))
     return executor
 
@@ -87,16 +89,11 @@ def test_the_closed_loop_meets_every_key_pose_as_exactly_as_it_must():
     assert executor.state.status is Status.DONE
     assert retries == 0
     assert sorted(left) == list(range(8))
-    settings = ControlSettings()
     for i, target in enumerate(executor.targets):
         metres, radians = se3.distances(left[i], target.T_world_ee)
         if target.key_pose.dwell:
             continue
-        limits = (
-            (settings.residual_m, settings.residual_rad)
-            if target.precise
-            else (settings.passing_m, settings.passing_rad)
-        )
+        limits = (RESIDUAL_M, RESIDUAL_RAD) if target.precise else (PASSING_M, PASSING_RAD)
         assert metres <= limits[0]
         assert radians <= limits[1]
 
@@ -109,9 +106,9 @@ def test_waiting_for_the_fingers_takes_the_demonstrated_steps():
             assert steps_at[i] == target.key_pose.n_steps
 
 
-@pytest.mark.parametrize("settings", [ControlSettings(), ControlSettings(execution="open_loop")])
-def test_a_hand_that_drifts_while_the_fingers_close_is_brought_back(settings):
-    executor, world = make(settings), World()
+@pytest.mark.parametrize("execution", ["closed_loop_trc", "open_loop"])
+def test_a_hand_that_drifts_while_the_fingers_close_is_brought_back(execution):
+    executor, world = make(execution), World()
     run(executor, world, until=lambda e: e.targets[e.state.index].key_pose.dwell)
     target = executor.targets[executor.state.index]
     drift = np.array([0.012, -0.008, 0.005, 0.0, 0.0, 0.05])
@@ -121,7 +118,7 @@ def test_a_hand_that_drifts_while_the_fingers_close_is_brought_back(settings):
         actions.append(executor.next_action(world.hand))
         world.step(actions[-1])
     assert_allclose(np.array(actions)[:, 6], ROBOT.command(target.key_pose.closed))
-    if settings.execution == "open_loop":  # it cannot know
+    if execution == "open_loop":  # it cannot know
         assert float(se3.distances(world.T, target.T_world_ee)[0]) > 0.01
         return
     # Each of the ten steps makes good a fifth.
@@ -131,11 +128,13 @@ def test_a_hand_that_drifts_while_the_fingers_close_is_brought_back(settings):
     assert radians < 0.2 * np.linalg.norm(drift[3:])
 
 
-def test_via_points_are_passed_without_stopping_short():
-    loose, world = make(ControlSettings(passing_m=0.05, passing_rad=1.0)), World()
+def test_via_points_are_passed_without_stopping_short(monkeypatch):
+    monkeypatch.setattr(strategies, "PASSING_M", 0.05)
+    monkeypatch.setattr(strategies, "PASSING_RAD", 1.0)
+    loose, world = make(), World()
     loose_left, _, _ = run(loose, world)
     metres, _ = se3.distances(loose_left[0], loose.targets[0].T_world_ee)
-    assert ControlSettings().passing_m < metres <= 0.05
+    assert PASSING_M < metres <= 0.05
 
 
 @pytest.mark.parametrize("sign", [-1, 1])
@@ -150,7 +149,7 @@ def test_a_key_pose_is_met_in_angle_too(sign):
 
 
 def test_time_runs_out_in_the_closed_loop():
-    executor = make(ControlSettings(execution="closed_loop"))
+    executor = make("closed_loop")
     world = World(stuck=lambda T: True)
     _, retries, steps_at = run(executor, world)
     assert executor.state.status is Status.DONE
@@ -161,14 +160,14 @@ def test_time_runs_out_in_the_closed_loop():
 
 def test_residual_correction_reaches_what_time_alone_does_not():
     slow = 0.5
-    without = make(ControlSettings(execution="closed_loop"))
+    without = make("closed_loop")
     left_without, _, _ = run(without, World(gain=slow))
     corrected = make()
     left_with, retries, _ = run(corrected, World(gain=slow))
     assert corrected.state.status is Status.DONE
     assert retries == 0
     error = lambda left, executor: float(se3.distances(left[1], executor.targets[1].T_world_ee)[0])  # noqa: E731
-    assert error(left_with, corrected) <= ControlSettings().residual_m < error(left_without, without)
+    assert error(left_with, corrected) <= RESIDUAL_M < error(left_without, without)
 
 
 def test_a_correction_contracts_the_error_whatever_the_flow_model_says():
@@ -197,9 +196,10 @@ def blocked_at_the_bowl(executor):
     return lambda T: bool(T[2, 3] < height + 0.02)
 
 
-def test_what_cannot_be_met_is_corrected_then_tried_again_then_given_up():
-    settings = ControlSettings(max_corrections=3, max_attempts=2)
-    executor = make(settings)
+def test_what_cannot_be_met_is_corrected_then_tried_again_then_given_up(monkeypatch):
+    monkeypatch.setattr(executing, "MAX_CORRECTIONS", 3)
+    monkeypatch.setattr(executing, "MAX_ATTEMPTS", 2)
+    executor = make()
     world = World(stuck=blocked_at_the_bowl(executor))
     _, retries, _ = run(executor, world, 2000)
     assert executor.state.status is Status.NO_PROGRESS
@@ -208,8 +208,9 @@ def test_what_cannot_be_met_is_corrected_then_tried_again_then_given_up():
     assert executor.next_action(world.hand)[:6].tolist() == [0.0] * 6
 
 
-def test_corrections_are_counted_once_time_is_up_and_forgotten_at_the_next_key_pose():
-    executor = make(ControlSettings(max_corrections=3))
+def test_corrections_are_counted_once_time_is_up_and_forgotten_at_the_next_key_pose(monkeypatch):
+    monkeypatch.setattr(executing, "MAX_CORRECTIONS", 3)
+    executor = make()
     world = World(stuck=blocked_at_the_bowl(executor))
     run(executor, world, until=lambda e: e.state.index == 1)
     assert executor.approach.corrections == 0
@@ -257,7 +258,7 @@ def test_grip_is_not_judged_before_the_grasp_nor_in_a_push_nor_without_correctio
     for index in (0, 1, 2, 7):
         executor.begin(executor.targets, empty, index)
         assert executor.advance(empty) is False
-    plain = make(ControlSettings(execution="closed_loop"))
+    plain = make("closed_loop")
     plain.begin(plain.targets, empty, 4)
     assert plain.advance(empty) is False
     fist = [
@@ -282,10 +283,9 @@ def test_a_retry_begins_at_the_first_approach_of_the_same_contact():
 
 
 def test_the_open_loop_never_looks_at_the_hand():
-    settings = ControlSettings(execution="open_loop")
     seen = []
     for world in (World(), World(stuck=lambda T: True), World(gain=0.3, held=0.0)):
-        executor, queries = make(settings), []
+        executor, queries = make("open_loop"), []
 
         def flow(query, queries=queries):
             queries.append(query)
@@ -330,7 +330,7 @@ def test_actions_left_over_are_dropped_at_the_next_key_pose():
 
 
 def test_holding_still_keeps_the_fingers_as_they_are():
-    executor = Executor(ControlSettings(), ROBOT, EpisodeState())
+    executor = Executor("closed_loop_trc", ROBOT, EpisodeState())
     assert executor.hold().tolist() == [0] * 6 + [ROBOT.open_command]
     assert executor.next_action(Hand(HOME, OPEN_WIDTH)).tolist() == [0] * 6 + [ROBOT.open_command]
     carrying = make()

@@ -9,10 +9,9 @@ from numpy.testing import assert_allclose
 from tests.control.test_controller import HAND, Perception, controller, observe, shifted, watch
 from tests.memory.builders import entry, hand_pose, key_pose, robot
 
-from lerobot_openspm.control.executor import Executor
+from lerobot_openspm.control.executor import MAX_ATTEMPTS, Executor
 from lerobot_openspm.control.scene import LEFT_BEHIND_M, OUTRUN_M
 from lerobot_openspm.control.state import EpisodeState, Status
-from lerobot_openspm.control.strategies import ControlSettings
 from lerobot_openspm.control.transfer import Target, push_paths, transfer
 from lerobot_openspm.geometry import se3
 from lerobot_openspm.memory.entry import Anchor, Outcome
@@ -104,7 +103,7 @@ def test_a_push_without_a_known_outcome_ends_where_the_demonstration_did():
 
 
 def test_a_hand_that_strays_while_it_pushes_is_led_back_to_its_way():
-    executor = Executor(ControlSettings(), robot(), EpisodeState())
+    executor = Executor("closed_loop_trc", robot(), EpisodeState())
     memory, path = push().key_poses[2], push_paths(push(), LAYOUT)[0]
     start, end = hand_pose(0.3, 0.0, 0.02), hand_pose(0.1, 0.0, 0.02)
     executor.begin([Target(end, memory, precise=True, push=path)], Hand(start, 0.0))
@@ -119,7 +118,7 @@ def test_a_hand_that_strays_while_it_pushes_is_led_back_to_its_way():
 
 @given(st.floats(-0.05, 0.05), st.floats(-0.05, 0.05), st.floats(-1, 1), st.floats(-1, 1))
 def test_an_action_that_leads_back_to_the_way_stays_within_bounds(y, z, along, across):
-    executor = Executor(ControlSettings(), robot(), EpisodeState())
+    executor = Executor("closed_loop_trc", robot(), EpisodeState())
     memory, path = push().key_poses[2], push_paths(push(), LAYOUT)[0]
     start, end = hand_pose(0.3, 0.0, 0.02), hand_pose(0.1, -0.1, 0.02)
     executor.begin([Target(end, memory, precise=True, push=path)], Hand(start, 0.0))
@@ -283,7 +282,7 @@ def test_a_plate_that_stopped_short_is_pushed_on_until_attempts_are_used_up():
     perception, one = Perception(LAYOUT), controller(push(), instruction=INSTRUCTION)
     goal = se3.from_yaw(se3.apply(LAYOUT["stove"], GOAL[None])[0], 0.0)
     hand = done(one, perception, shifted(goal, 0.05))
-    for attempt in range(1, ControlSettings().max_attempts + 1):
+    for attempt in range(1, MAX_ATTEMPTS + 1):
         assert one.state.status is Status.RUNNING
         assert one.state.attempts == attempt
         assert one.state.index == 0

@@ -6,6 +6,7 @@ from numpy.testing import assert_allclose
 from tests.geometry.strategies import transforms
 from tests.memory.builders import entry, hand_pose, key_pose, robot
 
+from lerobot_openspm.control import checks
 from lerobot_openspm.control.checks import TransferLimits, check_transfer, geometric_score, shape_deviation
 from lerobot_openspm.control.transfer import RETREAT_M, transfer, transfer_pose
 from lerobot_openspm.geometry import se3
@@ -100,11 +101,11 @@ def test_contacts_and_the_arrivals_before_them_are_precise():
     ]  # fmt: skip
 
 
-def problems(*poses, hand=HOME, limits=None):
+def problems(*poses, hand=HOME):
     layout = {"bowl": np.eye(4)}
     key_poses = [key_pose("bowl", T, phase) for phase, T in poses]
     targets = transfer(entry(key_poses=key_poses, layout=layout), layout, {}, hand)
-    return check_transfer(targets, hand, robot(), limits or TransferLimits())
+    return check_transfer(targets, hand, robot(), TransferLimits())
 
 
 def test_key_poses_within_bounds_pass():
@@ -129,11 +130,11 @@ def test_each_check_names_the_key_pose_and_what_is_wrong(T, word):
     assert word in problem
 
 
-def test_a_jump_is_measured_from_the_key_pose_before_and_first_from_the_hand():
-    limits = TransferLimits(max_jump_m=0.25)
-    far = problems(("approach", hand_pose(0, 0, 0.2)), ("grasp", hand_pose(0.3, 0, 0.2)), limits=limits)
+def test_a_jump_is_measured_from_the_key_pose_before_and_first_from_the_hand(monkeypatch):
+    monkeypatch.setattr(checks, "MAX_JUMP_M", 0.25)
+    far = problems(("approach", hand_pose(0, 0, 0.2)), ("grasp", hand_pose(0.3, 0, 0.2)))
     assert far == ["key pose 1 (grasp at bowl) is 0.30 m and 0.00 rad from the one before"]
-    first = problems(("approach", hand_pose(0.3, 0, 0.3)), ("grasp", hand_pose(0.3, 0, 0.2)), limits=limits)
+    first = problems(("approach", hand_pose(0.3, 0, 0.3)), ("grasp", hand_pose(0.3, 0, 0.2)))
     assert first == ["key pose 0 (approach at bowl) is 0.30 m and 0.00 rad from the one before"]
 
 
@@ -195,8 +196,8 @@ def test_what_is_not_to_be_put_anywhere_is_not_let_go():
     assert "release" not in [target.key_pose.phase for target in targets]
 
 
-def score(layout, memory=None, **limits):
-    return geometric_score(memory or entry(), layout, {}, HOME, robot(), TransferLimits(**limits))
+def score(layout, memory=None):
+    return geometric_score(memory or entry(), layout, {}, HOME, robot(), TransferLimits())
 
 
 @given(st.floats(-0.1, 0.1), st.floats(-0.1, 0.1), st.floats(-0.3, 0.3))
@@ -205,11 +206,12 @@ def test_a_scene_arranged_like_the_entrys_own_scores_one_wherever_it_is(x, y, ya
     assert score({name: G @ T for name, T in entry().layout.items()}) == pytest.approx(1)
 
 
-def test_an_object_that_is_missing_or_out_of_reach_scores_nothing():
+def test_an_object_that_is_missing_or_out_of_reach_scores_nothing(monkeypatch):
     layout = entry().layout
     assert score({"bowl": layout["bowl"]}) == 0
     assert score(layout | {"plate": se3.from_yaw([3.0, 0, 0], 0.0)}) == 0
-    assert score(layout, max_jump_m=0.05) == 0
+    monkeypatch.setattr(checks, "MAX_JUMP_M", 0.05)
+    assert score(layout) == 0
 
 
 def test_the_less_like_the_entrys_own_arrangement_the_less_it_scores():
@@ -227,10 +229,12 @@ def test_objects_that_no_key_pose_is_relative_to_make_no_difference():
     assert score(layout | {"mug": se3.from_yaw([0.3, 0.3, 0], 1.0)}) == score(layout)
 
 
-def test_what_can_be_done_at_all_scores_something():
+def test_what_can_be_done_at_all_scores_something(monkeypatch):
     # A drawer that opens another way round from where the hand comes from: far from alike, yet possible.
     pull = key_pose("cabinet", hand_pose(0.3, 0.0, 0.1), "open", closed=True)
     take = key_pose("handle", hand_pose(0.0, 0.0, 0.1), "grasp", closed=True)
     memory = entry(key_poses=[take, pull], layout={"cabinet": np.eye(4), "handle": np.eye(4)})
     here = {"cabinet": np.eye(4), "handle": se3.from_yaw([-0.4, 0.0, 0.0], 2.0)}
-    assert 0 < score(here, memory, max_jump_m=9, max_jump_rad=9) < 0.01
+    monkeypatch.setattr(checks, "MAX_JUMP_M", 9)
+    monkeypatch.setattr(checks, "MAX_JUMP_RAD", 9)
+    assert 0 < score(here, memory) < 0.01

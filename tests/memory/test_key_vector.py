@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from lerobot_openspm.language.instruction import parse_instruction
-from lerobot_openspm.memory.key_vector import DIMENSIONS, SCHEME, key_vector, key_vectors
+from lerobot_openspm.memory.key_vector import DIMENSIONS, key_vector, key_vectors
 from lerobot_openspm.types import Reference, SubTask
 
 names = st.text("abc ", max_size=8).map(lambda text: " ".join(text.split()))
@@ -82,7 +82,6 @@ def test_the_order_of_sub_tasks_counts():
 
 
 def test_every_process_and_release_makes_the_same_vectors():
-    """Banks keep vectors: where these numbers change, SCHEME has to count up."""
     code = (
         "import hashlib; from lerobot_openspm.memory.entry import SubTask; "
         "from lerobot_openspm.memory.key_vector import key_vector; "
@@ -98,5 +97,4 @@ def test_every_process_and_release_makes_the_same_vectors():
     ]  # fmt: skip
     here = key_vector([SubTask("put", "wine bottle", "", "on", "rack")])
     assert runs == [hashlib.sha256(here.round(4).tobytes()).hexdigest()] * 2
-    assert SCHEME == 1
     assert here[:4].round(4).tolist() == pytest.approx([-0.0542, 0.1285, 0.0558, 0.1609], abs=1e-4)

@@ -5,9 +5,9 @@ from tests.memory.builders import entry, semantic_candidates
 
 from lerobot_openspm.errors import InstructionError
 from lerobot_openspm.language.instruction import parse_instruction
+from lerobot_openspm.memory import retrieval
 from lerobot_openspm.memory.retrieval import (
     MARGIN,
-    ScoreWeights,
     retrieve,
     semantic_score,
 )
@@ -52,7 +52,7 @@ def test_a_chain_is_as_good_as_its_weakest_link():
     assert score(asked, asked) == pytest.approx(1)
 
 
-def test_only_matching_entries_are_candidates_each_with_its_score():
+def test_only_matching_entries_are_candidates_each_with_its_score(monkeypatch):
     exact, other = entry("put the wine bottle on the rack"), entry("put the bowl on the plate")
     near = entry("place the wine bottle on the left rack")
     found = semantic_candidates("put the wine bottle on the rack", [other, near, exact, exact])
@@ -62,8 +62,8 @@ def test_only_matching_entries_are_candidates_each_with_its_score():
     # The weight of semantics decides against a nearer match in another respect, or not.
     better_place = {id(near): 1.0}
     for weight, first in ((5.0, exact), (0.1, near)):
-        weights = ScoreWeights(semantic=weight, geometric=0.5, quality=0.0)
-        ranked = retrieve(found, lambda e: better_place.get(id(e), 0.5), weights)
+        monkeypatch.setattr(retrieval, "LAMBDAS", (weight, 0.5, 0.0))
+        ranked = retrieve(found, lambda e: better_place.get(id(e), 0.5))
         assert ranked[0].entry is first
 
 
@@ -84,7 +84,7 @@ def test_what_is_meant_acts_whatever_the_scene_and_the_quality_say_for_another(a
     found = semantic_candidates(asked, [other, meant])
     for geometry in (0.1, 0.0):
         scene = {id(meant): geometry, id(other): 1.0}
-        ranked = retrieve(found, lambda e, scene=scene: scene[id(e)], ScoreWeights())
+        ranked = retrieve(found, lambda e, scene=scene: scene[id(e)])
         assert ranked[0].entry is meant
 
 
@@ -118,31 +118,33 @@ def test_an_instruction_without_experience_lists_what_is_known(instruction):
 SCORES = {"semantic": (1.0, 0.2), "geometric": (0.8, 1.0), "quality": (0.8, 0.2)}
 
 
-def rank(weights, geometric=lambda entry: SCORES[entry.source][1]):
+def rank(geometric=lambda entry: SCORES[entry.source][1]):
     entries = [
         (entry(quality=0.9 if source == "quality" else 0.2, source=source), semantic)
         for source, (semantic, _) in SCORES.items()
     ]
-    return retrieve(entries, geometric, weights)
+    return retrieve(entries, geometric)
 
 
 @pytest.mark.parametrize("term", ["semantic", "geometric", "quality"])
-def test_the_weight_of_a_term_decides_for_the_entry_that_is_best_in_it(term):
-    weights = {"semantic": 0.1, "geometric": 0.1, "quality": 0.1, term: 10.0}
-    assert rank(ScoreWeights(**weights))[0].entry.source == term
+def test_the_weight_of_a_term_decides_for_the_entry_that_is_best_in_it(monkeypatch, term):
+    monkeypatch.setattr(retrieval, "LAMBDAS", tuple(10.0 if name == term else 0.1 for name in SCORES))
+    assert rank()[0].entry.source == term
 
 
-def test_the_score_is_the_papers_sum():
-    for scored in rank(ScoreWeights(2.0, 3.0, 5.0)):
+def test_the_score_is_the_papers_sum(monkeypatch):
+    monkeypatch.setattr(retrieval, "LAMBDAS", (2.0, 3.0, 5.0))
+    for scored in rank():
         assert (scored.semantic, scored.geometric) == SCORES[scored.entry.source]
         assert scored.quality == scored.entry.quality
         assert scored.total == pytest.approx(2 * scored.semantic + 3 * scored.geometric + 5 * scored.quality)
 
 
-@pytest.mark.parametrize("weights", [ScoreWeights(), ScoreWeights(100, 0, 0), ScoreWeights(0, 0, 100)])
-def test_an_entry_that_cannot_be_executed_comes_last_whatever_the_weights(weights):
-    best = rank(weights)[0].entry.source
-    ranked = rank(weights, lambda entry: 0.0 if entry.source == best else 0.01)
+@pytest.mark.parametrize("weights", [retrieval.LAMBDAS, (100, 0, 0), (0, 0, 100)])
+def test_an_entry_that_cannot_be_executed_comes_last_whatever_the_weights(monkeypatch, weights):
+    monkeypatch.setattr(retrieval, "LAMBDAS", weights)
+    best = rank()[0].entry.source
+    ranked = rank(lambda entry: 0.0 if entry.source == best else 0.01)
     assert ranked[-1].entry.source == best
     assert ranked[-1].geometric == 0
     assert [scored.total for scored in ranked[:2]] == sorted((s.total for s in ranked[:2]), reverse=True)

@@ -14,7 +14,6 @@ from lerobot_openspm.errors import OpenSPMError
 from lerobot_openspm.language.lexicon import read_lexicon
 from lerobot_openspm.language.names import TABLE_NAMES, NameSimilarity, names_from
 from lerobot_openspm.memory.io import read_memory
-from lerobot_openspm.memory.retrieval import ScoreWeights
 from lerobot_openspm.search import Found, Hit, observation_of, search_memory, search_scene
 from lerobot_openspm.types import Reference, SubTask
 
@@ -67,7 +66,7 @@ def search(args: list[str]) -> None:
 def _search(instruction: str, config: SearchConfig) -> Found:
     if config.dataset.root is None and config.dataset.repo_id is None:
         entries = read_memory(Path(config.path)).entries
-        return search_memory(instruction, entries, ScoreWeights(), _names(config.path))
+        return search_memory(instruction, entries, _names(config.path))
     if config.dataset.root is not None and not (Path(config.dataset.root) / "meta/info.json").is_file():
         raise FileNotFoundError(f"no dataset at --dataset.root={config.dataset.root}")
     from lerobot.datasets import LeRobotDataset

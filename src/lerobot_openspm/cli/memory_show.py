@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections import defaultdict
+from collections import Counter, defaultdict
 from dataclasses import dataclass, replace
 from itertools import islice
 from pathlib import Path
@@ -94,8 +94,9 @@ def show(args: list[str]) -> None:
             f"--path={config.path}` lists what it holds"
         )
     for entry in shown:
-        print("\n".join(table(entry)), end="\n\n")
-    print(json.dumps({"entries": len(memory.entries), "shown": len(shown)}))
+        print("\n".join(_table(entry)), end="\n\n")
+    per_task = Counter(entry.language for entry in memory.entries)
+    print(json.dumps({"entries": len(memory.entries), "shown": len(shown), "per_task": per_task}))
 
 
 def export(args: list[str]) -> None:
@@ -136,7 +137,7 @@ def _task_line(language: str, qualities: list[float]) -> str:
     return f"{len(qualities):6d} entries  mean quality {np.mean(qualities):.2f}  {language!r}"
 
 
-def table(entry: MemoryEntry) -> list[str]:
+def _table(entry: MemoryEntry) -> list[str]:
     """An entry as lines: a head, a row for every key pose, and where what was moved should end."""
     outcomes = f", succeeded {entry.successes} of {entry.trials} times" if entry.trials else ""
     head = (

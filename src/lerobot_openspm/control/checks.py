@@ -15,6 +15,9 @@ from lerobot_openspm.memory.robot import RobotModel
 
 # Phases in which an object follows the hand along a constraint.
 CONSTRAINED_PHASES = ("push", "open", "turn")
+# Longest way and largest turn between consecutive key poses: the reach of a table-top arm, and just short of
+# half a turn, whose direction is open.
+MAX_JUMP_M, MAX_JUMP_RAD = 0.8, 2.8
 # How much a different motion through free space counts beside one in contact.
 FREE_SPACE_SHARE = 0.2
 # An entry whose motions differ by this much scores 1/e.
@@ -30,15 +33,10 @@ class TransferLimits:
     Attributes:
         reach_margin_m: How far outside the box that the demonstrations covered the hand may go.
         min_clearance_m: How far below the lowest demonstrated hand position the hand may go.
-        max_jump_m: Longest way between consecutive key poses. The default is the reach of a table-top arm.
-        max_jump_rad: Largest turn between consecutive key poses. The default is just short of half a turn,
-            whose direction is open.
     """
 
     reach_margin_m: float = 0.10
     min_clearance_m: float = 0.01
-    max_jump_m: float = 0.8
-    max_jump_rad: float = 2.8
 
 
 def check_transfer(
@@ -65,7 +63,7 @@ def check_transfer(
         if low[2] - p[2] > limits.min_clearance_m:
             problems.append(f"{where} is {low[2] - p[2]:.3f} m below the lowest demonstrated hand position")
         metres, radians = se3.distances(before, target.T_world_ee)
-        if metres > limits.max_jump_m or radians > limits.max_jump_rad:
+        if metres > MAX_JUMP_M or radians > MAX_JUMP_RAD:
             problems.append(f"{where} is {metres:.2f} m and {radians:.2f} rad from the one before")
         before = target.T_world_ee
     return problems

@@ -46,7 +46,7 @@ class EpisodeController:
         self.instruction = instruction
         self.state = EpisodeState()
         self.scene = SceneState(context)
-        self.executor = Executor(context.settings, context.robot, self.state)
+        self.executor = Executor(context.execution, context.robot, self.state)
         # Told by the first observation, so it does not matter in which batch or row the episode runs.
         self._noise_key = (noise_seed, zlib.crc32(instruction.encode()), fingerprint)
 

@@ -10,7 +10,7 @@ from dataclasses import replace
 import numpy as np
 
 from lerobot_openspm.control.state import EpisodeState, Status
-from lerobot_openspm.control.strategies import STRATEGIES, Approach, ControlSettings
+from lerobot_openspm.control.strategies import STRATEGIES, Approach
 from lerobot_openspm.control.transfer import Target
 from lerobot_openspm.errors import OpenSPMError
 from lerobot_openspm.flow.condition import Query, progress
@@ -18,10 +18,12 @@ from lerobot_openspm.geometry import se3
 from lerobot_openspm.geometry.se3 import Array
 from lerobot_openspm.memory.entry import PHASES
 from lerobot_openspm.memory.robot import RobotModel
-from lerobot_openspm.types import Hand
+from lerobot_openspm.types import Execution, Hand
 
 logger = logging.getLogger(__name__)
 
+# Corrections per key pose, and how often a grasp that missed or a key pose that was not met is tried again.
+MAX_CORRECTIONS, MAX_ATTEMPTS = 8, 3
 # Phases that end with the hand on an object.
 CONTACTS = ("grasp", "release", "push", "open", "turn")
 # An opening below this share of the demonstrated one means that the fingers hold nothing.
@@ -42,9 +44,9 @@ class Executor:
         approach: The way to the present key pose.
     """
 
-    def __init__(self, settings: ControlSettings, robot: RobotModel, state: EpisodeState):
-        self._settings, self._robot, self.state = settings, robot, state
-        self.strategy = STRATEGIES[settings.execution](settings, robot)
+    def __init__(self, execution: Execution, robot: RobotModel, state: EpisodeState):
+        self._robot, self.state = robot, state
+        self.strategy = STRATEGIES[execution](robot)
         self.targets: tuple[Target, ...] = ()
         self.approach = Approach(np.eye(4))
         self._believed = np.eye(4)  # where the hand should be, by the actions given out so far
@@ -141,7 +143,7 @@ class Executor:
     def _is_given_up(self, hand: Hand) -> bool:
         """Whether the present key pose is tried again because its corrections are used up."""
         approach = self.approach
-        is_used_up = approach.corrections > self._settings.max_corrections
+        is_used_up = approach.corrections > MAX_CORRECTIONS
         is_passed_by = not self.present.precise and self.state.index + 1 < len(self.targets)
         if is_passed_by and (is_used_up or approach.is_blocked):
             # A hand that is held up short of a key pose it only passes by goes on to the next one.
@@ -237,7 +239,7 @@ class Executor:
         """Count another attempt at the present key pose; without one left there is no progress."""
         self.state.attempts += 1
         phase = self.present.key_pose.phase
-        if self.state.attempts > self._settings.max_attempts:
+        if self.state.attempts > MAX_ATTEMPTS:
             self.stop(Status.NO_PROGRESS)
             logger.info("giving up at key pose %d (%s): %s", self.state.index, phase, why)
             return False

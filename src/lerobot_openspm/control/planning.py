@@ -8,16 +8,15 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from lerobot_openspm.control.checks import TransferLimits, check_transfer, geometric_score
-from lerobot_openspm.control.strategies import ControlSettings
 from lerobot_openspm.control.transfer import Target, pushed_by_landmark, transfer
 from lerobot_openspm.geometry import se3
 from lerobot_openspm.geometry.se3 import Array
 from lerobot_openspm.language.names import TABLE_NAMES, NameSimilarity
 from lerobot_openspm.memory.compose import Candidate
 from lerobot_openspm.memory.entry import WORLD, MemoryEntry, MemoryKeyPose, Outcome, RetrievalKey
-from lerobot_openspm.memory.retrieval import Scored, ScoreWeights, retrieve
+from lerobot_openspm.memory.retrieval import Scored, retrieve
 from lerobot_openspm.memory.robot import RobotModel
-from lerobot_openspm.types import SubTask
+from lerobot_openspm.types import Execution, SubTask
 
 # An object this far from where the key poses took it to be takes them along; less is noise.
 MOVED_M, MOVED_RAD = 0.002, 0.05
@@ -33,9 +32,8 @@ class PlanningContext:
         entries: The memory's entries.
         yaw_periods: Angle by object that turns it into itself, radians.
         robot: The robot.
-        weights: Of retrieval.
         limits: Of transferred key poses.
-        settings: How key poses are followed.
+        execution: How key poses are followed.
         tracking: Whether objects are looked for again once a plan is made.
         step_s: Seconds that a control step takes.
         names: Tells which names in an instruction mean the same thing.
@@ -44,9 +42,8 @@ class PlanningContext:
     entries: Sequence[MemoryEntry]
     yaw_periods: Mapping[str, float]
     robot: RobotModel
-    weights: ScoreWeights = field(default_factory=ScoreWeights)
     limits: TransferLimits = field(default_factory=TransferLimits)
-    settings: ControlSettings = field(default_factory=ControlSettings)
+    execution: Execution = "closed_loop_trc"
     tracking: bool = True
     step_s: float = 0.05
     names: NameSimilarity = TABLE_NAMES
@@ -78,7 +75,7 @@ class PlanningContext:
         scene = object_poses, self.yaw_periods, T_world_ee, self.robot, self.limits
         geometric = {id(one.entry): geometric_score(one.entry, *scene) for one in candidates}
         semantic = [(one.entry, one.semantic) for one in candidates]
-        return tuple(retrieve(semantic, lambda entry: geometric[id(entry)], self.weights, self.names))
+        return tuple(retrieve(semantic, lambda entry: geometric[id(entry)], self.names))
 
 
 @dataclass(frozen=True)

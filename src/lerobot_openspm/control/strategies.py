@@ -13,6 +13,11 @@ from lerobot_openspm.geometry.se3 import Array
 from lerobot_openspm.memory.robot import RobotModel
 from lerobot_openspm.types import Execution, Hand
 
+# The numbers here were set by hand on the tabletop, and serve LIBERO as well.
+# The paper's epsilon_r: a precise key pose is met within this distance and angle ...
+RESIDUAL_M, RESIDUAL_RAD = 0.004, 0.06
+# ... and one that is only passed by within these.
+PASSING_M, PASSING_RAD = 0.015, 0.15
 # A correction that leaves more than this share of the residual is blocked by something solid.
 STUCK_SHARE = 0.9
 # A blocked key pose is met within this multiple of the tolerance, because what is touched is in the way.
@@ -20,30 +25,6 @@ BLOCKED_SHARE = 3.0
 # Each step of a correction makes good this share of the residual, and five steps are one correction. Every
 # further correction adds the same share again, because friction stops a hand that asks for millimetres.
 CORRECTION_SHARE, CORRECTION_STEPS = 0.2, 5
-
-
-@dataclass(frozen=True)
-class ControlSettings:
-    """How key poses are followed. The numbers were set by hand on the tabletop, and serve LIBERO as well.
-
-    Attributes:
-        execution: ``open_loop`` plans every chunk from where the hand should be; ``closed_loop`` from where
-            it is; ``closed_loop_trc`` adds terminal residual correction.
-        residual_m: The paper's epsilon_r: a precise key pose is met within this distance ...
-        residual_rad: ... and this angle.
-        passing_m: A key pose that is only passed by is met within this distance ...
-        passing_rad: ... and this angle.
-        max_corrections: Corrections of five steps per key pose.
-        max_attempts: How often a grasp that missed, or a key pose that was not met, is tried again.
-    """
-
-    execution: Execution = "closed_loop_trc"
-    residual_m: float = 0.004
-    residual_rad: float = 0.06
-    passing_m: float = 0.015
-    passing_rad: float = 0.15
-    max_corrections: int = 8
-    max_attempts: int = 3
 
 
 @dataclass
@@ -82,8 +63,8 @@ class ClosedLoop:
     measures = True  # whether the hand and the scene are looked at once there is a plan
     feels_fingers = False  # whether a grip that was lost is noticed
 
-    def __init__(self, settings: ControlSettings, robot: RobotModel):
-        self._settings, self._robot = settings, robot
+    def __init__(self, robot: RobotModel):
+        self._robot = robot
 
     def is_met(self, target: Target, approach: Approach, hand: Hand) -> bool:
         """Whether a key pose in motion is met."""
@@ -110,12 +91,11 @@ class ClosedLoop:
         return np.append(motion, self._robot.command(target.key_pose.closed))
 
     def _is_near(self, target: Target, approach: Approach, hand: Hand) -> bool:
-        settings = self._settings
         metres, radians = se3.distances(hand.T_world_ee, target.T_world_ee)
         if target.precise:
-            share = max(float(metres) / settings.residual_m, float(radians) / settings.residual_rad)
+            share = max(float(metres) / RESIDUAL_M, float(radians) / RESIDUAL_RAD)
             return share <= 1 or (approach.is_blocked and share <= BLOCKED_SHARE)
-        return bool(metres <= settings.passing_m and radians <= settings.passing_rad)
+        return bool(metres <= PASSING_M and radians <= PASSING_RAD)
 
 
 class OpenLoop(ClosedLoop):

@@ -1,13 +1,9 @@
 """Which seeds belong to what: evaluation, demonstrations and tuning never share an initial state."""
 
-EVALUATION_SEED_START = 0
 DEMO_SEED_START = 1_000_000
 TUNING_SEED_START = 2_000_000
-SEED_END = 3_000_000
 
-EVALUATION_SEEDS = range(EVALUATION_SEED_START, DEMO_SEED_START)
 DEMO_SEEDS = range(DEMO_SEED_START, TUNING_SEED_START)
-TUNING_SEEDS = range(TUNING_SEED_START, SEED_END)
 
 
 def require_demo_seeds(first: int, count: int) -> None:

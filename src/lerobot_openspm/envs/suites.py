@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from importlib.util import find_spec
 
 from lerobot_openspm.envs.recording import Suite
 
@@ -33,8 +32,3 @@ def find_suite(env_type: str) -> Suite:
     if env_type not in SUITES:
         raise ValueError(f"env.type is {env_type!r}, expected {' or '.join(SUITES)}")
     return SUITES[env_type]()
-
-
-def has_libero() -> bool:
-    """Whether LIBERO is installed."""
-    return find_spec("libero") is not None

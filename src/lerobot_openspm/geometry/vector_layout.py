@@ -26,7 +26,6 @@ from lerobot_openspm.geometry import se3
 from lerobot_openspm.geometry.se3 import Array
 
 RotationKind = Literal["none", "axis_angle", "quat", "euler"]
-ROTATION_KINDS: tuple[RotationKind, ...] = ("none", "axis_angle", "quat", "euler")
 
 _POSITION = ("x", "y", "z")
 _ROTATIONS: dict[RotationKind, tuple[str, ...]] = {

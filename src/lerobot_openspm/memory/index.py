@@ -102,20 +102,18 @@ class FaissIndex:
         return cosines, found
 
 
-def make_index(vectors: Vectors, where: str = "the memory") -> KeyIndex:
+def make_index(vectors: Vectors) -> KeyIndex:
     """The index for a number of vectors: exact up to :data:`EXACT_LIMIT`, FAISS's beyond if it is installed.
 
     Args:
         vectors: Unit vectors ``(n, 64)``.
-        where: Names the memory in the log.
     """
     if len(vectors) <= EXACT_LIMIT:
         return ExactIndex(vectors)
     if importlib.util.find_spec("faiss") is None:
         logger.warning(
-            "%s holds %d different keys, and every one is compared at each retrieval; it is quicker with "
-            "FAISS: pip install 'lerobot_policy_openspm[index]'",
-            where,
+            "the memory holds %d different keys, and every one is compared at each retrieval; it is quicker "
+            "with FAISS: pip install 'lerobot_policy_openspm[index]'",
             len(vectors),
         )
         return ExactIndex(vectors)

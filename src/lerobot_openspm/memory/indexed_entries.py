@@ -34,7 +34,6 @@ class IndexedEntries(Sequence[MemoryEntry]):
 
     Args:
         entries: The bank. Of an :class:`EntryBank` one entry of every different key is read, else all.
-        where: Names the bank in errors.
 
     Attributes:
         names: Of all objects that the entries are about.
@@ -43,7 +42,7 @@ class IndexedEntries(Sequence[MemoryEntry]):
         MemoryFormatError: An entry cannot be read.
     """
 
-    def __init__(self, entries: Sequence[MemoryEntry], where: str = "the memory"):
+    def __init__(self, entries: Sequence[MemoryEntry]):
         self._entries = entries
         keys, numbers, qualities = _numbered_keys(entries)
         # Entries by key, the best of each first.
@@ -56,7 +55,7 @@ class IndexedEntries(Sequence[MemoryEntry]):
                 self._rows.setdefault(row, []).append(number)
         self._row_keys, self._keys = list(self._rows), keys
         self.names = _names(keys)
-        self._index = make_index(key_vectors(self._row_keys), where)
+        self._index = make_index(key_vectors(self._row_keys))
 
     def __len__(self) -> int:
         return len(self._entries)
@@ -106,11 +105,11 @@ class IndexedEntries(Sequence[MemoryEntry]):
             yield from (int(i) for i in self._order[begin : begin + 1 + more])
 
 
-def indexed(entries: Sequence[MemoryEntry], where: str = "the memory") -> Sequence[MemoryEntry]:
+def indexed(entries: Sequence[MemoryEntry]) -> Sequence[MemoryEntry]:
     """The entries with an index, if there are many; else as they are."""
     if len(entries) <= INDEX_FROM or isinstance(entries, IndexedEntries):
         return entries
-    return IndexedEntries(entries, where)
+    return IndexedEntries(entries)
 
 
 def known_names(entries: Sequence[MemoryEntry]) -> frozenset[str]:

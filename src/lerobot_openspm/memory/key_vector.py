@@ -21,8 +21,6 @@ from lerobot_openspm.types import Reference, SubTask
 Vectors = NDArray[np.float32]
 
 DIMENSIONS = 64
-# Counts up whenever other vectors come out for the same key: kept ones are then computed again.
-SCHEME = 1
 
 # How much the elements of a sub-task count. Another operation, target or landmark is another task; the
 # reference tells apart only objects of one name.

@@ -19,20 +19,11 @@ from lerobot_openspm.types import SubTask
 MIN_SEMANTIC = 0.75
 # Entries about different things whose scores lie this close together leave open which is meant.
 MARGIN = 0.05
+# The paper's lambda_s, lambda_g and lambda_r. Only entries that mean the same are compared, so scene and
+# quality weigh alike; what is meant weighs most.
+LAMBDAS = (1.0, 0.5, 0.5)
 # An error names at most this many known instructions.
 MAX_NAMED = 20
-
-
-@dataclass(frozen=True)
-class ScoreWeights:
-    """The paper's lambda_s, lambda_g and lambda_r.
-
-    Only entries that mean the same are compared, so scene and quality weigh alike; what is meant weighs most.
-    """
-
-    semantic: float = 1.0
-    geometric: float = 0.5
-    quality: float = 0.5
 
 
 @dataclass(frozen=True)
@@ -166,7 +157,6 @@ def _shortened(languages: list[str]) -> list[str]:
 def retrieve(
     candidates: Sequence[tuple[MemoryEntry, float]],
     geometric: Callable[[MemoryEntry], float],
-    weights: ScoreWeights,
     names: NameSimilarity = TABLE_NAMES,
 ) -> list[Scored]:
     """Rank entries, best first: those that are meant, of these the usable ones, then by the paper's score.
@@ -179,13 +169,13 @@ def retrieve(
         candidates: Entries with their semantic score.
         geometric: ``S_geo`` in 0..1 of an entry in the present scene; 0 if it cannot be executed there,
             because an object was not found or its key poses, carried over, fail the checks.
-        weights: The three lambdas.
         names: Says which names mean the same thing.
     """
+    lambda_s, lambda_g, lambda_r = LAMBDAS
     ranked: list[Scored] = []
     for entry, semantic in candidates:
         geometry = geometric(entry)
-        total = weights.semantic * semantic + weights.geometric * geometry + weights.quality * entry.quality
+        total = lambda_s * semantic + lambda_g * geometry + lambda_r * entry.quality
         ranked.append(Scored(entry, semantic, geometry, entry.quality, total))
     most = max((scored.semantic for scored in ranked), default=0.0)
     meant = {scored.entry.key.sub_tasks for scored in ranked if scored.semantic == most}

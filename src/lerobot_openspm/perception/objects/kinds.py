@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Collection, Sequence
 from dataclasses import replace
-from typing import get_args
 
 from numpy.random import Generator
 
@@ -17,7 +16,6 @@ from lerobot_openspm.types import Scene, Segmenter, Shape
 
 # In the order in which they are asked to learn: each gets the objects that those before it left.
 KINDS = {kind.name: kind for kind in (PATCHES, SHAPE, BOX)}
-SHAPES: tuple[Shape, ...] = get_args(Shape)
 
 
 def learn_objects(
