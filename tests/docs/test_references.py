@@ -28,7 +28,7 @@ def text_of(page: Path) -> str:
 
 def found(cited: str) -> Path | None:
     """The file that a page cites, from the repository's root or from the package."""
-    return next((root / cited for root in (REPOSITORY, PACKAGE) if (root / cited).exists()), None)
+    return next((root / cited for root in FOLDERS if (root / cited).exists()), None)
 
 
 def defined(file: Path) -> set[str]:
