@@ -15,9 +15,8 @@ CITED = re.compile(r"`([\w/]+\.py)`: ((?:`[\w.]+`(?:, | and )?)+)")
 # "caller ==>|"function: Type<br>function: Type"| callee"
 ARROW = re.compile(r'^  (\w+) (?:-\.->|==>)\|"(.*)"\| (\w+)$', re.M)
 PATH = re.compile(r"[\w/.]+/[\w.]*")
-ROOTS = {path.name for root in (REPOSITORY, PACKAGE) for path in root.iterdir() if path.is_dir()} - {
-    "outputs"
-}
+FOLDERS = (REPOSITORY, PACKAGE)
+ROOTS = {path.name for folder in FOLDERS for path in folder.iterdir() if path.is_dir()} - {"outputs"}
 PICTURE = REPOSITORY / "docs" / "architecture.md"
 
 
