@@ -13,7 +13,6 @@ STATES ?= 50
 TASKS ?= 0-9
 SUITE ?= tabletop
 PYTEST_ARGS ?=
-RESULT ?=
 FIGURES ?=
 # The tests of a file share what they make, so a file stays in one process; each has one of two cores.
 TWO_PROCESSES := -n 2 --dist loadfile
@@ -34,9 +33,8 @@ setup: ## make .venv with Python 3.12 or 3.13 (PYTHON=... chooses one) and insta
 egl: setup
 	@$(BIN)/python scripts/check_egl.py
 
-demo: egl ## collect DEMOS demonstrations, train, evaluate EPISODES episodes; RESULT=FILE keeps the last line
-	@$(BIN)/openspm demo --demos=$(DEMOS) --episodes=$(EPISODES) --started_at=$(STARTED_AT) \
-		$(if $(RESULT),--result=$(RESULT))
+demo: egl ## collect DEMOS demonstrations, train, evaluate EPISODES episodes
+	@$(BIN)/openspm demo --demos=$(DEMOS) --episodes=$(EPISODES) --started_at=$(STARTED_AT)
 
 figures: egl ## take the published figures (FIGURES="NAME ..." some of them) that are missing or stale, on LIBERO too if it is installed: hours
 	@$(BIN)/python -m benchmarks.figures $(FIGURES)

@@ -4,28 +4,25 @@
 libero`, recorded if need be. Ten episodes are the k-th of each task, for several k.
 """
 
-import argparse
 import json
 import math
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
-from benchmarks.common import DEMOS, write
-from lerobot.datasets import LeRobotDatasetMetadata
 
+from benchmarks.results import run, write
+from benchmarks.stages import EnvironmentOption, dataset
 from lerobot_openspm.calibration.estimate import estimate_camera
 from lerobot_openspm.calibration.tracks import track_features
-from lerobot_openspm.cli.bench import DEFAULTS
 from lerobot_openspm.cli.calibrate import errors
-from lerobot_openspm.cli.pipeline import collect_dataset
 from lerobot_openspm.configuration_openspm import OpenSPMConfig
 from lerobot_openspm.errors import CalibrationError
 from lerobot_openspm.geometry.camera import Camera, load_cameras
-from lerobot_openspm.mining.dataset import Demonstrations
+from lerobot_openspm.mining.dataset import Demonstrations, dataset_metadata
 from lerobot_openspm.mining.signals import Episode
 from lerobot_openspm.training import open_demonstrations
 
@@ -42,25 +39,32 @@ class Source:
     cameras: dict[str, Camera]
 
 
-def main(simulator: str) -> dict[str, Any]:
+@dataclass
+class CalibrationConfig:
+    """Whose cameras to estimate; of all tasks."""
+
+    env: EnvironmentOption = field(default_factory=EnvironmentOption)
+
+
+def main(config: CalibrationConfig) -> dict[str, Any]:
     """Measure, write and return the result."""
-    root = Path(DEFAULTS[simulator][0]) / "dataset"
-    collect_dataset(root, DEMOS, simulator)
+    root = dataset(config.env.type)
     cv2.setNumThreads(1)
-    source = read(root, OpenSPMConfig(device="cpu", push_to_hub=False, state_rotation="axis_angle"))
-    name, suffix = ("tabletop", "") if simulator == "openspm_tabletop" else (simulator, f"_{simulator}")
-    rows = {}
+    source = read(root, OpenSPMConfig(device="cpu", push_to_hub=False, rotation="axis_angle"))
+    name, rows = config.env.type.removeprefix("openspm_"), {}
     for key, truth in source.cameras.items():
-        runs = [run for k in range(CHOICES) for run in estimate(source, key, truth, k)]
+        runs = [one for k in range(CHOICES) for one in estimate(source, key, truth, k)]
         rows[f"{name} {key.rsplit('.', 1)[1]}"] = {
-            "field of view given": summary([run for run in runs if run["fov_given"]]),
-            "field of view estimated": summary([run for run in runs if not run["fov_given"]]),
+            "field of view given": summary([one for one in runs if one["fov_given"]]),
+            "field of view estimated": summary([one for one in runs if not one["fov_given"]]),
         }
-    return write(f"calibration{suffix}", {"seed": 0, "n": CHOICES, "episodes": 10, "cameras": rows})
+    return write(
+        f"calibration{config.env.suffix}", {"seed": 0, "n": CHOICES, "episodes": 10, "cameras": rows}
+    )
 
 
 def read(folder: Path, config: OpenSPMConfig) -> Source:
-    demonstrations = open_demonstrations(LeRobotDatasetMetadata("local/calibration", root=folder), config)
+    demonstrations = open_demonstrations(dataset_metadata("local/calibration", str(folder)), config)
     return Source(
         demonstrations, demonstrations.episodes(), load_cameras(folder / "meta" / "openspm_cameras.json")
     )
@@ -81,9 +85,9 @@ def estimate(source: Source, key: str, truth: Camera, k: int) -> list[dict]:
     runs = []
     for fov_deg in (math.degrees(2 * math.atan(truth.height / 2 / truth.fy)), None):
         start_s = time.monotonic()
-        run: dict[str, Any] = {"k": k, "fov_given": fov_deg is not None, "refused": None}
+        found: dict[str, Any] = {"k": k, "fov_given": fov_deg is not None, "refused": None}
         try:
-            found = estimate_camera(
+            estimated = estimate_camera(
                 tracks,
                 [episode.T_world_ee for episode in episodes],
                 width=truth.width,
@@ -93,16 +97,16 @@ def estimate(source: Source, key: str, truth: Camera, k: int) -> list[dict]:
                 mirrored=None,
                 rng=np.random.default_rng(0),
             )
-            run |= errors(found.camera, truth)
-            run["position_sd_mm"] = round(1e3 * found.position_sd_m, 2)
-            run["focal_percent"] = round(100 * (found.camera.fy / truth.fy - 1), 3)
-            run["mirrored_right"] = found.camera.fx * truth.fx > 0
-            run["reprojection_px"] = round(found.reprojection_px, 3)
+            found |= errors(estimated.camera, truth)
+            found["position_sd_mm"] = round(1e3 * estimated.position_sd_m, 2)
+            found["focal_percent"] = round(100 * (estimated.camera.fy / truth.fy - 1), 3)
+            found["mirrored_right"] = estimated.camera.fx * truth.fx > 0
+            found["reprojection_px"] = round(estimated.reprojection_px, 3)
         except CalibrationError as error:
-            run["refused"] = str(error)
-        run["seconds"] = round(tracking_s + time.monotonic() - start_s, 1)
-        print(key, json.dumps(run), flush=True)
-        runs.append(run)
+            found["refused"] = str(error)
+        found["seconds"] = round(tracking_s + time.monotonic() - start_s, 1)
+        print(key, json.dumps(found), flush=True)
+        runs.append(found)
     return runs
 
 
@@ -124,6 +128,4 @@ def summary(runs: list[dict]) -> dict:
 
 
 if __name__ == "__main__":
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--env.type", dest="simulator", choices=list(DEFAULTS), default="openspm_tabletop")
-    print(json.dumps(main(parser.parse_args().simulator)))
+    run(CalibrationConfig, main)

@@ -10,30 +10,36 @@ Those on LIBERO are left out of all where it is not installed. A figure `NAME` i
 from __future__ import annotations
 
 import argparse
-import importlib.util
 import json
 import logging
 import shlex
 import subprocess
 import sys
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
+from benchmarks.results import MEASURED_CODE, code_version
 from benchmarks.staleness import origin
-
-from lerobot_openspm.bench.results import MEASURED_CODE, code_version
 from lerobot_openspm.cli.pipeline import LIBERO_ASSETS, RECORDED_BY
+from lerobot_openspm.envs.suites import has_libero
 from lerobot_openspm.errors import OpenSPMError
 
 logger = logging.getLogger(__name__)
 
 PACKAGE = "src/lerobot_openspm"
+
+
+def _package(*names: str) -> tuple[str, ...]:
+    return tuple(f"{PACKAGE}/{name}" for name in names)
+
+
+def _benchmarks(*names: str) -> tuple[str, ...]:
+    return tuple(f"benchmarks/{name}.py" for name in names)
+
+
 # What a policy does with its default options. Backends that need a download are not part of any figure.
 POLICY = (
-    *(
-        f"{PACKAGE}/{room}"
-        for room in ("control", "flow", "geometry", "language", "memory", "mining", "perception")
-    ),
+    *_package("control", "flow", "geometry", "language", "memory", "mining", "perception"),
     f":(glob){PACKAGE}/*.py",
     f":(exclude){PACKAGE}/search.py",
     f":(exclude){PACKAGE}/perception/objects/sam3d",
@@ -44,65 +50,45 @@ RECORDING = {
     simulator: tuple(f":(glob){PACKAGE}/{pattern}" for pattern in patterns)
     for simulator, patterns in RECORDED_BY.items()
 }
+RECORDING["libero"] = (*RECORDING["libero"], str(LIBERO_ASSETS))
 TABLETOP = (
     *POLICY,
     *RECORDING["openspm_tabletop"],
-    *(f"{PACKAGE}/cli/{name}.py" for name in ("pipeline", "demo")),
+    *_package("cli/options.py", "cli/pipeline.py"),
+    *_benchmarks("stages"),
     "configs/openspm_tabletop_train.yaml",
     "configs/cameras/openspm_tabletop.json",
 )
+EPISODES = _benchmarks("episodes", "harness", "worlds")
 LIBERO = (
     *POLICY,
     *RECORDING["libero"],
-    str(LIBERO_ASSETS),
-    f"{PACKAGE}/cli/pipeline.py",
-    *(f"{PACKAGE}/bench/{name}.py" for name in ("episode", "libero")),
+    *EPISODES,
+    *_package("cli/options.py", "cli/pipeline.py"),
+    *_benchmarks("stages", "libero/evaluate"),
     "configs/openspm_libero_train.yaml",
     "configs/cameras/libero.json",
-    "benchmarks/common.py",
-    "benchmarks/libero/episode.py",
-    "benchmarks/libero/evaluate.py",
-    "benchmarks/libero/stages.py",
 )
-TRACKING = (
-    f"{PACKAGE}/cli/bench.py",
-    *(f"{PACKAGE}/bench/{name}.py" for name in ("tracking", "tabletop", "episode")),
-)
-ALONG = (
-    f"{PACKAGE}/cli/bench.py",
-    *(
-        f"{PACKAGE}/bench/{name}.py"
-        for name in ("perception", "truth", "object_frames", "episode", "tabletop")
-    ),
-)
+DISTURBED = (*TABLETOP, *EPISODES, *_benchmarks("disturbances", "tracking"))
+ALONG = (*EPISODES, *_benchmarks("perception", "truth"), *_package("bench"))
 KEY_POSES = (
-    *(f"{PACKAGE}/{room}" for room in ("geometry", "mining")),
-    f"{PACKAGE}/types.py",
-    f"{PACKAGE}/memory/robot.py",
-    f"{PACKAGE}/envs/unsteady.py",
-    *(
-        f"{PACKAGE}/bench/{name}.py"
-        for name in ("key_poses", "recording", "contact_events", "contact_sensor")
-    ),
+    *_package("geometry", "mining", "types.py", "memory/robot.py", "envs/unsteady.py"),
+    *_benchmarks("key_poses", "recording", "contact_events", "contact_sensor", "harness", "stages"),
 )
 LANGUAGE = (
-    *(f"{PACKAGE}/{room}" for room in ("control", "geometry", "language", "memory", "mining")),
-    f"{PACKAGE}/types.py",
-    f"{PACKAGE}/bench/language.py",
-    f"{PACKAGE}/bench/taught_words.py",
-    f"{PACKAGE}/bench/instructions",
+    *_package("control", "geometry", "language", "memory", "mining", "types.py"),
+    *_benchmarks("language", "taught_words"),
+    "benchmarks/instructions",
 )
-ACCURACY = ("benchmarks/libero/accuracy.py", f"{PACKAGE}/bench/object_frames.py")
+MEMORY = (*_package("geometry", "language", "memory", "types.py"), *_benchmarks("memory", "synthetic"))
 CALIBRATION = (
-    *(f"{PACKAGE}/{room}" for room in ("calibration", "geometry")),
-    f"{PACKAGE}/types.py",
-    *(f"{PACKAGE}/mining/{name}.py" for name in ("columns", "dataset", "signals")),
-    f"{PACKAGE}/memory/robot.py",
-    *(f"{PACKAGE}/cli/{name}.py" for name in ("calibrate", "pipeline")),
-    *(f"benchmarks/{name}.py" for name in ("calibration", "common")),
+    *_package(
+        "calibration", "geometry", "types.py", "memory/robot.py", "cli/calibrate.py", "cli/pipeline.py"
+    ),
+    *_package(*(f"mining/{name}.py" for name in ("columns", "dataset", "signals"))),
+    *_benchmarks("calibration", "stages"),
 )
-NOISE = "benchmarks.measurement_noise"
-NOISE_PATHS = ("benchmarks/measurement_noise.py", "benchmarks/common.py")
+NOISE = (*ALONG, *_benchmarks("measurement_noise"))
 # As `make libero` types it.
 LIBERO_GOAL = "--demos=10 --states=50 --tasks=0-9"
 NEW_TASKS = (
@@ -120,87 +106,69 @@ class Figure:
     Attributes:
         command: The command line, from the root of the checkout; what it wrote says with what it was run.
         paths: Git's names (pathspecs) of the code whose change makes the figure stale.
-        simulator: The one whose default checkpoint it measures; "" if it makes its own.
     """
 
     command: str
     paths: tuple[str, ...]
-    simulator: str = ""
 
 
-def _bench(what: str, name: str, paths: tuple[str, ...], options: str = "", simulator: str = "") -> Figure:
-    options = f" {options}" if options else ""
-    command = f"openspm bench {what}{options} --result=benchmarks/results/{name}.json"
-    return Figure(command, paths, simulator)
+def _figure(module: str, paths: tuple[str, ...], options: str = "") -> Figure:
+    return Figure(f"python -m benchmarks.{module} {options}".strip(), paths)
 
 
-def _tabletop(comparison: str) -> Figure:
-    own = ("benchmarks/tabletop.py", "benchmarks/common.py")
-    return Figure(f"python -m benchmarks.tabletop {comparison}", (*TABLETOP, *own))
+def _libero(module: str, *own: str, options: str = "") -> Figure:
+    return _figure(f"libero.{module}", (*LIBERO, *_benchmarks(f"libero/{module}", *own)), options)
 
 
-def _libero(script: str, *own: str, options: str = "") -> Figure:
-    module = f"benchmarks/libero/{script}.py"
-    return Figure(f"python -m benchmarks.libero.{script} {options}".strip(), (*LIBERO, module, *own))
+def _with(figure: Figure, *paths: str) -> Figure:
+    return replace(figure, paths=(*figure.paths, *paths))
 
 
+COMPARISONS = ("tabletop", "execution", "oracle", "conditioning", "compound", "two_bowls")
+ON_LIBERO = "--env.type=libero"
 FIGURES: dict[str, Figure] = {
-    "tabletop": Figure(
-        "openspm demo --demos=10 --episodes=20 --result=benchmarks/results/tabletop.json", TABLETOP
-    ),
-    **{name: _tabletop(name) for name in ("execution", "oracle", "conditioning", "compound", "two_bowls")},
-    "perception_tabletop": _bench(
-        "perception", "perception_tabletop", (*TABLETOP, *ALONG), simulator="openspm_tabletop"
-    ),
     **{
-        name: _bench(name, name, (*TABLETOP, *own, *TRACKING), simulator="openspm_tabletop")
-        for name, own in {"tracking": (), "cameras": (), "teach": (f"{PACKAGE}/bench/teach.py",)}.items()
+        name: _figure(
+            "tabletop",
+            (*TABLETOP, *_benchmarks("tabletop")),
+            f"--comparison={name}",
+        )
+        for name in COMPARISONS
     },
-    "keyposes_tabletop": _bench(
-        "keyposes", "keyposes_tabletop", (*KEY_POSES, *RECORDING["openspm_tabletop"]),
-        "--env.type=openspm_tabletop --seed=30000",
-    ),
-    "language": _bench("language", "language", LANGUAGE),
-    "memory": _bench(
-        "memory", "memory",
-        (f"{PACKAGE}/memory", f"{PACKAGE}/language", f"{PACKAGE}/geometry", f"{PACKAGE}/types.py",
-         f":(glob){PACKAGE}/bench/synthetic_*.py", f"{PACKAGE}/bench/memory.py"),
-    ),
-    "measurement_noise": Figure(f"python -m {NOISE}", (*TABLETOP, *ALONG, *NOISE_PATHS), "openspm_tabletop"),
-    "measurement_noise_libero": Figure(
-        f"python -m {NOISE} --env.type=libero", (*LIBERO, *ALONG, *NOISE_PATHS), "libero"
-    ),
-    "libero_goal": _libero("run", *ACCURACY, options=LIBERO_GOAL),
-    "libero_accuracy": _libero("run", *ACCURACY, options=LIBERO_GOAL),
+    "perception_tabletop": _figure("perception", (*TABLETOP, *ALONG)),
+    "tracking": _figure("tracking", DISTURBED, "--figure=tracking"),
+    "cameras": _figure("tracking", DISTURBED, "--figure=cameras"),
+    "teach": _figure("teach", (*TABLETOP, *EPISODES, *_benchmarks("teach"))),
+    "keyposes_tabletop": _figure("key_poses", (*KEY_POSES, *RECORDING["openspm_tabletop"])),
+    "language": _figure("language", LANGUAGE),
+    "memory": _figure("memory", MEMORY),
+    "measurement_noise": _figure("measurement_noise", (*TABLETOP, *NOISE)),
+    "measurement_noise_libero": _figure("measurement_noise", (*LIBERO, *NOISE), ON_LIBERO),
+    "libero_goal": _libero("run", "libero/accuracy", "truth", options=LIBERO_GOAL),
+    "libero_accuracy": _libero("run", "libero/accuracy", "truth", options=LIBERO_GOAL),
     "libero_few_shot_3": _libero("few_shot", options="--demos=3"),
     "libero_few_shot_1": _libero("few_shot", options="--demos=1 --states=10"),
-    "libero_ablations": _libero(
-        "ablations", "benchmarks/libero/geometric_guess.py", f"{PACKAGE}/mining/phase_labels"
+    "libero_ablations": _with(
+        _libero("ablations", "libero/geometric_guess", "libero/guessed_key_poses"),
+        f"{PACKAGE}/mining/phase_labels",
     ),
-    **{f"libero_new_task_{task}_3": _libero("new_task", options=f"--task={task}") for task in NEW_TASKS},
+    **{
+        f"libero_new_task_{task}_3": _libero("new_task", "teach", options=f"--task={task}")
+        for task in NEW_TASKS
+    },
     "libero_losses": _libero("losses"),
-    "libero_latency": _libero("latency"),
+    "libero_latency": _with(_libero("latency"), f"{PACKAGE}/bench"),
     "libero_equality": _libero("equality"),
-    "perception_libero": _bench(
-        "perception", "perception_libero", (*LIBERO, *ALONG), "--env.type=libero", "libero"
-    ),
-    "keyposes_libero": _bench(
-        "keyposes", "keyposes_libero", (*KEY_POSES, *RECORDING["libero"], str(LIBERO_ASSETS)),
-        "--env.type=libero --seed=30000",
-    ),
-    "calibration": Figure(
-        "python -m benchmarks.calibration", (*CALIBRATION, *RECORDING["openspm_tabletop"])
-    ),
-    "calibration_libero": Figure(
-        "python -m benchmarks.calibration --env.type=libero",
-        (*CALIBRATION, *RECORDING["libero"], str(LIBERO_ASSETS)),
-    ),
-}  # fmt: skip
+    "perception_libero": _figure("perception", (*LIBERO, *ALONG), ON_LIBERO),
+    "keyposes_libero": _figure("key_poses", (*KEY_POSES, *RECORDING["libero"]), ON_LIBERO),
+    "calibration": _figure("calibration", (*CALIBRATION, *RECORDING["openspm_tabletop"])),
+    "calibration_libero": _figure("calibration", (*CALIBRATION, *RECORDING["libero"]), ON_LIBERO),
+}
 
 
 def takeable() -> list[str]:
     """All figures, but for those on LIBERO where that is not installed; which these are is told."""
-    if importlib.util.find_spec("libero") is not None:
+    if has_libero():
         return list(FIGURES)
     left_out = [name for name, figure in FIGURES.items() if needs_libero(figure)]
     logger.warning("LIBERO is not installed; run: make libero-setup. Left out: %s", ", ".join(left_out))
@@ -213,10 +181,7 @@ def needs_libero(figure: Figure) -> bool:
 
 
 def take(name: str) -> None:
-    """Run a figure's command, unless its result is current. One that fails leaves the others to be taken.
-
-    The default checkpoint that it measures is made first, unless there is one by the present code.
-    """
+    """Run a figure's command, unless its result is current. One that fails leaves the others to be taken."""
     figure = FIGURES[name]
     problem = origin(name, figure.paths, expected_command=figure.command).problem
     if problem is None:
@@ -224,24 +189,10 @@ def take(name: str) -> None:
         return
     logger.info("%s (%s): %s", name, problem, figure.command)
     try:
-        if figure.simulator:
-            make_checkpoint(figure.simulator)
         program, *arguments = shlex.split(figure.command)
         subprocess.run([str(Path(sys.executable).with_name(program)), *arguments], check=True)
-    except (subprocess.CalledProcessError, OpenSPMError, OSError, RuntimeError, ImportError) as error:
+    except (subprocess.CalledProcessError, OSError) as error:
         logger.error("%s failed: %s", name, error)
-
-
-def make_checkpoint(simulator: str) -> None:
-    """Record and train as `make demo` and `make libero` do, unless that is done."""
-    if simulator == "libero":
-        from benchmarks.libero.stages import dataset, policy
-
-        policy(dataset(), "train")
-    else:
-        from benchmarks import common
-
-        common.policy()
 
 
 def main(names: list[str]) -> dict[str, str]:

@@ -23,7 +23,6 @@ from __future__ import annotations
 
 import json
 import logging
-import os
 import sys
 import time
 from collections.abc import Callable, Sequence
@@ -33,12 +32,13 @@ from typing import Any
 
 import draccus
 import numpy as np
-from benchmarks.libero import evaluate as harness
-from benchmarks.libero import stages
 from scipy.optimize import brentq
 from scipy.stats import binom
 
+from benchmarks import stages
+from benchmarks.libero import evaluate as harness
 from lerobot_openspm.cli import pipeline
+from lerobot_openspm.cli.pipeline import Episode
 from lerobot_openspm.envs.seeds import TUNING_SEED_START
 
 FALSE_ALARM, POWER = 0.1, 0.9
@@ -71,17 +71,6 @@ STANDARDS = {
     "tabletop": Standard(expected=0.983, demos=10, episodes=8, seed=TUNING_SEED_START + 800_000),
     "libero": Standard(expected=0.966, demos=1, episodes=2, seed=TUNING_SEED_START + 800_100),
 }
-
-
-@dataclass(frozen=True)
-class Run:
-    """One episode; its status is what the policy said of it."""
-
-    task: str
-    seed: int
-    success: bool
-    steps: int
-    status: str
 
 
 @dataclass
@@ -128,31 +117,30 @@ def floors(n_tasks: int, episodes: int, expected: float) -> Floors:
     return Floors(floor(n_tasks * episodes, expected, half), floor(episodes, expected, half / n_tasks))
 
 
-def tabletop(standard: Standard, output: Path) -> list[Run]:
+def tabletop(standard: Standard, output: Path) -> list[Episode]:
     """The tabletop's episodes, by the steps of `openspm demo`."""
     pipeline.collect_dataset(output / "dataset", standard.demos)
     checkpoint, _ = pipeline.train(output / "dataset", output / "train")
-    episodes = pipeline.evaluate(checkpoint, output / "evaluation", standard.episodes, standard.seed)
-    return [Run(e.task, e.seed, e.success, e.steps, e.status) for e in episodes]
+    return pipeline.evaluate(checkpoint, output / "evaluation", standard.episodes, standard.seed)
 
 
-def libero(standard: Standard, output: Path) -> list[Run]:
+def libero(standard: Standard, output: Path) -> list[Episode]:
     """LIBERO-GOAL's episodes, from scenes drawn by the guard's seeds, not the benchmark's initial states."""
     root = output / "dataset"
     pipeline.collect_dataset(root, standard.demos, "libero")
-    checkpoint, _ = stages.policy(root, "train")
+    checkpoint, _ = stages.policy("libero", root=root)
     config = harness.EvaluationConfig(
         str(checkpoint), str(output / "evaluation"),
         episodes=standard.episodes, tuning=True, tuning_seed=standard.seed,
     )  # fmt: skip
     episodes = harness.evaluate(config)
-    return [Run(e["task"], e["seed"], e["success"], e["steps"], harness.reason(e)) for e in episodes]
+    return [Episode(e["task"], e["seed"], e["steps"], e["success"], harness.reason(e)) for e in episodes]
 
 
-SUITES: dict[str, Callable[[Standard, Path], list[Run]]] = {"tabletop": tabletop, "libero": libero}
+SUITES: dict[str, Callable[[Standard, Path], list[Episode]]] = {"tabletop": tabletop, "libero": libero}
 
 
-def verdict(runs: Sequence[Run], standard: Standard) -> tuple[dict[str, Any], list[str]]:
+def verdict(runs: Sequence[Episode], standard: Standard) -> tuple[dict[str, Any], list[str]]:
     """The figures of a set of episodes, and one line for every floor that it is below."""
     tasks = list(dict.fromkeys(run.task for run in runs))
     n, n_task = len(runs), standard.episodes
@@ -179,7 +167,7 @@ def verdict(runs: Sequence[Run], standard: Standard) -> tuple[dict[str, Any], li
     return figures, below
 
 
-def report(runs: Sequence[Run]) -> str:
+def report(runs: Sequence[Episode]) -> str:
     """Successes and mean steps of every task, and a line for each failed episode."""
     lines = []
     for task in dict.fromkeys(run.task for run in runs):
@@ -210,5 +198,4 @@ def main(config: GuardConfig) -> None:
 
 if __name__ == "__main__":
     logging.basicConfig(level=logging.INFO, format="%(levelname)s %(message)s")
-    os.environ.setdefault("MUJOCO_GL", "egl")
-    main(draccus.parse(GuardConfig, args=sys.argv[1:]))
+    main(draccus.parse(GuardConfig))

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import re
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
 
+from benchmarks.results import PROVENANCE
 from benchmarks.staleness import read_result
-
-from lerobot_openspm.bench.results import PROVENANCE
 
 NO_FIGURES = {*PROVENANCE, "interval"}
 
@@ -61,21 +59,12 @@ def chapter(introduction: str, sections: Iterable[str]) -> list[str]:
 
 
 def _origin(result: dict[str, Any]) -> str:
-    machine, command = result["machine"], re.sub(r" --started_at=\S+", "", result["command"])
+    machine, command = result["machine"], result["command"]
     changed = ", with changes that are not in it" if result["dirty"] else ""
     return (
         f"`{command}` on {result['date'][:10]}, commit `{result['commit']}`{changed}; "
         f"{machine['cores']} cores of {machine['cpu']}."
     )
-
-
-def rates(runs: dict[str, Any]) -> str:
-    """Success with its interval, a row each."""
-    rows = [
-        [name.replace("_", " "), percent(run), interval(run), run["n"], run["mean_steps"]]
-        for name, run in runs.items()
-    ]
-    return table(["", "Success", "95 % interval", "Episodes", "Mean steps of successes"], rows)
 
 
 def percent(run: dict[str, Any]) -> str:
@@ -85,11 +74,26 @@ def percent(run: dict[str, Any]) -> str:
 
 def interval(run: dict[str, Any]) -> str:
     """The interval of a success rate; a dash for that of no episodes."""
-    return (
-        "-"
-        if run["interval"] is None
-        else f"{100 * run['interval'][0]:.1f} to {100 * run['interval'][1]:.1f} %"
-    )
+    low, high = (100 * bound for bound in run["interval"] or (0, 0))
+    return "-" if run["interval"] is None else f"{low:.1f} to {high:.1f} %"
+
+
+# A column: its head, and the key of its values or what makes them of a row.
+type Columns = Mapping[str, str | Callable[[dict[str, Any]], Any]]
+SUCCESS: Columns = {"Success": percent, "95 % interval": interval, "Episodes": "n"}
+STEPS: Columns = {**SUCCESS, "Mean steps of successes": "mean_steps"}
+
+
+def grid(rows: Mapping[str, dict[str, Any]], columns: Columns, head: str = "") -> str:
+    """A table in Markdown of named rows; underscores of a name are blanks."""
+    cells = [
+        [
+            name.replace("_", " "),
+            *(row[one] if isinstance(one, str) else one(row) for one in columns.values()),
+        ]
+        for name, row in rows.items()
+    ]
+    return table([head, *columns], cells)
 
 
 def table(heads: list[str], rows: list[list[Any]]) -> str:

@@ -4,36 +4,28 @@
 
 Errors are those of the estimates that the policy gets along episodes from tuning seeds, the hand in the way
 and all. Weights are fitted on all seeds but the last and judged on that, beside those in use. Fitted ones go
-by hand into `perception/tracking/measurement.py`. Takes the options of `openspm bench`; episodes are
-counted per task.
+by hand into `perception/tracking/measurement.py`. Takes the options of `benchmarks.perception` that say what
+is measured; it runs its own number of episodes.
 """
 
 from __future__ import annotations
 
-import json
-import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-import draccus
 import numpy as np
-import torch
-from benchmarks.common import write
-from lerobot.datasets import LeRobotDatasetMetadata
 from scipy.optimize import minimize
 from scipy.stats import chi2
 
-from lerobot_openspm.bench.episode import run_episode
-from lerobot_openspm.bench.object_frames import offset
-from lerobot_openspm.bench.perception import tasks, world
-from lerobot_openspm.bench.truth import Truth, true_period
-from lerobot_openspm.cli.bench import DEFAULTS, BenchConfig
+from benchmarks.episodes import load, run_episode
+from benchmarks.perception import PerceptionConfig
+from benchmarks.results import run, write
+from benchmarks.truth import Truth, offsets, true_period
+from benchmarks.worlds import WORLDS
 from lerobot_openspm.control.controller import EpisodeController
-from lerobot_openspm.envs.gl_backend import set_default_gl_backend
 from lerobot_openspm.envs.seeds import TUNING_SEED_START
 from lerobot_openspm.geometry import se3
-from lerobot_openspm.modeling_openspm import OpenSPMPolicy
 from lerobot_openspm.perception.observation import Observation
 from lerobot_openspm.perception.tracking.measurement import (
     FLOOR_M,
@@ -42,7 +34,6 @@ from lerobot_openspm.perception.tracking.measurement import (
     YAW_WEIGHTS,
     features,
 )
-from lerobot_openspm.training import open_demonstrations
 
 EPISODES = 3
 FIRST_SEED = TUNING_SEED_START + 400_000
@@ -63,52 +54,46 @@ class Sample:
     features: np.ndarray
 
 
-def collect(config: BenchConfig) -> list[Sample]:
+def collect(config: PerceptionConfig) -> list[Sample]:
     """Run the policy on tuning seeds and note every estimate of objects that the hand does not hold."""
-    torch.set_num_threads(1)
-    policy = OpenSPMPolicy.from_pretrained(config.checkpoint)
-    root, repo_id = DEFAULTS[config.env.type]
-    meta = LeRobotDatasetMetadata(
-        config.dataset.repo_id or repo_id, root=config.dataset.root or f"{root}/dataset"
-    )
-    memory, demonstrations = policy.require_memory(), open_demonstrations(meta, policy.config)
-    offsets = {name: offset(memory, name, demonstrations) for name in memory.objects}
-    samples: list[Sample] = []
-    for task in tasks(config.env.type, config.env.task):
+    checkpoint = config.checkpoint()
+    T_sim_obj = offsets(checkpoint, config.demonstrations())
+    policy, samples = load(str(checkpoint)), list[Sample]()
+    periods = policy.require_memory().yaw_periods
+    for task in config.env.tasks():
         for seed in range(FIRST_SEED, FIRST_SEED + EPISODES):
-            with world(config.env.type, task, seed) as scene:
-                truth = Truth(scene.object_poses(), offsets)
+            with WORLDS[config.env.type](task, seed) as world:
+                truth = Truth(world.object_poses(), T_sim_obj)
 
                 def note(
-                    _: int, __: Observation, row: EpisodeController, truth=truth, scene=scene, seed=seed
+                    _: int,
+                    __: Observation,
+                    controller: EpisodeController,
+                    truth=truth,
+                    world=world,
+                    seed=seed,
                 ) -> None:
-                    if row.scene.has_just_looked and row.scene.detections is not None:
-                        true = truth.now(scene.object_poses())
-                        for name, estimate in row.scene.detections.estimates.items():
-                            if (
-                                name in true
-                                and name not in row.scene.tracker.held
-                                and estimate.support is not None
-                            ):
-                                round_ = 0 in (
-                                    true_period(name, config.env.type), memory.yaw_periods[name]
-                                )  # fmt: skip
-                                found = _sample(estimate, true[name], seed, round_, name, config.env.type)
-                                samples.extend(found)
+                    scene = controller.scene
+                    if not scene.has_just_looked:
+                        return
+                    true = truth.now(world.object_poses())
+                    for name, estimate in scene.detections.estimates.items():
+                        if name in true and name not in scene.tracker.held and estimate.support is not None:
+                            period = true_period(name, config.env.type)
+                            is_round = 0 in (period, periods[name])
+                            samples.extend(_sample(estimate, true[name], seed, is_round, period))
 
-                run_episode(policy, scene, note=note)
+                run_episode(policy, world, note=note)
     return samples
 
 
-def _sample(
-    estimate: Any, T_true: np.ndarray, seed: int, is_round: bool, name: str, env_type: str
-) -> list[Sample]:
+def _sample(estimate: Any, T_true: np.ndarray, seed: int, is_round: bool, period: float) -> list[Sample]:
     T = estimate.T_world_obj
     error = T[:2, 3] - T_true[:2, 3]
     if estimate.status != "found" or estimate.confidence < MIN_CONFIDENCE or np.hypot(*error) > MAX_ERROR_M:
         return []
     turn = se3.yaw_of(T) - se3.yaw_of(T_true)
-    yaw = np.nan if is_round else float(se3.wrap_angle(turn, true_period(name, env_type)))
+    yaw = np.nan if is_round else float(se3.wrap_angle(turn, period))
     row = features(estimate, estimate.support)
     return [Sample(estimate.support.kind, seed, error, yaw, estimate.covariance, row)]
 
@@ -168,16 +153,14 @@ def _judged(squared: np.ndarray, dimensions: int) -> dict[str, Any]:
     }
 
 
-def main(options: list[str]) -> dict[str, Any]:
+def main(config: PerceptionConfig) -> dict[str, Any]:
     """Collect, fit, write and return the result."""
-    set_default_gl_backend()
-    config = draccus.parse(config_class=BenchConfig, args=options)
     samples = collect(config)
     kinds = sorted({sample.kind for sample in samples})
     result = {kind: fit([sample for sample in samples if sample.kind == kind]) for kind in kinds}
-    suffix = "" if config.env.type == "openspm_tabletop" else f"_{config.env.type}"
-    return write(f"measurement_noise{suffix}", {"seed": FIRST_SEED, "n": len(samples), "kinds": result})
+    name = f"measurement_noise{config.env.suffix}"
+    return write(name, {"seed": FIRST_SEED, "n": len(samples), "kinds": result})
 
 
 if __name__ == "__main__":
-    print(json.dumps(main(sys.argv[1:])))
+    run(PerceptionConfig, main)

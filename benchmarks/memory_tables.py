@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from benchmarks.markdown import Quoted, chapter, percent, section, table
-
+from benchmarks.markdown import Columns, Quoted, chapter, grid, interval, percent, section, table
 from lerobot_openspm.cli.pipeline import rate
 
 INTRODUCTION = """# Memory and language
@@ -54,27 +53,27 @@ def _language(result: Quoted) -> str:
 
 def _share(share: float, n: int) -> list[Any]:
     one = rate(round(share * n), n)
-    low, high = one["interval"]
-    return [percent(one), f"{100 * low:.1f} to {100 * high:.1f} %", n]
+    return [percent(one), interval(one), n]
 
 
 def _key_poses(result: Quoted) -> str:
-    heads = ["Phase", "F1 within 3 frames", "Mean, mm", "n"]
-    rows = [
-        [name, one["f1_3_frames"], one["position_mm_mean"], one["n"]]
-        for name, one in (*result["phases"].items(), ("all", result))
-    ]
+    columns: Columns = {"F1 within 3 frames": "f1_3_frames", "Mean, mm": "position_mm_mean", "n": "n"}
+    table = grid({**result["phases"], "all": result}, columns, "Phase")
     note = (
-        f"{result['episodes']} episodes of an operator who is {result['operator']}: tremor, pauses, "
-        f"overshoot, fingers closed twice. n counts true events."
+        f"{result['episodes']} episodes of an unsteady operator: tremor, pauses, overshoot, fingers closed "
+        "twice. n counts true events."
     )
-    return f"{table(heads, rows)}\n\n{note}"
+    return f"{table}\n\n{note}"
 
 
 def _teach(result: Quoted) -> str:
     found = result["demonstrations"]
-    rows = [[task.replace("_", " "), *(f"{100 * x:.0f} %" for x in ones)] for task, ones in _tasks(result)]
-    totals = [f"{100 * result[name]:.1f} %" for name in ("success_1_demo", "success_3_demos")]
+    tasks = next(iter(found.values()))["per_task"]
+    rows = [
+        [task.replace("_", " "), *(f"{100 * one['per_task'][task]:.0f} %" for one in found.values())]
+        for task in tasks
+    ]
+    totals = [percent(one) for one in found.values()]
     note = (
         f"Each task is taught to a policy that was trained on the nine others; {result['n']} episodes for "
         f"each number of demonstrations ({', '.join(found)}). The longest lesson took "
@@ -84,16 +83,14 @@ def _teach(result: Quoted) -> str:
     return f"{table(heads, [*rows, ['mean', *totals]])}\n\n{note}"
 
 
-def _tasks(result: Quoted) -> list[tuple[str, list[float]]]:
-    return [(task, list(ones.values())) for task, ones in result["tasks"].items()]
-
-
 def _memory(result: Quoted) -> str:
-    heads = ["Keys", "Median, ms", "99th percentile, ms", "... of the thread's own work", "Recall"]
-    rows = [
-        [name, one["query_ms_p50"], one["query_ms_p99"], one["query_cpu_ms_p99"], one["recall"]]
-        for name, one in ((name, result[name]) for name in ("tasks", "uniform"))
-    ]
+    columns: Columns = {
+        "Median, ms": "query_ms_p50",
+        "99th percentile, ms": "query_ms_p99",
+        "... of the thread's own work": "query_cpu_ms_p99",
+        "Recall": "recall",
+    }
+    keys = grid({name: result[name] for name in ("tasks", "uniform")}, columns, "Keys")
     note = (
         f"{result['entries']:,} different keys of 64 numbers, {result['n']} queries one by one. *Tasks* are "
         "keys made up of things, attributes, relations and operations, asked for with some left out and "
@@ -102,4 +99,4 @@ def _memory(result: Quoted) -> str:
         f"{result['exact_ms_p50']} ms (median). A memory of {result['loaded_entries']:,} entries loads in "
         f"{result['load_s']} s (median of 3)."
     )
-    return f"{table(heads, rows)}\n\n{note}"
+    return f"{keys}\n\n{note}"

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from benchmarks.libero.tables import PAPER_MM
-from benchmarks.markdown import Quoted, chapter, interval, percent, section, table
+from benchmarks.markdown import SUCCESS, Columns, Quoted, chapter, grid, section, table
 
 INTRODUCTION = """# Perception
 
@@ -17,7 +17,20 @@ truly looks the same: of round objects the tilt alone; until it is touched, an o
 taken to stand as demonstrated. Failed episodes count to their end."""
 CALIBRATION = ("calibration", "calibration_libero")
 NOISE = ("measurement_noise", "measurement_noise_libero")
-VARIANTS = {"filtered": "filtered", "unfiltered": "unfiltered", "one_view": "one view"}
+POSES: Columns = {
+    "Poses": "poses",
+    "Unknown": "unknown",
+    "Mean, mm": "position_mm_mean",
+    "95th percentile, mm": "position_mm_p95",
+    "Orientation, degrees": "orientation_deg_mean",
+}
+ERRORS: Columns = {
+    "Mean, mm": "position_mm_mean",
+    "Largest, mm": "position_mm_max",
+    "Mean, degrees": "rotation_deg_mean",
+    "Largest, degrees": "rotation_deg_max",
+    "Within 5 mm, 0.5 degrees": "within",
+}
 
 
 def perception_sections() -> list[str]:
@@ -36,27 +49,18 @@ def perception_sections() -> list[str]:
 
 
 def _along_libero(result: Quoted) -> str:
-    return _along(result, PAPER_MM)
+    """The same with the paper's errors by task."""
+    tasks = zip(result["tasks"].items(), PAPER_MM, strict=True)
+    return _along(result, {name: {**one, "paper": mm} for (name, one), mm in tasks}, {"Paper, mm": "paper"})
 
 
-def _along(result: Quoted, paper: tuple[float, ...] | None = None) -> str:
-    heads = ["Poses", "Unknown", "Mean, mm", "95th percentile, mm", "Orientation, degrees"]
-    rows = [[VARIANTS[name], *_row(one)] for name, one in result["variants"].items()]
-    rows += [
-        ["filtered, at the start", *_row(result["start"])],
-        ["filtered, in the hand", *_row(result["held"])],
-    ]
-    tasks = [[name.replace("_", " "), *_row(one)] for name, one in result["tasks"].items()]
-    objects = [[name, *_row(one)] for name, one in result["objects"].items()]
-    extra = []
-    if paper is not None:
-        tasks = [[*task, mm] for task, mm in zip(tasks, paper, strict=True)]
-        extra = ["Paper, mm"]
+def _along(result: Quoted, tasks: dict[str, Any] | None = None, more: Columns | None = None) -> str:
+    parts = {"filtered, at the start": result["start"], "filtered, in the hand": result["held"]}
     return "\n\n".join(
         [
-            table(["", *heads], rows),
-            table(["Task", *heads, *extra], tasks),
-            table(["Object", *heads], objects),
+            grid({**result["variants"], **parts}, POSES),
+            grid(tasks or result["tasks"], {**POSES, **(more or {})}, "Task"),
+            grid(result["objects"], POSES, "Object"),
             _cost(result),
         ]
     )
@@ -72,11 +76,6 @@ def _cost(result: Quoted) -> str:
         f"{followed['median']:.1f} ms ({followed['p99']:.1f}) when they are followed; a step of the filter "
         f"takes {one['median']:.0f} us for one object and {twenty['median']:.0f} us for twenty; one thread."
     )
-
-
-def _row(one: dict[str, Any]) -> list[Any]:
-    names = ("poses", "unknown", "position_mm_mean", "position_mm_p95", "orientation_deg_mean")
-    return [one[name] for name in names]
 
 
 def _noise(results: list[Quoted]) -> str:
@@ -101,39 +100,18 @@ def _noise(results: list[Quoted]) -> str:
 
 
 def _disturbed(result: Quoted) -> str:
-    rows = [
-        [name.replace("_", " "), percent(one), interval(one), one["n"]]
-        for name, one in result["conditions"].items()
-    ]
-    return table(["", "Success", "95 % interval", "Episodes"], rows)
+    return grid(result["conditions"], SUCCESS)
 
 
 def _calibration(results: list[Quoted]) -> str:
-    rows = [
-        [
-            camera,
-            way,
-            one["position_mm_mean"],
-            one["position_mm_max"],
-            one["rotation_deg_mean"],
-            one["rotation_deg_max"],
-            one["within"],
-        ]
+    rows = {
+        f"{camera}, {way}": one
         for result in results
         for camera, ways in result["cameras"].items()
         for way, one in ways.items()
-    ]
-    heads = [
-        "Camera",
-        "",
-        "Mean, mm",
-        "Largest, mm",
-        "Mean, degrees",
-        "Largest, degrees",
-        "Within 5 mm, 0.5 degrees",
-    ]
+    }
     note = (
         f"From {results[0]['episodes']} episodes, one of each task, {results[0]['n']} choices of them. See "
         "[calibration.md](calibration.md)."
     )
-    return f"{table(heads, rows)}\n\n{note}"
+    return f"{grid(rows, ERRORS, 'Camera')}\n\n{note}"

@@ -10,7 +10,6 @@ recording, whatever the policy does, so one wrong action does not hide the next.
 from __future__ import annotations
 
 import json
-import os
 import sys
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -126,7 +125,8 @@ def _run_one(policy: OpenSPMPolicy, world: Any, interfere: Any) -> dict[str, Any
 
 def _tabletop_worlds() -> Iterator[tuple[str, Any, Any]]:
     """Every task once, the tasks that grasp once more with the object moved or dropped on the way."""
-    from lerobot_openspm.bench.tabletop import GRASPED, Disturbance, TabletopWorld
+    from benchmarks.disturbances import GRASPED, Disturbance
+    from benchmarks.worlds import TabletopWorld
     from lerobot_openspm.envs.tabletop.env import TabletopEnv
     from lerobot_openspm.envs.tabletop.tasks import TASK_NAMES
 
@@ -142,16 +142,15 @@ def _tabletop_worlds() -> Iterator[tuple[str, Any, Any]]:
 
 def _libero_worlds() -> Iterator[tuple[str, Any, Any]]:
     """Every task of LIBERO-GOAL once."""
-    from lerobot_openspm.bench.libero import IMAGE_SIZE, LiberoWorld
+    from benchmarks.worlds import LIBERO_IMAGE_SIZE, LiberoWorld
     from lerobot_openspm.envs.libero.simulator import LiberoSimulator, tasks
 
     for number, task in enumerate(tasks()):
-        simulator = LiberoSimulator(task, IMAGE_SIZE)
+        simulator = LiberoSimulator(task, LIBERO_IMAGE_SIZE)
         simulator.reset(SEED + number)
         yield task, LiberoWorld(simulator), None
         simulator.close()
 
 
 if __name__ == "__main__":
-    os.environ.setdefault("MUJOCO_GL", "egl")
-    sys.exit(main(draccus.parse(ReplayConfig, args=sys.argv[1:])) > 0)
+    sys.exit(main(draccus.parse(ReplayConfig)) > 0)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import ast
 import functools
-import importlib.util
 import json
 import re
 import shlex
@@ -16,7 +15,8 @@ from typing import Any
 
 import yaml
 
-ROOT = Path(__file__).parents[1]
+from benchmarks.results import ROOT
+
 # A quoted figure is marked where it stands: the result's name and the key in it.
 MARK = re.compile(r"<!-- figure: (\w+)\.(\w+) -->")
 
@@ -99,25 +99,15 @@ def origin(
 
 
 def _options(command: str) -> set[str]:
-    """The words of a command line, but for those that change no figure."""
-    return {word for word in shlex.split(command) if not word.startswith(("--result=", "--started_at="))}
+    """The words of a command line; their order changes no figure."""
+    return set(shlex.split(command))
 
 
 def _is_there(command: str, root: Path) -> bool:
-    """Whether the script, module or subcommand of a command line still exists."""
+    """Whether the module of a command line still exists."""
     match shlex.split(command):
         case ["python", "-m", module, *_]:
             return (root / f"{module.replace('.', '/')}.py").is_file()
-        case ["openspm", "bench", what, *_]:
-            from lerobot_openspm.cli.bench import MEASURES, ON_THEIR_OWN
-
-            return what in MEASURES or (
-                what in ON_THEIR_OWN and importlib.util.find_spec(ON_THEIR_OWN[what]) is not None
-            )
-        case ["openspm", what, *_]:
-            from lerobot_openspm.cli.main import COMMANDS
-
-            return what in COMMANDS
         case _:
             return False
 

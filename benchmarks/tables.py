@@ -12,7 +12,7 @@ from typing import Any
 
 from benchmarks.figures import FIGURES
 from benchmarks.libero.tables import libero_sections
-from benchmarks.markdown import Quoted, chapter, interval, percent, quoted, rates, section, table
+from benchmarks.markdown import STEPS, Quoted, chapter, grid, interval, percent, quoted, section, table
 from benchmarks.memory_tables import memory_sections
 from benchmarks.perception_tables import perception_sections
 from benchmarks.staleness import ROOT, origin, read_result
@@ -62,7 +62,7 @@ def tabletop_sections() -> list[str]:
     """Success rates on the tabletop."""
     parts = "Instructions of which only the parts were demonstrated, from pixels"
     return [
-        section("`make demo`, from pixels", "tabletop", _demo),
+        section("The ten tasks, from pixels", "tabletop", _demo),
         section("How key poses are followed, from pixels", "execution", _execution),
         section("Object poses from the simulator (oracle)", "oracle", _with_tasks),
         section("What the flow model is told, from pixels", "conditioning", _with_tasks),
@@ -127,28 +127,28 @@ def _in_s(seconds: float | None, result: Quoted) -> str:
 
 
 def _demo(result: Quoted) -> str:
-    set_up = "set-up, " if "--started_at=" in result["command"] else ""  # as `make demo` starts it
     seconds = {
         "mining and training": result["train_s"],
-        f"with {set_up}recording and evaluating": result["total_s"],
+        "with recording and evaluating": result["total_s"],
     }
     told = ", ".join(f"{what} {s:.0f} s" for what, s in seconds.items() if s is not None)
-    return f"{rates({'all ten tasks': result})}\n\n{told.capitalize()}.\n\n{_per_task({'success': result})}"
+    overall = grid({"all ten tasks": result}, STEPS)
+    return f"{overall}\n\n{told.capitalize()}.\n\n{_per_task({'success': result})}"
 
 
 def _execution(result: Quoted) -> str:
     note = f"The demonstrations take {result['expert_steps']} steps on average."
-    return f"{rates(result['runs'])}\n\n{note}\n\n{_per_task(result['runs'])}"
+    return f"{grid(result['runs'], STEPS)}\n\n{note}\n\n{_per_task(result['runs'])}"
 
 
 def _with_tasks(result: Quoted) -> str:
-    return f"{rates(result['runs'])}\n\n{_per_task(result['runs'])}"
+    return f"{grid(result['runs'], STEPS)}\n\n{_per_task(result['runs'])}"
 
 
 def _selection(result: Quoted) -> str:
     ((name, run),) = result["runs"].items()
     rows = [[text, f"{100 * run['per_task'][task]:.0f} %"] for task, text in result["instructions"].items()]
-    return f"{rates(result['runs'])}\n\n{NOTES[name]}\n\n{table(['Instruction', 'Success'], rows)}"
+    return f"{grid(result['runs'], STEPS)}\n\n{NOTES[name]}\n\n{table(['Instruction', 'Success'], rows)}"
 
 
 def _per_task(runs: dict[str, Any]) -> str:

@@ -1,90 +1,110 @@
 """Success rates on the tabletop: one result file for each comparison, resumed where it was interrupted.
 
-python -m benchmarks.tabletop execution      # three ways to follow key poses
-python -m benchmarks.tabletop oracle         # object poses from the simulator, in place of perception
-python -m benchmarks.tabletop conditioning   # the flow model told poses in the target's or the world's frame
-python -m benchmarks.tabletop compound       # instructions of which only the parts were demonstrated
-python -m benchmarks.tabletop two_bowls      # with a second bowl on the table
+    python -m benchmarks.tabletop --comparison=execution
 
-Demonstrations and the default policy are those of `make demo`, made if need be.
+tabletop: the policy as it is. execution: three ways to follow key poses. oracle: object poses from the
+simulator, not from perception. conditioning: the flow is told poses in the target's or in the world's frame.
+compound: instructions of which only the parts were demonstrated. two_bowls: with a second bowl on the table.
 """
 
 from __future__ import annotations
 
-import argparse
-import json
-import logging
+import time
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from benchmarks.common import DEMOS, EPISODES, RUN, dataset, policy, write
-
-from lerobot_openspm.cli.demo import EVALUATION_SEED
-from lerobot_openspm.cli.pipeline import THREADS, collect_dataset, evaluate, success
+from benchmarks.results import run, write
+from benchmarks.stages import DEMOS, TABLETOP, policy, run_folder
+from lerobot_openspm.cli.pipeline import EVALUATION_SEED, THREADS, collect_dataset, evaluate, success
 from lerobot_openspm.envs.tabletop.tasks import ANY_TASK, SELECTIONS
 
+EPISODES = 20
 # Seeds of evaluation that nothing else was measured on; the code was tuned on 2,600,000 and more.
 SELECTION_SEEDS = {"compound": 8000, "two_bowls": 11_000}
 
 
+@dataclass
+class TabletopConfig:
+    """What is compared."""
+
+    comparison: str = "tabletop"
+
+    def __post_init__(self) -> None:
+        known = [*COMPARISONS, *SELECTION_SEEDS]
+        if self.comparison not in known:
+            raise ValueError(f"comparison is {self.comparison!r}, expected one of {', '.join(known)}")
+
+
+def main(config: TabletopConfig) -> dict[str, Any]:
+    """Measure, write and return the result."""
+    name = config.comparison
+    measured = COMPARISONS[name]() if name in COMPARISONS else selection(name)
+    return write(name, {"seed": SELECTION_SEEDS.get(name, EVALUATION_SEED), **measured}, THREADS)
+
+
+def tabletop() -> dict[str, Any]:
+    """The policy as it is; how long all took only where nothing was kept from before."""
+    start_s, is_new = time.monotonic(), not run_folder(TABLETOP).exists()
+    checkpoint, train_s = policy(TABLETOP)
+    found = rate("eval_20", checkpoint)
+    total_s = round(time.monotonic() - start_s, 1) if is_new else None
+    return {**found, "train_s": train_s, "total_s": total_s, "demonstrations": DEMOS}
+
+
 def execution() -> dict[str, Any]:
     """The three ways to follow key poses, with the same policy in the same episodes."""
-    checkpoint, train_s = policy()
-    collected = collect_dataset(dataset(), DEMOS)
+    checkpoint, train_s = policy(TABLETOP)
+    collected = collect_dataset(run_folder(TABLETOP) / "dataset", DEMOS)
     return {
         "train_s": train_s,
         "expert_steps": round(collected["frames"] / collected["episodes"], 1),
-        "runs": {
-            "closed_loop_trc": rate("eval_20", checkpoint),
-            "closed_loop": rate("eval_closed_loop", checkpoint, "--policy.execution=closed_loop"),
-            "open_loop": rate("eval_open_loop", checkpoint, "--policy.execution=open_loop"),
-        },
+        **runs(
+            closed_loop_trc=rate("eval_20", checkpoint),
+            closed_loop=rate("eval_closed_loop", checkpoint, "--policy.execution=closed_loop"),
+            open_loop=rate("eval_open_loop", checkpoint, "--policy.execution=open_loop"),
+        ),
     }
 
 
 def oracle() -> dict[str, Any]:
     """The simulator's object poses in place of perception: what is lost to perception."""
-    checkpoint, _ = policy("train_oracle", "--policy.perception=oracle")
-    return {"runs": {"oracle": rate("eval_oracle", checkpoint, "--env.object_poses=true")}}
+    checkpoint, _ = policy(TABLETOP, "train_oracle", "--policy.perception=oracle")
+    return runs(oracle=rate("eval_oracle", checkpoint, "--env.object_poses=true"))
 
 
 def conditioning() -> dict[str, Any]:
     """The flow model told the poses in the frame of the target, or in the world as in the paper."""
-    paper, _ = policy("train_paper", "--policy.conditioning=paper")
-    return {"runs": {"equivariant": rate("eval_20", policy()[0]), "paper": rate("eval_paper", paper)}}
+    paper, _ = policy(TABLETOP, "train_paper", "--policy.conditioning=paper")
+    return runs(equivariant=rate("eval_20", policy(TABLETOP)[0]), paper=rate("eval_paper", paper))
 
 
 def selection(name: str) -> dict[str, Any]:
     """Tasks beside the ten that were demonstrated."""
-    tasks = SELECTIONS[name]
-    episodes = evaluate(
-        policy()[0], RUN / f"eval_{name}", EPISODES, SELECTION_SEEDS[name], tasks=tasks
-    )  # fmt: skip
-    return {
-        "instructions": {task: ANY_TASK[task].instruction for task in tasks},
-        "runs": {name: success(episodes)},
-    }
+    tasks, output = SELECTIONS[name], run_folder(TABLETOP) / f"eval_{name}"
+    episodes = evaluate(policy(TABLETOP)[0], output, EPISODES, SELECTION_SEEDS[name], tasks=tasks)
+    told = {task: ANY_TASK[task].instruction for task in tasks}
+    return {"instructions": told, **runs(**{name: success(episodes)})}
 
 
 def rate(name: str, checkpoint: Path, *options: str) -> dict[str, Any]:
     """Success in episodes of all ten tasks from unseen seeds, evaluated if need be."""
-    return success(evaluate(checkpoint, RUN / name, EPISODES, EVALUATION_SEED, options))
+    output = run_folder(TABLETOP) / name
+    return success(evaluate(checkpoint, output, EPISODES, EVALUATION_SEED, options))
 
 
-COMPARISONS = {"execution": execution, "oracle": oracle, "conditioning": conditioning}
+def runs(**found: dict[str, Any]) -> dict[str, Any]:
+    """The compared success rates, and over how many episodes each was taken."""
+    return {"n": min(one["n"] for one in found.values()), "runs": found}
 
 
-def main(name: str) -> dict[str, Any]:
-    """Measure, write and return the result."""
-    measured = COMPARISONS[name]() if name in COMPARISONS else selection(name)
-    n = min(run["n"] for run in measured["runs"].values())
-    return write(name, {"seed": SELECTION_SEEDS.get(name, EVALUATION_SEED), "n": n, **measured}, THREADS)
+COMPARISONS = {
+    "tabletop": tabletop,
+    "execution": execution,
+    "oracle": oracle,
+    "conditioning": conditioning,
+}
 
 
 if __name__ == "__main__":
-    logging.basicConfig(level=logging.INFO, format="%(levelname)s %(message)s")
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("comparison", choices=[*COMPARISONS, *SELECTION_SEEDS])
-    print(json.dumps(main(parser.parse_args().comparison)))
+    run(TabletopConfig, main)

@@ -13,9 +13,9 @@ from pathlib import Path
 import numpy as np
 from lerobot.datasets import LeRobotDatasetMetadata
 
-from lerobot_openspm.cli.collect import CollectConfig, SimulatorConfig, collect
 from lerobot_openspm.configuration_openspm import OpenSPMConfig
-from lerobot_openspm.memory.memory import write_memory
+from lerobot_openspm.envs.collection import CollectConfig, SimulatorConfig, collect
+from lerobot_openspm.memory.io import write_memory
 from lerobot_openspm.training import dataset_processor, memory_of
 
 NAME = "local/openspm_tabletop"

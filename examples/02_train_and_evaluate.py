@@ -12,7 +12,7 @@ import subprocess
 import sys
 from pathlib import Path
 
-from lerobot_openspm.cli.collect import CollectConfig, SimulatorConfig, collect
+from lerobot_openspm.envs.collection import CollectConfig, SimulatorConfig, collect
 
 REPOSITORY = Path(__file__).parents[1]
 

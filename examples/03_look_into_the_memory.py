@@ -8,7 +8,6 @@ carried over to where the objects are now, into the camera image.
 """
 
 import argparse
-from functools import partial
 from pathlib import Path
 
 import torch
@@ -16,10 +15,10 @@ import torch
 from lerobot_openspm.cli.drawing import draw_key_poses, save_png
 from lerobot_openspm.configuration_openspm import OpenSPMConfig
 from lerobot_openspm.control.controller import EpisodeController
-from lerobot_openspm.control.planning_context import PlanningContext
+from lerobot_openspm.control.planning import PlanningContext
 from lerobot_openspm.control.transfer import transfer
 from lerobot_openspm.envs.tabletop.env import ACTION_NAMES, STATE_NAMES, TabletopEnv
-from lerobot_openspm.memory.memory import read_memory
+from lerobot_openspm.memory.io import read_memory
 from lerobot_openspm.perception.observation import split_batch
 from lerobot_openspm.perception.pipeline import Perception
 
@@ -44,29 +43,31 @@ def main() -> None:
     config = OpenSPMConfig(state_layout=list(STATE_NAMES), action_layout=list(ACTION_NAMES), device="cpu")
     (observation,) = split_batch(batch, config.layouts()[0])
 
-    # 2. Observing plans: find the objects in the images, rank the entries, carry the best one over.
+    # 2. Plan: find the objects in the images, rank the entries, carry the best one over.
     memory = read_memory(options.memory)
-    context = PlanningContext(
-        memory.entries, memory.yaw_periods, memory.robot, config.score_weights,
-        config.transfer_limits, config.control_settings,
-    )  # fmt: skip
+    context = PlanningContext(memory.entries, memory.yaw_periods, memory.robot)
     controller = EpisodeController(context, options.instruction, observation.fingerprint(), noise_seed=0)
     perception = Perception(memory, config.hand_radius_m)
-    controller.observe(observation.hand, partial(perception.detect, observation))
+    look = controller.advance(observation.hand)
+    while look is not None:
+        seen = perception.detect(observation, look.names, look.expected, look.time_s)
+        look = controller.take_in(look, seen, observation.hand)
 
-    print(f"{options.instruction!r}: {controller.status.name.lower()}")
-    for name, T_world_obj in controller.planner.object_poses.items():
+    state = controller.state
+    print(f"{options.instruction!r}: {state.status.name.lower()}")
+    poses = controller.scene.tracker.poses(observation.hand.T_world_ee)
+    for name, T_world_obj in poses.items():
         print(f"  the {name} is at {T_world_obj[:3, 3].round(3).tolist()} m")
     print("  recalled              semantics  geometry  quality   score")
-    for item in controller.planner.ranked:
+    for item in state.ranked:
         scores = (item.semantic, item.geometric, item.quality, item.total)
         print(f"  {item.entry.source.split('/')[-1]:20s}", *(f"{score:9.2f}" for score in scores))
 
     # 3. Draw where the hand is to go.
-    best = controller.planner.ranked[0].entry
-    if any(name not in controller.planner.object_poses for name in best.objects):
+    best = state.ranked[0].entry
+    if any(name not in poses for name in best.objects):
         raise SystemExit("not all of its objects were found in this scene; try another --seed")
-    targets = transfer(best, controller.planner.object_poses, memory.yaw_periods, observation.hand.T_world_ee)
+    targets = transfer(best, poses, memory.yaw_periods, observation.hand.T_world_ee)
     view = observation.views(memory.cameras)[CAMERA]
     picture = draw_key_poses(view, [t.T_world_ee for t in targets], [t.key_pose.phase for t in targets])
     save_png(picture, options.output / "key_poses.png")

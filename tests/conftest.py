@@ -43,7 +43,7 @@ def make_once(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., Path]:
 
 def record(root: Path, task: str, episodes: int) -> None:
     """Record demonstrations in small images."""
-    from lerobot_openspm.cli.collect import CollectConfig, SimulatorConfig, collect
+    from lerobot_openspm.envs.collection import CollectConfig, SimulatorConfig, collect
 
     env = SimulatorConfig(task=task)
     collect(CollectConfig(env, episodes, str(root), height=128, width=128, workers=0))

@@ -7,20 +7,17 @@ With --source=openai or qwen3vl also the paper's own memory ablation, key poses 
 
 from __future__ import annotations
 
-import json
-import logging
-import os
-import sys
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
-import draccus
-from benchmarks.common import write
-from benchmarks.libero.evaluate import SEED, summary
+from benchmarks.libero.evaluate import SEED, evaluate_states, summary
 from benchmarks.libero.geometric_guess import GuessConfig, Source, guessing_policy, source_of
-from benchmarks.libero.stages import dataset, evaluation, policy, run_folder
+from benchmarks.results import run, write
+from benchmarks.stages import LIBERO, policy, run_folder
 
 from lerobot_openspm.cli.pipeline import THREADS
+from lerobot_openspm.control.strategies import Execution
 
 
 @dataclass
@@ -42,30 +39,29 @@ class AblationConfig:
 
 def main(config: AblationConfig) -> dict[str, Any]:
     """Evaluate every variant on the same states, and write the result down."""
-    root, folder = dataset(), run_folder()
-    full, _ = policy(root, "train")
-    oracle, _ = policy(root, "train_oracle", "--policy.perception=oracle")
-    guess = guessing_policy(oracle, folder / "train_guess")
-    variants: dict[str, Any] = {
-        "closed_loop_trc": evaluation(folder / "ablation_full", full, config.states),
-        "closed_loop": evaluation(
-            folder / "ablation_closed_loop", full, config.states, execution="closed_loop"
-        ),
-        "open_loop": evaluation(folder / "ablation_open_loop", full, config.states, execution="open_loop"),
-        "oracle": evaluation(folder / "ablation_oracle", oracle, config.states),
-        "geometric_guess": evaluation(folder / "ablation_guess", guess, config.states),
+    folder = run_folder(LIBERO)
+    full, _ = policy(LIBERO)
+    oracle, _ = policy(LIBERO, "train_oracle", "--policy.perception=oracle")
+    variants: dict[str, tuple[Path, Execution | None]] = {
+        "closed_loop_trc": (full, None),
+        "closed_loop": (full, "closed_loop"),
+        "open_loop": (full, "open_loop"),
+        "oracle": (oracle, None),
+        "geometric_guess": (guessing_policy(oracle, folder / "train_guess"), None),
     }
     if config.source != "geometric":
         place = folder / "train_zero_shot"
         asked = GuessConfig(str(oracle), str(place), config.source, config.model_id, config.api_base)
-        model = guessing_policy(oracle, place, source_of(asked))
-        variants["zero_shot"] = evaluation(folder / "ablation_zero_shot", model, config.states)
-    runs = {name: summary(found) for name, found in variants.items()}
+        variants["zero_shot"] = guessing_policy(oracle, place, source_of(asked)), None
+    runs = {
+        name: summary(
+            evaluate_states(checkpoint, folder / f"ablation_{name}", config.states, execution=execution)
+        )
+        for name, (checkpoint, execution) in variants.items()
+    }
     n = min(run["n"] for run in runs.values())
     return write("libero_ablations", {"seed": SEED, "n": n, "states": config.states, "runs": runs}, THREADS)
 
 
 if __name__ == "__main__":
-    logging.basicConfig(level=logging.INFO, format="%(levelname)s %(message)s")
-    os.environ.setdefault("MUJOCO_GL", "egl")
-    print(json.dumps(main(draccus.parse(AblationConfig, args=sys.argv[1:]))))
+    run(AblationConfig, main)

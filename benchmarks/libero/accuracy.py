@@ -3,77 +3,49 @@
 from __future__ import annotations
 
 from collections import defaultdict
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-from benchmarks.libero.stages import REPO_ID
-from lerobot.datasets import LeRobotDatasetMetadata
+from benchmarks.harness import Row
+from benchmarks.stages import LIBERO
+from benchmarks.truth import Error, offsets, pose_error, summary, true_period
+from lerobot_openspm.perception.objects.model import PatchModel
 
-from lerobot_openspm.bench.object_frames import error, offset, summary
-from lerobot_openspm.configuration_openspm import OpenSPMConfig
 from lerobot_openspm.envs.libero.simulator import tasks
 from lerobot_openspm.geometry import se3
-from lerobot_openspm.memory.memory import read_memory
-from lerobot_openspm.perception.objects.model import PatchModel
-from lerobot_openspm.training import open_demonstrations
-
-# By which angle each object truly turns into itself.
-TRUE_PERIODS = {
-    "bowl": 0.0,
-    "plate": 0.0,
-    "wine bottle": 0.0,
-    "cream cheese": np.pi,
-    "rack": 2 * np.pi,
-    "cabinet": 2 * np.pi,
-    "stove": 2 * np.pi,
-}
-NOT_FOUND = (float("nan"), float("nan"))
+from lerobot_openspm.memory.io import read_memory
 
 
-def accuracy(checkpoint: Path, dataset: Path, episodes: list[dict[str, Any]]) -> dict[str, Any]:
+def accuracy(checkpoint: Path, dataset: Path, episodes: Sequence[Row]) -> dict[str, Any]:
     """Position and yaw errors, over all objects that an episode's task touches, per object and per task.
 
     ``off_mm`` holds the largest position error of every episode, in their order; None if an object was not
     found.
     """
-    memory = read_memory(checkpoint)
-    config = OpenSPMConfig(
-        device="cpu", push_to_hub=False, state_rotation="axis_angle", action_rotation="axis_angle"
-    )
-    demonstrations = open_demonstrations(LeRobotDatasetMetadata(REPO_ID, root=dataset), config)
-    offsets = {name: offset(memory, name, demonstrations) for name in memory.objects}
-    # Patches do not measure a yaw: such an object is taken to stand as demonstrated.
-    periods = {
-        name: 0.0 if isinstance(model, PatchModel) else TRUE_PERIODS[name]
-        for name, model in memory.objects.items()
-    }
-    by_object, by_task = defaultdict(list), defaultdict(list)
-    off_mm = []
+    models, T_sim_obj = read_memory(checkpoint).objects, offsets(checkpoint, dataset)
+    by_object, by_task = defaultdict[str, list[Error]](list), defaultdict[str, list[Error]](list)
+    off_mm: list[float | None] = []
     for episode in episodes:
-        off = [0.0]
+        found: list[Error] = []
         for name, true in episode["true"].items():
-            seen = episode["seen"].get(name)
-            one = NOT_FOUND if seen is None else error(_pose(true), _pose(seen), offsets[name], periods[name])
-            by_object[name].append(one)
-            by_task[episode["task"]].append(one)
-            off.append(one[0])
-        off_mm.append(None if np.isnan(off).any() else round(1000 * max(off), 1))
-    everything = 1000 * np.concatenate([np.array(found)[:, 0] for found in by_object.values()])
-    known = [task for task in tasks() if task in by_task]
+            error: Error = (None, None)
+            if name in episode["seen"]:
+                period = true_period(name, LIBERO)
+                T_true, T = (se3.from_yaw(place[:3], place[3]) for place in (true, episode["seen"][name]))
+                metres, radians = pose_error(T_true @ T_sim_obj[name], T, period)
+                # Patches do not measure a yaw, and a round object has none.
+                is_turned = period > 0 and not isinstance(models[name], PatchModel)
+                error = (metres, radians if is_turned else None)
+            by_object[name].append(error)
+            found.append(error)
+        by_task[episode["task"]] += found
+        metres = [metres for metres, _ in found]
+        off_mm.append(None if None in metres else round(1000 * max(metres, default=0.0), 1))
+    overall = summary([error for errors in by_object.values() for error in errors])
     return {
-        "position_mm_mean": round(float(np.nanmean(everything)), 2),
-        "position_mm_p95": round(float(np.nanpercentile(everything, 95)), 2),
-        "objects": {name: summary(np.array(found), periods[name]) for name, found in by_object.items()},
+        **{key: overall[key] for key in ("position_mm_mean", "position_mm_p95")},
+        "objects": {name: summary(errors) for name, errors in by_object.items()},
         "off_mm": off_mm,
-        "tasks": {task: summary(np.array(by_task[task]), _turning(by_task[task])) for task in known},
+        "tasks": {task: summary(by_task[task]) for task in tasks() if task in by_task},
     }
-
-
-def _turning(errors: list[tuple[float, float]]) -> float:
-    """A period for a summary: 0 if no object of a task has a yaw that is measured."""
-    return 0.0 if np.isnan(np.array(errors)[:, 1]).all() else 2 * np.pi
-
-
-def _pose(place: list[float]) -> np.ndarray:
-    return se3.from_yaw(place[:3], place[3])

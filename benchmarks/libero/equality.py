@@ -2,20 +2,16 @@
 
 from __future__ import annotations
 
-import json
-import os
-import sys
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import draccus
 import numpy as np
-import torch
-from benchmarks.common import write
-from benchmarks.libero.episode import initial_states, run_episode
+from benchmarks.episodes import load, run_episode
 from benchmarks.libero.evaluate import SEED
-from benchmarks.libero.stages import dataset, policy
+from benchmarks.results import run, write
+from benchmarks.stages import LIBERO, policy
+from benchmarks.worlds import LIBERO_IMAGE_SIZE, LiberoWorld, initial_states
 from lerobot.envs.configs import LiberoEnv
 from lerobot.envs.factory import make_env, make_env_pre_post_processors
 from lerobot.policies.factory import make_pre_post_processors
@@ -35,16 +31,15 @@ class EqualityConfig:
 
 def main(config: EqualityConfig) -> dict[str, Any]:
     """Run every episode twice, compare, write and return the result."""
-    torch.set_num_threads(1)
-    checkpoint, _ = policy(dataset(), "train")
-    acting = OpenSPMPolicy.from_pretrained(checkpoint)
+    checkpoint, _ = policy(LIBERO)
+    acting = load(str(checkpoint))
     plain, lazy = [], []
     for number, task in enumerate(tqdm(tasks(), unit="task")):
         plain += _plain(acting, checkpoint, number, config.states)
-        simulator = LiberoSimulator(task, 360)
+        simulator = LiberoSimulator(task, LIBERO_IMAGE_SIZE)
         for state in range(config.states):
             simulator.reset_to(SEED + state, initial_states(task)[state])
-            lazy.append(run_episode(acting, simulator).actions)
+            lazy.append(run_episode(acting, LiberoWorld(simulator)).actions)
         simulator.close()
     equal = [len(a) == len(b) and np.array_equal(a, b) for a, b in zip(plain, lazy, strict=True)]
     together = [np.abs(a[: len(b)] - b[: len(a)]).max() for a, b in zip(plain, lazy, strict=True)]
@@ -76,5 +71,4 @@ def _plain(acting: OpenSPMPolicy, checkpoint: Path, number: int, states: int) ->
 
 
 if __name__ == "__main__":
-    os.environ.setdefault("MUJOCO_GL", "egl")
-    print(json.dumps(main(draccus.parse(EqualityConfig, args=sys.argv[1:]))))
+    run(EqualityConfig, main)

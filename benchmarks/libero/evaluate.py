@@ -10,35 +10,30 @@ two action by action. Every episode is written down as it ends; a second run doe
 from __future__ import annotations
 
 import gc
-import json
-import logging
-import multiprocessing
-import os
-import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import count
 from pathlib import Path
 from typing import Any
 
-import draccus
 import numpy as np
-import torch
-from benchmarks.libero.episode import Episode, initial_states, run_episode
-from tqdm import tqdm
+from benchmarks.episodes import load, run_episode
+from benchmarks.harness import Row, checkpoint_files, measured_folder, resume
+from benchmarks.results import run
+from benchmarks.worlds import LIBERO_IMAGE_SIZE, LiberoWorld, initial_states
 
-from lerobot_openspm.cli.pipeline import digest, rate
-from lerobot_openspm.control.status import Status
-from lerobot_openspm.control.strategies import Execution
+from lerobot_openspm.cli.pipeline import rate
+from lerobot_openspm.control.controller import EpisodeController
+from lerobot_openspm.control.state import Status
 from lerobot_openspm.envs.libero.simulator import LiberoSimulator, tasks
 from lerobot_openspm.envs.seeds import TUNING_SEED_START
-from lerobot_openspm.files import write_beside
 from lerobot_openspm.geometry import se3
+from lerobot_openspm.language.instruction import parse_instruction
 from lerobot_openspm.modeling_openspm import OpenSPMPolicy
+from lerobot_openspm.perception.observation import Observation
+from lerobot_openspm.perception.oracle import name_simulator_poses
+from lerobot_openspm.types import Execution
 
-logger = logging.getLogger(__name__)
-
-SEED = 1000
+STATES, SEED = 50, 1000
 # Tuning scenes of the benchmark, apart from those that tests use.
 TUNING_SEED = TUNING_SEED_START + 100_000
 
@@ -54,89 +49,61 @@ class EvaluationConfig:
         episodes: Initial states a task, from the first on.
         tuning: Draw as many scenes from tuning seeds instead of taking the benchmark's initial states.
         tuning_seed: The first of those seeds.
-        processes: Episodes at a time, each in a process of its own; a single one stays in this process.
-        image_size: Pixels; lerobot-eval's default.
+        workers: Episodes at a time, each in a process of its own; a single one stays in this process.
         execution: Of the policy; the checkpoint's if not given.
     """
 
     checkpoint: str
     output: str
     task: str = "all"
-    episodes: int = 50
+    episodes: int = STATES
     tuning: bool = False
     tuning_seed: int = TUNING_SEED
-    processes: int = 2
-    image_size: int = 360
+    workers: int = 2
     execution: Execution | None = None
 
 
-# Settings, task, number of the initial state.
-type Job = tuple[EvaluationConfig, str, int]
+def main(config: EvaluationConfig) -> dict[str, Any]:
+    """Evaluate, and return the summary; it is no published figure."""
+    return summary(evaluate(config))
 
 
-def evaluate(config: EvaluationConfig) -> list[dict[str, Any]]:
+def evaluate(config: EvaluationConfig) -> list[Row]:
     """Run the episodes that are missing, and return all of them.
 
-    Episodes of another policy, other settings or other code are set aside, not mixed in.
+    Episodes of another policy, other settings or other code are removed, not mixed in.
     """
-    output = Path(config.output)
-    output.mkdir(parents=True, exist_ok=True)
-    log = output / "episodes.jsonl"
-    _set_others_aside(config, output, log)
-    _drop_torn_line(log)
     wanted = list(tasks()) if config.task == "all" else config.task.split(",")
     if unknown := [task for task in wanted if task not in tasks()]:
         raise ValueError(f"libero_goal has no tasks {unknown}, expected some of {', '.join(tasks())}")
-    done = {(e["task"], e["state"]) for e in _read(log)}
-    jobs = [(config, task, i) for task in wanted for i in range(config.episodes) if (task, i) not in done]
-    with log.open("a") as file:
-        for episode in tqdm(_run(jobs, config.processes), total=len(jobs), unit="episode", disable=not jobs):
-            file.write(json.dumps(episode) + "\n")
-            file.flush()
-    return [e for e in _read(log) if e["task"] in wanted and e["state"] < config.episodes]
+    settings = [f"{key}={getattr(config, key)}" for key in ("tuning", "tuning_seed", "execution")]
+    files = checkpoint_files(Path(config.checkpoint))
+    folder = measured_folder(Path(config.output), files, settings, __file__)
+    jobs = {f"{task} {i}": (config, task, i) for task in wanted for i in range(config.episodes)}
+    return resume(folder / "episodes.jsonl", jobs, evaluate_one, config.workers)
 
 
-def _run(jobs: Sequence[Job], processes: int) -> Iterator[dict[str, Any]]:
-    if processes == 1:
-        yield from map(evaluate_one, jobs)
-    else:
-        with multiprocessing.get_context("spawn").Pool(processes) as pool:
-            yield from pool.imap_unordered(evaluate_one, jobs)
+def evaluate_states(
+    checkpoint: Path,
+    output: Path,
+    states: int = STATES,
+    selected: Sequence[str] | None = None,
+    execution: Execution | None = None,
+) -> list[Row]:
+    """Episodes on the first of the benchmark's initial states of all tasks or some, run if need be."""
+    names = ",".join(selected) if selected else "all"
+    return evaluate(EvaluationConfig(str(checkpoint), str(output), names, states, execution=execution))
 
 
-def _set_others_aside(config: EvaluationConfig, output: Path, log: Path) -> None:
-    """Keep apart what was made of something else, and note what the next episodes are made of."""
-    files = [Path(config.checkpoint) / name for name in ("model.safetensors", "memory.json", "config.json")]
-    code = [Path(__file__), Path(__file__).with_name("episode.py")]
-    keys = ("tuning", "tuning_seed", "image_size", "execution")
-    settings = [f"{key}={getattr(config, key)}" for key in keys]
-    made_of, kept = digest([*code, *files], settings), output / "made_of.sha256"
-    if log.exists() and (not kept.exists() or kept.read_text() != made_of):
-        aside = next(p for i in count(1) if not (p := output / f"episodes_before_{i}.jsonl").exists())
-        logger.warning("%s holds episodes of another policy, settings or code; set aside as %s", log, aside)
-        log.rename(aside)
-    write_beside(kept, made_of.encode())
-
-
-def _drop_torn_line(log: Path) -> None:
-    """Forget an episode that was being written when a run was killed; it is run again."""
-    if log.exists() and (text := log.read_text()) and not text.endswith("\n"):
-        write_beside(log, text[: text.rfind("\n") + 1].encode())
-
-
-def summary(episodes: list[dict[str, Any]]) -> dict[str, Any]:
+def summary(episodes: list[Row]) -> dict[str, Any]:
     """Rates over all episodes and per task, and which of them failed."""
     names = dict.fromkeys(e["task"] for e in episodes)
     own = {
         task: [e for e in episodes if e["task"] == task] for task in sorted(names, key=list(tasks()).index)
     }
     return {
-        **rate(sum(e["success"] for e in episodes), len(episodes)),
-        "mean_steps": mean_steps(episodes),
-        "per_task": {
-            task: {**rate(sum(e["success"] for e in es), len(es)), "mean_steps": mean_steps(es)}
-            for task, es in own.items()
-        },
+        **_rate(episodes),
+        "per_task": {task: _rate(es) for task, es in own.items()},
         "failed": [
             {**{key: e[key] for key in ("task", "state", "seed", "attempts")}, "reason": reason(e)}
             for e in episodes
@@ -145,7 +112,14 @@ def summary(episodes: list[dict[str, Any]]) -> dict[str, Any]:
     }
 
 
-def reason(episode: dict[str, Any]) -> str:
+def _rate(episodes: Sequence[Row]) -> dict[str, Any]:
+    """Success rate, and mean steps of the successes; None if there is none."""
+    steps = [e["steps"] for e in episodes if e["success"]]
+    mean = round(float(np.mean(steps)), 1) if steps else None
+    return {**rate(len(steps), len(episodes)), "mean_steps": mean}
+
+
+def reason(episode: Row) -> str:
     """Why an episode failed, as far as the policy can tell."""
     match episode["status"]:
         case Status.DONE:
@@ -158,23 +132,33 @@ def reason(episode: dict[str, Any]) -> str:
             return status.replace("_", " ")
 
 
-def mean_steps(episodes: list[dict[str, Any]]) -> float | None:
-    """Mean steps of the successes; None if there is none."""
-    steps = [e["steps"] for e in episodes if e["success"]]
-    return round(float(np.mean(steps)), 1) if steps else None
+def evaluate_one(config: EvaluationConfig, task: str, state: int) -> Row:
+    """Run one episode, with a policy and a simulator kept by the process.
 
-
-def evaluate_one(job: Job) -> dict[str, Any]:
-    """Run one episode, with a policy and a simulator kept by the process."""
-    config, task, state = job
-    policy, simulator = _policy(config), _simulator(task, config.image_size)
+    Returns:
+        What is kept of it. ``seen`` are the poses that the policy found when it planned, ``true`` the
+        simulator's poses of the objects that the instruction names.
+    """
+    policy, simulator = _policy(config), _simulator(task)
     seed = (config.tuning_seed if config.tuning else SEED) + state
     if config.tuning:
         simulator.reset(seed)
         _move_hand(simulator, np.random.default_rng(seed))
     else:
         simulator.reset_to(seed, initial_states(task)[state])
-    return {"task": task, "state": state, "seed": seed, **_told(run_episode(policy, simulator))}
+    sub_tasks = parse_instruction(simulator.instruction)
+    named = list(dict.fromkeys(name for sub_task in sub_tasks for name in sub_task.objects))
+    places: dict[str, Any] = {}
+
+    def note(step: int, observation: Observation, controller: EpisodeController) -> None:
+        if step == 0:
+            true = name_simulator_poses(simulator.object_poses(), named, policy.require_memory().objects)
+            seen = controller.scene.tracker.poses(observation.hand.T_world_ee)
+            places["seen"] = {name: _place(T) for name, T in seen.items()}
+            places["true"] = {name: _place(T) for name, T in true.items()}
+
+    episode = run_episode(policy, LiberoWorld(simulator), note=note)
+    return {"task": task, "state": state, "seed": seed, **episode.told(), **places}
 
 
 def _move_hand(simulator: LiberoSimulator, rng: np.random.Generator) -> None:
@@ -182,22 +166,6 @@ def _move_hand(simulator: LiberoSimulator, rng: np.random.Generator) -> None:
     towards = rng.uniform(-0.6, 0.6, size=3)
     for share in (1.0, 1.0, 1.0, 0.0, 0.0):
         simulator.step(np.array([*(share * towards), 0.0, 0.0, 0.0, -1.0]))
-
-
-def _told(episode: Episode) -> dict[str, Any]:
-    """An episode as a line of JSON."""
-    executor, ranked = episode.row.executor, episode.row.planner.ranked
-    return {
-        "steps": len(episode.actions),
-        "success": episode.success,
-        "status": str(episode.row.status),
-        "key_pose": executor.index,
-        "phase": executor.plan[executor.index].key_pose.phase if executor.plan else None,
-        "attempts": executor.attempts,
-        "entry": ranked[0].entry.source if ranked else None,
-        "seen": {name: _place(T) for name, T in episode.seen.items()},
-        "true": {name: _place(T) for name, T in episode.true.items()},
-    }
 
 
 def _place(T_world_obj: np.ndarray) -> list[float]:
@@ -209,28 +177,24 @@ _KEPT: dict[str, Any] = {}
 
 
 def _policy(config: EvaluationConfig) -> OpenSPMPolicy:
-    if "policy" not in _KEPT:
-        torch.set_num_threads(1)
-        _KEPT["policy"] = OpenSPMPolicy.from_pretrained(config.checkpoint)
+    kept = (config.checkpoint, config.execution)
+    if _KEPT.get("policy_of") != kept:
+        policy = load(config.checkpoint)
+        if config.execution:
+            policy.config.execution = config.execution
+        _KEPT.update(policy_of=kept, policy=policy)
         # robosuite collects garbage at every reset; it need not look through all modules each time.
         gc.freeze()
-        if config.execution:
-            _KEPT["policy"].config.execution = config.execution
     return _KEPT["policy"]
 
 
-def _simulator(task: str, image_size: int) -> LiberoSimulator:
+def _simulator(task: str) -> LiberoSimulator:
     if _KEPT.get("task") != task:
         if "simulator" in _KEPT:
             _KEPT["simulator"].close()
-        _KEPT.update(task=task, simulator=LiberoSimulator(task, image_size))
+        _KEPT.update(task=task, simulator=LiberoSimulator(task, LIBERO_IMAGE_SIZE))
     return _KEPT["simulator"]
 
 
-def _read(log: Path) -> list[dict[str, Any]]:
-    return [json.loads(line) for line in log.read_text().splitlines()] if log.exists() else []
-
-
 if __name__ == "__main__":
-    os.environ.setdefault("MUJOCO_GL", "egl")
-    print(json.dumps(summary(evaluate(draccus.parse(EvaluationConfig, args=sys.argv[1:])))))
+    run(EvaluationConfig, main)

@@ -11,35 +11,33 @@ writes a checkpoint whose memory holds one guess a task; evaluate it with `bench
 
 from __future__ import annotations
 
-import json
 import logging
-import os
-import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Literal
 
-import draccus
 import numpy as np
+from benchmarks.libero.guessed_key_poses import (
+    GuessedKeyPose,
+    SceneQuestion,
+    SeenObject,
+    guess_by_endpoint,
+    guess_by_qwen3vl,
+)
+from benchmarks.results import run
 
 from lerobot_openspm.envs.libero.simulator import OBJECTS, LiberoSimulator, tasks
-from lerobot_openspm.errors import JudgementError, OpenSPMError
+from lerobot_openspm.errors import PhaseLabelError
 from lerobot_openspm.geometry import se3
 from lerobot_openspm.geometry.se3 import Array
 from lerobot_openspm.language.instruction import parse_instruction
 from lerobot_openspm.memory.entry import WORLD, Anchor, MemoryEntry, MemoryKeyPose, RetrievalKey
-from lerobot_openspm.memory.memory import Memory, read_memory
+from lerobot_openspm.memory.io import read_memory
+from lerobot_openspm.memory.memory import Memory
 from lerobot_openspm.mining.phase_labels.endpoint import API_BASE, ChatEndpoint
 from lerobot_openspm.mining.phase_labels.qwen3vl import WEIGHTS, Qwen3VL
-from lerobot_openspm.mining.phase_labels.zero_shot import (
-    EndpointKeyPoses,
-    GuessedKeyPose,
-    KeyPoseSource,
-    Qwen3VLKeyPoses,
-    SceneQuestion,
-    SeenObject,
-)
 from lerobot_openspm.modeling_openspm import OpenSPMPolicy
 from lerobot_openspm.perception.oracle import name_simulator_poses
 from lerobot_openspm.types import SubTask
@@ -55,6 +53,8 @@ PICTURE_PX = 256
 logger = logging.getLogger(__name__)
 
 Source = Literal["geometric", "openai", "qwen3vl"]
+# Makes up key poses; raises PhaseLabelError where there is no answer, or none that can be followed.
+KeyPoseSource = Callable[[SceneQuestion], tuple[GuessedKeyPose, ...]]
 
 
 @dataclass
@@ -65,7 +65,7 @@ class GuessConfig:
         oracle: Checkpoint trained with perception=oracle; everything but its memory is kept.
         output: Folder of the checkpoint to write.
         source: "geometric", or a multimodal model: "openai" behind an endpoint, "qwen3vl" in this process.
-        model_id: The model, as --policy.phase_judge_model_id names it.
+        model_id: The model, as --policy.judge.model_id names it.
         api_base: Where the endpoint is.
         device: Where "qwen3vl" runs.
     """
@@ -87,7 +87,7 @@ def guessing_policy(oracle: Path, folder: Path, source: KeyPoseSource | None = N
         source: The model to ask; geometry if not given.
 
     Raises:
-        JudgementError: Nothing that the model said can be followed, for any task.
+        PhaseLabelError: Nothing that the model said can be followed, for any task.
     """
     policy = OpenSPMPolicy.from_pretrained(oracle)
     memory = read_memory(oracle)
@@ -95,15 +95,14 @@ def guessing_policy(oracle: Path, folder: Path, source: KeyPoseSource | None = N
     for task, instruction in tasks().items():
         try:
             entries.append(_guess(task, instruction, memory, source))
-        except JudgementError as error:
+        except PhaseLabelError as error:
             logger.warning("no key poses for %r: %s", instruction, error)
             refused[task] = str(error)
     if not entries:
-        raise JudgementError(f"no task has key poses that can be followed; the last: {refused.popitem()[1]}")
+        raise PhaseLabelError(f"no task has key poses that can be followed; the last: {refused.popitem()[1]}")
     policy.memory = replace(memory, entries=tuple(entries))
     # A guess may well lie outside what the demonstrations reached.
     policy.config.reach_margin_m = policy.config.min_clearance_m = 1.0
-    policy.config.max_jump_m = 2.0
     policy.save_pretrained(folder)
     return folder
 
@@ -112,16 +111,17 @@ def source_of(config: GuessConfig) -> KeyPoseSource | None:
     """The model that a configuration names; None for geometry.
 
     Raises:
-        JudgementError: The endpoint's model is not named.
+        PhaseLabelError: The endpoint's model is not named.
         PerceptionError: Qwen3-VL cannot be loaded.
     """
     if config.source == "geometric":
         return None
     if config.source == "qwen3vl":
-        return Qwen3VLKeyPoses(Qwen3VL.from_pretrained(config.model_id or WEIGHTS, config.device))
+        model = Qwen3VL.from_pretrained(config.model_id or WEIGHTS, config.device)
+        return partial(guess_by_qwen3vl, model=model)
     if not config.model_id:
-        raise JudgementError("source=openai needs the name of a model; pass --model_id=NAME")
-    return EndpointKeyPoses(ChatEndpoint(config.api_base or API_BASE, config.model_id))
+        raise PhaseLabelError("source=openai needs the name of a model; pass --model_id=NAME")
+    return partial(guess_by_endpoint, endpoint=ChatEndpoint(config.api_base or API_BASE, config.model_id))
 
 
 def _guess(task: str, instruction: str, memory: Memory, source: KeyPoseSource | None) -> MemoryEntry:
@@ -142,7 +142,7 @@ def _guess(task: str, instruction: str, memory: Memory, source: KeyPoseSource | 
         )
         pictures = simulator.images()
         at = simulator.ee_pose()[:3, 3]
-        guessed = source.guess(SceneQuestion(instruction, objects, at, open_width, pictures))
+        guessed = source(SceneQuestion(instruction, objects, at, open_width, pictures))
         poses = remembered(guessed, sub_tasks, layout, down, open_width)
     simulator.close()
     key = RetrievalKey(sub_tasks, tuple(pose.phase for pose in poses))
@@ -270,9 +270,4 @@ def main(config: GuessConfig) -> dict[str, object]:
 
 
 if __name__ == "__main__":
-    logging.basicConfig(level=logging.INFO, format="%(levelname)s %(message)s")
-    os.environ.setdefault("MUJOCO_GL", "egl")
-    try:
-        print(json.dumps(main(draccus.parse(GuessConfig, args=sys.argv[1:]))))
-    except OpenSPMError as error:
-        sys.exit(f"geometric_guess: {error}")
+    run(GuessConfig, main)

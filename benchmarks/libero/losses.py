@@ -2,22 +2,19 @@
 
 from __future__ import annotations
 
-import argparse
-import json
-import logging
-import os
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import matplotlib.pyplot as plt
 import torch
-from benchmarks.common import write
-from benchmarks.libero.stages import DEMOS, REPO_ID, dataset, first_episodes, policy
-from lerobot.datasets import LeRobotDatasetMetadata
+from benchmarks.results import run, write
+from benchmarks.stages import DEMOS, LIBERO, dataset, first_episodes, policy
 from torch import Tensor
 from tqdm import tqdm
 
 from lerobot_openspm.flow.training_set import TrainingSet
+from lerobot_openspm.mining.dataset import dataset_metadata
 from lerobot_openspm.modeling_openspm import OpenSPMPolicy
 from lerobot_openspm.training import dataset_processor, open_demonstrations, training_set
 
@@ -28,21 +25,27 @@ DRAWS = 16
 PLOT = Path("docs/images/libero_losses.png")
 
 
-def main() -> dict[str, Any]:
+@dataclass
+class LossesConfig:
+    """There is nothing to choose."""
+
+
+def main(_: LossesConfig) -> dict[str, Any]:
     """Train on eight demonstrations a task, judge every checkpoint on both kinds, plot, write and return."""
-    root = dataset()
+    root = dataset(LIBERO)
+    meta = dataset_metadata("local/libero", str(root))
     learned = first_episodes(root, DEMOS - HELD_OUT)
-    last, _ = policy(root, "losses", f"--save_freq={EVERY}", episodes=learned)
+    last, _ = policy(LIBERO, "losses", f"--save_freq={EVERY}", episodes=learned)
     config = OpenSPMPolicy.from_pretrained(last).config
     config.memory_episodes = learned
-    frames = _frames(root, config, learned)
+    frames = _frames(meta, config, learned)
     losses: dict[str, list[float]] = {name: [] for name in frames}
     steps = sorted(int(folder.name) for folder in last.parents[1].glob("[0-9]*"))
     samples: TrainingSet | None = None
     for step in tqdm(steps, unit="checkpoint"):
         acting = OpenSPMPolicy.from_pretrained(last.parents[1] / f"{step:06d}" / last.name)
         if samples is None:
-            mined = dataset_processor(_meta(root), config).key_poses(held_out=True)
+            mined = dataset_processor(meta, config).key_poses(held_out=True)
             samples = training_set(mined, acting.require_memory().robot, config)
         for name, index in frames.items():
             losses[name].append(_loss(acting, samples, index))
@@ -52,14 +55,10 @@ def main() -> dict[str, Any]:
     return write("libero_losses", {"seed": 0, "n": n, "epochs": epochs, **losses, "plot": PLOT.name})
 
 
-def _meta(root: Path) -> LeRobotDatasetMetadata:
-    return LeRobotDatasetMetadata(REPO_ID, root=root)
-
-
-def _frames(root: Path, config: Any, learned: list[int]) -> dict[str, Tensor]:
+def _frames(meta: Any, config: Any, learned: list[int]) -> dict[str, Tensor]:
     """Dataset indices of the demonstrations learned from, and of those held out."""
     indices: dict[str, list[int]] = {"training": [], "validation": []}
-    for episode in open_demonstrations(_meta(root), config).episodes():
+    for episode in open_demonstrations(meta, config).episodes():
         kind = "training" if episode.index in learned else "validation"
         indices[kind] += range(episode.from_index, episode.from_index + len(episode))
     return {name: torch.tensor(index) for name, index in indices.items()}
@@ -93,7 +92,4 @@ def _plot(epochs: list[float], losses: dict[str, list[float]]) -> None:
 
 
 if __name__ == "__main__":
-    logging.basicConfig(level=logging.INFO, format="%(levelname)s %(message)s")
-    os.environ.setdefault("MUJOCO_GL", "egl")
-    argparse.ArgumentParser(description=__doc__).parse_args()
-    print(json.dumps(main()))
+    run(LossesConfig, main)

@@ -5,18 +5,14 @@ python -m benchmarks.libero.run --demos=10 --states=50 --tasks=0-9
 
 from __future__ import annotations
 
-import json
 import logging
-import os
-import sys
 from dataclasses import dataclass
 from typing import Any
 
-import draccus
-from benchmarks.common import write
 from benchmarks.libero.accuracy import accuracy
-from benchmarks.libero.evaluate import SEED, summary
-from benchmarks.libero.stages import DEMOS, STATES, dataset, evaluation, policy, run_folder, select_tasks
+from benchmarks.libero.evaluate import SEED, STATES, evaluate_states, summary
+from benchmarks.results import run, write
+from benchmarks.stages import DEMOS, LIBERO, dataset, policy
 
 from lerobot_openspm.cli.pipeline import THREADS
 from lerobot_openspm.envs.libero.simulator import tasks
@@ -38,21 +34,24 @@ class RunConfig:
     states: int = STATES
     tasks: str = "0-9"
 
+    def __post_init__(self) -> None:
+        select_tasks(self.tasks)
+        if not 1 <= self.states <= STATES or self.demos < 1:
+            raise ValueError(
+                f"STATES must be 1 to {STATES} and DEMOS at least 1, got {self.states}, {self.demos}"
+            )
+
 
 def main(config: RunConfig) -> dict[str, Any]:
     """Do what is missing. The whole suite from 50 states is written down as a published result."""
     selected = select_tasks(config.tasks)
-    if not 1 <= config.states <= STATES or config.demos < 1:
-        raise ValueError(
-            f"STATES must be 1 to {STATES} and DEMOS at least 1, got {config.states}, {config.demos}"
-        )
     logger.info("recording %d demonstrations of each of %d tasks", config.demos, len(selected))
-    root = dataset(config.demos, selected)
+    root = dataset(LIBERO, config.demos, selected)
     logger.info("mining and training")
-    checkpoint, seconds = policy(root, "train")
-    folder = run_folder(config.demos, selected) / "evaluation"
+    checkpoint, seconds = policy(LIBERO, root=root)
+    folder = root.with_name("evaluation")
     logger.info("evaluating %d tasks from %d initial states", len(selected), config.states)
-    episodes = evaluation(folder, checkpoint, config.states, selected)
+    episodes = evaluate_states(checkpoint, folder, config.states, selected)
     figures, errors = summary(episodes), accuracy(checkpoint, root, episodes)
     worst = {(e["task"], e["state"]): off for e, off in zip(episodes, errors.pop("off_mm"), strict=True)}
     for failed in figures["failed"]:
@@ -68,10 +67,26 @@ def main(config: RunConfig) -> dict[str, Any]:
     return {**told, "per_task": per_task, **timing, **places, "checkpoint": str(checkpoint)}
 
 
+def select_tasks(selection: str) -> list[str]:
+    """Tasks by their numbers: "0-9", or "0,3,5-6".
+
+    Raises:
+        ValueError: There is no such task.
+    """
+    names = list(tasks())
+    chosen: list[int] = []
+    for part in selection.split(","):
+        first, dash, last = part.strip().partition("-")
+        last = last if dash else first
+        numbers = first.isdecimal() and last.isdecimal()
+        if not numbers or not int(first) <= int(last) < len(names):
+            raise ValueError(
+                f"TASKS must be numbers and ascending ranges from 0 to {len(names) - 1}, like 0-9 or 0,3,5, "
+                f"got {selection}; they stand for {', '.join(f'{i} {name}' for i, name in enumerate(names))}"
+            )
+        chosen += range(int(first), int(last) + 1)
+    return [names[i] for i in dict.fromkeys(chosen)]
+
+
 if __name__ == "__main__":
-    logging.basicConfig(level=logging.INFO, format="%(levelname)s %(message)s")
-    os.environ.setdefault("MUJOCO_GL", "egl")
-    try:
-        print(json.dumps(main(draccus.parse(RunConfig, args=sys.argv[1:])), allow_nan=False))
-    except ValueError as error:
-        sys.exit(f"make libero: {error}")
+    run(RunConfig, main)

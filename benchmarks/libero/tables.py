@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from benchmarks.figures import FIGURES
-from benchmarks.markdown import Quoted, chapter, interval, percent, section, table
+from benchmarks.markdown import STEPS, SUCCESS, Columns, Quoted, chapter, grid, percent, section, table
 
 INTRODUCTION = """# On LIBERO-GOAL
 
@@ -52,22 +52,13 @@ def libero_sections() -> list[str]:
 
 
 def _main(result: Quoted) -> str:
-    tasks = [
-        [task.replace("_", " "), percent(row), interval(row), row["n"], row["mean_steps"]]
-        for task, row in result["per_task"].items()
-    ]
-    tasks.append(["**all**", percent(result), interval(result), result["n"], result["mean_steps"]])
-    ours = [
-        f"**OpenSPM, {result['demonstrations']} demonstrations a task**",
-        None,
-        None,
-        f"**{percent(result)}**",
-    ]
+    name = f"**OpenSPM, {result['demonstrations']} demonstrations a task**"
+    ours = [name, None, None, f"**{percent(result)}**"]
     rows = [[name, size, length, f"{rate} %"] for name, size, length, rate, _ in PUBLISHED]
     compared = table(["", "Parameters", "Chunk", "Success"], [*rows, ours])
     seconds = result["mine_and_train_s"]
     taken = "was interrupted" if seconds is None else f"took {seconds:.0f} s"
-    per_task = table(["Task", "Success", "95 % interval", "Episodes", "Mean steps of successes"], tasks)
+    per_task = grid({**result["per_task"], "**all**": result}, STEPS, "Task")
     return (
         f"{compared}\n\nThe rows above ours are quoted from the paper.\n\n{per_task}\n\n"
         f"Mining and training {taken}."
@@ -78,14 +69,14 @@ def _latency(result: Quoted) -> str:
     rows = [[name, size, length, None, hz] for name, size, length, _, hz in PUBLISHED]
     chunk, first = result["chunk_ms"], result["first_action_ms"]
     ours = [
-        "**OpenSPM**", f"{result['parameters'] / 1e6:.2f} M", result["chunk_size"], chunk["median"],
+        "**OpenSPM**", f"{result['parameters'] / 1e6:.2f} M", result["chunk_size"], f"{chunk['median']:.2f}",
         result["equivalent_hz"],
     ]  # fmt: skip
     heads = ["", "Parameters", "Chunk H", "Chunk t, ms", "Actions per second, 1000 H / t"]
     note = (
-        f"The rows above ours are quoted from the paper. A chunk's 99th percentile is {chunk['p99']} ms (n = "
-        f"{chunk['n']}). An episode's first action, for which the objects are found in the images, takes "
-        f"{first['median']} ms ({first['p99']}, n = {first['n']}). One thread."
+        f"The rows above ours are quoted from the paper. A chunk's 99th percentile is {chunk['p99']:.2f} ms "
+        f"(n = {chunk['n']}). An episode's first action, for which the objects are found in the images, "
+        f"takes {first['median']:.2f} ms ({first['p99']:.2f}, n = {first['n']}). One thread."
     )
     return f"{table(heads, [*rows, ours])}\n\n{note}"
 
@@ -122,45 +113,31 @@ def _failures(result: Quoted) -> str:
 
 def _execution(result: Quoted) -> str:
     runs = result["runs"]
-    rows = [
-        [
-            name.replace("_", " "), percent(runs[name]), interval(runs[name]), runs[name]["n"],
-            runs[name]["mean_steps"], f"{paper} %",
-        ]
-        for name, paper in PAPER_EXECUTION.items()
-    ]  # fmt: skip
-    return table(["", "Success", "95 % interval", "Episodes", "Mean steps of successes", "Paper"], rows)
+    rows = {name: {**runs[name], "paper": f"{paper} %"} for name, paper in PAPER_EXECUTION.items()}
+    return grid(rows, {**STEPS, "Paper": "paper"})
 
 
 def _memory(result: Quoted) -> str:
     runs = result["runs"]
-    sources = {
-        "memory, poses from pixels": ("closed_loop_trc", "85.6 %"),
-        "memory, the simulator's poses": ("oracle", None),
-        "guess, the simulator's poses": ("geometric_guess", f"{PAPER_GUESS} %"),
+    rows = {
+        "memory, poses from pixels": {**runs["closed_loop_trc"], "paper": "85.6 %"},
+        "memory, the simulator's poses": {**runs["oracle"], "paper": None},
+        "guess, the simulator's poses": {**runs["geometric_guess"], "paper": f"{PAPER_GUESS} %"},
     }
-    rows = [
-        [told, percent(runs[name]), interval(runs[name]), runs[name]["n"], paper]
-        for told, (name, paper) in sources.items()
-    ]
     note = (
         "The guess, which knows no demonstration: grasp the centroid from above, release above the landmark. "
         "It gets the simulator's poses and sizes of the objects. The paper asks a multimodal model instead: "
         "see [judgement.md](judgement.md)."
     )
-    return f"{table(['Key poses from', 'Success', '95 % interval', 'Episodes', 'Paper'], rows)}\n\n{note}"
+    return f"{grid(rows, {**SUCCESS, 'Paper': 'paper'}, 'Key poses from')}\n\n{note}"
 
 
 def _accuracy(result: Quoted) -> str:
-    objects = [
-        [name, row["n"], row["position_mm_mean"], row["position_mm_p95"], row["yaw_deg_mean"]]
-        for name, row in result["objects"].items()
-    ]
-    tasks = [
-        [task.replace("_", " "), row["n"], row["position_mm_mean"], row["position_mm_p95"], paper]
-        for (task, row), paper in zip(result["tasks"].items(), PAPER_MM, strict=True)
-    ]
-    heads = ["n", "Mean, mm", "95th percentile, mm"]
+    columns: Columns = {
+        "n": "poses",
+        "Mean, mm": "position_mm_mean",
+        "95th percentile, mm": "position_mm_p95",
+    }
     note = (
         "Against the simulator, at the start of evaluated episodes, of the objects that a task touches. A "
         "learned object's frame stands anywhere on it: one rigid offset per object was fitted on the "
@@ -168,42 +145,24 @@ def _accuracy(result: Quoted) -> str:
         "to stand as demonstrated. The paper's column compares its filter with another estimator, not with "
         "the truth."
     )
-    per_object = table(["Object", *heads, "Yaw, degrees"], objects)
-    return f"{per_object}\n\n{table(['Task', *heads, 'Paper, mm'], tasks)}\n\n{note}"
+    objects = grid(result["objects"], {**columns, "Yaw, degrees": "orientation_deg_mean"}, "Object")
+    tasks = zip(result["tasks"].items(), PAPER_MM, strict=True)
+    rows = {task: {**row, "paper": mm} for (task, row), mm in tasks}
+    return f"{objects}\n\n{grid(rows, {**columns, 'Paper, mm': 'paper'}, 'Task')}\n\n{note}"
 
 
 def _few_shot(results: list[Quoted]) -> str:
-    rows = [
-        [r["demonstrations"], percent(r), interval(r), r["n"], r["mean_steps"], r["mine_and_train_s"]]
-        for r in results
-    ]
-    heads = [
-        "Demonstrations a task",
-        "Success",
-        "95 % interval",
-        "Episodes",
-        "Mean steps",
-        "Mining and training, s",
-    ]
-    return table(heads, rows)
+    rows = {str(result["demonstrations"]): result for result in results}
+    more = {"Mean steps": "mean_steps", "Mining and training, s": "mine_and_train_s"}
+    return grid(rows, {**SUCCESS, **more}, "Demonstrations a task")
 
 
 def _new_tasks(results: list[Quoted]) -> str:
-    rows = [
-        [r["task"].replace("_", " "), r["demonstrations"], percent(r), interval(r), r["n"], r["teach_s"]]
-        for r in results
-    ]
-    mean = sum(r["success"] for r in results) / len(results)
-    heads = [
-        "Task left out of training",
-        "Demonstrations",
-        "Success",
-        "95 % interval",
-        "Episodes",
-        "Teaching, s",
-    ]
+    rows = {result["task"]: result for result in results}
+    columns: Columns = {"Demonstrations": "demonstrations", **SUCCESS, "Teaching, s": "teach_s"}
+    mean = sum(result["success"] for result in results) / len(results)
     note = f"Mean over these {len(results)} tasks: {100 * mean:.1f} %. No gradient step after teaching."
-    return f"{table(heads, rows)}\n\n{note}"
+    return f"{grid(rows, columns, 'Task left out of training')}\n\n{note}"
 
 
 def _losses(result: Quoted) -> str:

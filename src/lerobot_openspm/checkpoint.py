@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -13,16 +14,9 @@ from huggingface_hub.errors import HFValidationError
 from lerobot_openspm.configuration_openspm import OpenSPMConfig
 from lerobot_openspm.errors import MemoryFormatError
 from lerobot_openspm.geometry.camera import check_sizes
-from lerobot_openspm.memory.files import data_files
-from lerobot_openspm.memory.header import check_layouts
-from lerobot_openspm.memory.memory import (
-    CAMERAS_JSON,
-    MEMORY_JSON,
-    Memory,
-    check_anchors,
-    check_labels,
-    read_memory,
-)  # fmt: skip
+from lerobot_openspm.memory.bank import anchored_objects
+from lerobot_openspm.memory.io import MEMORY_JSON, arrays_file, read_memory
+from lerobot_openspm.memory.memory import Memory, check_layouts
 
 
 def checkpoint_folder(name: str | Path, revision: str | None = None, **options: Any) -> Path:
@@ -40,15 +34,15 @@ def checkpoint_folder(name: str | Path, revision: str | None = None, **options: 
     if directory.is_dir():
         return directory
     download = partial(snapshot_download, str(name), **options)
-    files = [CONFIG_NAME, SAFETENSORS_SINGLE_FILE, MEMORY_JSON, CAMERAS_JSON]
+    files = [CONFIG_NAME, SAFETENSORS_SINGLE_FILE, MEMORY_JSON]
     try:
         directory = Path(download(allow_patterns=files, revision=revision))
     except HFValidationError as error:
         raise FileNotFoundError(
             f"no checkpoint folder at {name}, and no name on the Hub (user/name)"
         ) from error
-    # What else it needs is named there. Pushes before may have left other files of this kind.
-    download(allow_patterns=data_files(directory), revision=directory.name)
+    # The file of arrays is named there. Pushes before may have left others of this kind.
+    download(allow_patterns=[arrays_file(directory)], revision=directory.name)
     return directory
 
 
@@ -70,8 +64,11 @@ def load_memory(directory: Path, config: OpenSPMConfig, is_kept: bool) -> Memory
         raise MemoryFormatError(
             f"the memory in {directory} holds no entries, so nothing can be done with it; train again"
         )
-    for name in ("perception", "segmentation", "shape"):
-        made, asked = getattr(memory, name), getattr(config, name)
+    found_by = "oracle" if memory.perception == "oracle" else memory.segmentation
+    for name, made, asked in (
+        ("perception", found_by, config.perception),
+        ("segmentation.shape", memory.shape, config.segmentation.shape),
+    ):
         if made != asked:
             raise MemoryFormatError(
                 f"the memory in {directory} holds key poses in the frames of {name}={made}, got "
@@ -81,6 +78,44 @@ def load_memory(directory: Path, config: OpenSPMConfig, is_kept: bool) -> Memory
         where = str(directory / MEMORY_JSON)
         check_layouts(memory.layouts, config.layouts(), "the configuration's", where)
         check_anchors(memory, where)
-        check_labels(memory, config.mask_labels, str(directory / CONFIG_NAME))
-    check_sizes(memory.cameras, config.image_sizes, config.cameras or str(directory / CAMERAS_JSON))
+        check_labels(memory, config.segmentation.labels, str(directory / CONFIG_NAME))
+    check_sizes(memory.cameras, config.image_sizes, config.cameras or str(directory / MEMORY_JSON))
     return memory
+
+
+def check_anchors(memory: Memory, where: str) -> None:
+    """Every object that a key pose is relative to has to be one that perception can look for.
+
+    Args:
+        memory: What was loaded.
+        where: Names its file in errors.
+
+    Raises:
+        MemoryFormatError: There is no model of an object.
+    """
+    known_objects = memory.objects
+    for name in sorted(anchored_objects(memory.entries) - set(known_objects)):
+        if memory.perception != "oracle":
+            raise MemoryFormatError(
+                f"{where}: entries have key poses at {name!r}, which is none of the 'objects' that "
+                f"perception knows ({', '.join(sorted(known_objects)) or 'none'}); train or pull it again"
+            )
+
+
+def check_labels(memory: Memory, labels: Mapping[str, int] | None, where: str) -> None:
+    """Every object that is found by given masks has to have a number in them.
+
+    Args:
+        memory: What was loaded.
+        labels: Number by phrase; None where masks are not given.
+        where: Names the file with the labels in errors.
+
+    Raises:
+        MemoryFormatError: An object has none.
+    """
+    if labels is not None and (missing := sorted(set(memory.objects) - set(labels))):
+        raise MemoryFormatError(
+            f"{where}: 'segmentation.labels' has no number for {', '.join(missing)}, which the memory has "
+            f"key poses at; it has {', '.join(sorted(labels))}. Pass --policy.segmentation.labels='{{...}}' "
+            "with all of them"
+        )

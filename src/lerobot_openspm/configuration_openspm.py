@@ -3,25 +3,121 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
-from typing import Any, Literal, get_args
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any, ClassVar, Literal, get_args
 from urllib.parse import urlsplit
 
 from lerobot.configs import NormalizationMode, PreTrainedConfig
 from lerobot.optim import AdamWConfig, CosineDecayWithWarmupSchedulerConfig
 from lerobot.utils.constants import ACTION, OBS_STATE
 
-from lerobot_openspm.control.checks import TransferLimits
-from lerobot_openspm.control.strategies import ControlSettings, Execution
-from lerobot_openspm.flow.condition import Conditioning
-from lerobot_openspm.geometry.vector_layout import ROTATION_KINDS, VectorLayout, parse_layout
-from lerobot_openspm.memory.retrieval import ScoreWeights
-from lerobot_openspm.types import Segmenter, Shape
+from lerobot_openspm.geometry.vector_layout import RotationKind, VectorLayout, parse_layout
+from lerobot_openspm.types import Conditioning, Execution, Segmenter, Shape
 
-PerceptionSource = Literal["demonstrations", "oracle"]
-Segmentation = Literal["demonstrations", "sam3", "grounded_sam2", "given"]
+PerceptionSource = Literal["demonstrations", "sam3", "grounded_sam2", "given", "oracle"]
 MemoryUpdate = Literal["keep", "append", "rebuild"]
-Judge = Literal["none", "openai", "qwen3vl", "annotations"]
+JudgeType = Literal["none", "openai", "qwen3vl", "annotations"]
+
+# Perceptions with weights of their own, and all with masks.
+PRETRAINED = ("sam3", "grounded_sam2")
+SEGMENTERS = (*PRETRAINED, "given")
+CHOICES = {
+    "perception": PerceptionSource,
+    "memory_update": MemoryUpdate,
+    "conditioning": Conditioning,
+    "execution": Execution,
+}
+
+# The flow model's training. The rate has decayed after the 3000 steps of the ready-made configurations.
+LEARNING_RATE, FINAL_RATE = 2e-3, 2e-3 / 50
+WEIGHT_DECAY, GRADIENT_NORM = 1e-4, 1.0
+WARMUP_STEPS, DECAY_STEPS = 50, 3000
+
+
+@dataclass
+class SegmentationConfig:
+    """What a segmenter needs, and what is learned from its masks: ``--policy.segmentation.*``.
+
+    Args:
+        weights: Hub names or folders of a pretrained segmenter's weights: one for perception "sam3", detector
+            and masks for "grounded_sam2". The usual ones if not given.
+        labels: Number of each phrase in the masks, for perception "given", e.g. ``{"bowl": 1}``.
+        shape: What is learned of an object. "demonstrations": its shape, from the masks of all of them.
+            "box": the upright box or cylinder around it; one demonstration is enough. "sam3d": the same box,
+            of the size that SAM 3D Objects estimates, which runs in its own environment.
+        sam3d_python: Python of the environment that SAM 3D Objects is installed in, see ``docs/sam3d.md``.
+        sam3d_checkout: Folder of its repository, with its weights.
+    """
+
+    weights: list[str] | None = None
+    labels: dict[str, int] | None = None
+    shape: Shape = "demonstrations"
+    sam3d_python: str | None = None
+    sam3d_checkout: str | None = None
+
+    def __post_init__(self) -> None:
+        _require_choice("segmentation.shape", self.shape, get_args(Shape))
+        if self.shape != "sam3d" and (self.sam3d_python or self.sam3d_checkout):
+            raise ValueError(
+                f"segmentation.sam3d_python and sam3d_checkout are for shape 'sam3d', got {self.shape!r}; "
+                "pass --policy.segmentation.shape=sam3d too, or leave them out"
+            )
+        for phrase, number in (self.labels or {}).items():
+            if type(number) is not int or number < 1:
+                raise ValueError(
+                    f"segmentation.labels[{phrase!r}] is {number!r}, expected a number from 1 on"
+                )
+
+
+@dataclass
+class JudgeConfig:
+    """What says, beside motion and gripper, which phase ends at a key pose: ``--policy.judge.*``.
+
+    See ``docs/judgement.md``.
+
+    Args:
+        type: "none". "openai": a multimodal model behind an OpenAI-compatible endpoint. "qwen3vl": Qwen3-VL
+            in this process. "annotations": the sub-tasks that lerobot-annotate wrote.
+        api_base: Address of the endpoint of "openai", up to and with ``/v1``; lerobot-annotate's default,
+            ``http://localhost:8000/v1``, if not given. Its key, if it wants one, is read from the environment
+            variable OPENSPM_JUDGE_API_KEY.
+        model_id: Which of the endpoint's models to ask. For "qwen3vl" a Hub name or a folder;
+            ``Qwen/Qwen3-VL-2B-Instruct`` if not given.
+        confidence: An answer below this confidence, from 0 to 1, changes nothing.
+        timeout_s: How long to wait for the endpoint's answer about one episode, in seconds.
+    """
+
+    type: JudgeType = "none"
+    api_base: str | None = None
+    model_id: str | None = None
+    confidence: float = 0.6
+    timeout_s: float = 60.0
+
+    def __post_init__(self) -> None:
+        _require_choice("judge.type", self.type, get_args(JudgeType))
+        _require("judge.confidence", self.confidence, 0 <= self.confidence <= 1, "0 to 1")
+        _require("judge.timeout_s", self.timeout_s, self.timeout_s > 0, "more than 0")
+        if self.type == "openai" and not self.model_id:
+            raise ValueError(
+                "judge.type is 'openai', but judge.model_id is not given; pass --policy.judge.model_id=NAME, "
+                "one of those that the endpoint's /models lists"
+            )
+        if self.api_base is None:
+            return
+        if self.type != "openai":
+            raise ValueError(
+                f"judge.api_base is for judge.type 'openai', got {self.type!r}; pass "
+                "--policy.judge.type=openai too, or leave it out"
+            )
+        address = urlsplit(self.api_base)
+        plain = not (address.query or address.fragment or "@" in address.netloc)
+        if address.scheme not in ("http", "https") or not address.hostname or not plain:
+            raise ValueError(
+                "judge.api_base is no plain http:// or https:// address (without user, password or query, "
+                "which would be logged); pass e.g. http://localhost:8000/v1, and a key in the environment "
+                "variable OPENSPM_JUDGE_API_KEY"
+            )
 
 
 @PreTrainedConfig.register_subclass("openspm")
@@ -31,7 +127,8 @@ class OpenSPMConfig(PreTrainedConfig):
 
     The defaults are those measured on the bundled tabletop. What must be given for a new robot is the
     calibration of its cameras, and the layouts of state and action where the dataset's feature names do not
-    tell them.
+    say what the numbers are. The optimizer and its schedule are LeRobot's options: ``--optimizer.*`` and
+    ``--scheduler.*`` with ``--use_policy_training_preset=false``.
 
     Args:
         cameras: Calibration file of the cameras to look through (see ``configs/cameras``). Needed for
@@ -39,230 +136,126 @@ class OpenSPMConfig(PreTrainedConfig):
         state_layout: Name of every number of ``observation.state``; read from the dataset if not given. See
             `lerobot_openspm.geometry.vector_layout` for the names.
         action_layout: Name of every number of ``action``; read from the dataset if not given.
-        state_rotation: How the state writes the rotation, where its names are wrong about it: "axis_angle",
-            "quat", "euler" or "none".
-        action_rotation: Likewise for the action.
-        control_hz: How often the robot takes an action; what the dataset says of itself if not given. Actions
-            are counted in steps; only how long something was not seen is told in seconds.
-        hand_radius_m: Radius of the hand, which hides from the cameras what is behind it.
-        perception: "demonstrations" finds objects in the images, by what the demonstrations showed of them.
-            "oracle" takes their poses from the simulator, for ablations only.
+        rotation: How state and action write rotations, where their names are wrong about it: "axis_angle",
+            "quat" or "euler"; "none" ignores the rotation. Where the two differ, name them in the layouts.
+        control_hz: Actions per second that the robot takes; the dataset's frame rate if not given. Motions
+            are counted in steps; only how long an object or a camera was not seen is counted in seconds.
+        hand_radius_m: Radius of the hand, in metres. It hides from the cameras what is behind it: those
+            pixels say nothing about where objects are.
+        perception: What finds objects. "demonstrations": the colours and patches that the demonstrations
+            showed. "sam3" and "grounded_sam2": pretrained segmenters that take any phrase. "given": the
+            masks in ``observation.masks.<camera>``. "oracle": the simulator's poses, for ablations only.
         tracking: Whether objects are followed through the episode, and key poses with them. Otherwise they
-            are found once, at its start, as in the paper, and no picture is looked at, nor missed, after it.
-        segmentation: What finds the objects' pixels. "demonstrations": the colours and patches that the
-            demonstrations showed. "sam3" and "grounded_sam2": pretrained models that take any phrase.
-            "given": the numbers in ``observation.masks.<camera>``.
-        segmentation_weights: Names on the Hub, or folders, of a pretrained segmenter's weights: one for
-            "sam3", detector and masks for "grounded_sam2"; the usual ones if not given.
-        shape: What is learned of an object that a segmenter finds. "demonstrations": its shape, from the
-            masks of all of them. "box": the upright box or cylinder around it; one demonstration is enough.
-            "sam3d": the same, of the size that SAM 3D Objects tells, which runs in its own environment.
-        sam3d_python: Python of the environment that SAM 3D Objects is installed in, see ``docs/sam3d.md``.
-        sam3d_checkout: Folder of its repository, with its weights.
-        mask_labels: Number of each phrase in the masks, for segmentation "given", e.g. ``{"bowl": 1}``.
-        memory_episodes: Episodes that may enter the memory and the training samples; all if not given. Name
-            them when some are held out: the policy is shown the whole dataset otherwise.
+            are found once, at its start, as in the paper, and later pictures are neither needed nor used.
+        segmentation: What a segmenter needs, and what is learned from its masks.
+        memory_episodes: Indices of the episodes that may enter the memory and the training samples; all if
+            not given. Name them when some are held out: the policy is shown the whole dataset otherwise.
         memory_update: What happens to a checkpoint's memory when training goes on from it: "keep" it,
             "append" the dataset's episodes, or "rebuild" it from them.
-        phase_judge: Who says, beside motion and gripper, which phase ends at a key pose; see
-            ``docs/judgement.md``. "none". "openai": a multimodal model behind an OpenAI-compatible endpoint.
-            "qwen3vl": Qwen3-VL in this process. "annotations": the sub-tasks that lerobot-annotate wrote.
-        phase_judge_api_base: Where the endpoint of "openai" is, up to and with ``/v1``; lerobot-annotate's
-            default, ``http://localhost:8000/v1``, if not given. Its key, if it wants one, is read from the
-            environment variable OPENSPM_JUDGE_API_KEY.
-        phase_judge_model_id: Which of the endpoint's models to ask. For "qwen3vl" a name on the Hub, or a
-            folder; ``Qwen/Qwen3-VL-2B-Instruct`` if not given.
-        phase_judge_confidence: What a judge says with less confidence changes nothing.
-        phase_judge_timeout_s: How long to wait for the endpoint's answer about one episode.
-        phase_judge_cache: Folder to keep answers in, so that nothing is asked twice;
-            ``openspm/phase_judgements`` in LeRobot's cache if not given.
+        name_embeddings: Folder or Hub name of a model2vec model that recognises names of objects which the
+            lexicon does not know; needs the extra ``[text]``. None: the lexicon alone.
+        lexicon: File of words that instructions are read by beside the built-in ones, of the form of
+            ``lerobot_openspm/language/lexicon.yaml``: other names of things, verbs, wordings. A checkpoint
+            keeps its contents here.
+        judge: What says, beside motion and gripper, which phase ends at a key pose.
         chunk_size: Actions per chunk, the paper's H.
-        n_action_steps: Actions executed before the next chunk.
-        conditioning: "equivariant" tells the flow model the relative pose in the frame of the target key
-            pose; "paper" tells it the poses in the world.
-        hidden_dim: Width of the flow model; the default gives about 240 K parameters.
-        num_inference_steps: Euler steps from noise to a chunk.
-        samples_per_frame: (frame, noise, time) samples drawn for each frame that the loader brings. The
-            loader takes longer for one frame than the model for a hundred.
-        perturbation_m: Spread of the displacements added to training samples.
-        perturbation_rad: Spread of the rotations added to training samples.
-        execution: "open_loop", "closed_loop", or "closed_loop_trc" with terminal residual correction.
-        residual_m: A contact key pose is met within this distance, the paper's epsilon_r.
-        residual_rad: ... and this angle.
-        passing_m: A key pose in free space is passed within this distance.
-        passing_rad: ... and this angle.
-        max_corrections: Corrective chunks per key pose before it counts as not met.
-        max_attempts: How often a missed grasp or an unmet key pose is tried again in an episode.
-        name_embeddings: Folder, or name on the Hub, of a model2vec model that recognises names of objects
-            which the table of words does not know; needs the extra ``[text]``. None: the table alone.
-        weight_semantic: The paper's lambda_s, weight of the instruction in retrieval.
-        weight_geometric: The paper's lambda_g, weight of the scene.
-        weight_quality: The paper's lambda_r, weight of the entry's quality.
-        reach_margin_m: How far outside the demonstrated workspace a key pose may lie.
-        max_jump_m: Longest way between consecutive key poses.
-        max_jump_rad: Largest turn between consecutive key poses.
-        min_clearance_m: How far below the lowest demonstrated hand position a key pose may lie.
+        n_action_steps: Actions executed before the next chunk, 1 to ``chunk_size``.
+        conditioning: "equivariant" gives the flow model the relative pose in the frame of the target key
+            pose; "paper" gives it the poses in the world.
+        num_inference_steps: Euler steps from noise to a chunk. More are slower and follow the flow closer.
+        samples_per_frame: (frame, noise, time) samples drawn for each frame that the loader brings: the
+            batch size per loaded frame. The loader takes longer for one frame than the model for a hundred.
         noise_seed: Seed of the flow model's noise, which is drawn per (seed, episode, chunk).
+        execution: How key poses are followed: "open_loop" plans each chunk from where the hand should be,
+            "closed_loop" from where it is, "closed_loop_trc" adds terminal residual correction.
+        reach_margin_m: How far outside the demonstrated workspace a key pose may lie, in metres. What lies
+            further out is refused.
+        min_clearance_m: How far below the lowest demonstrated hand position a key pose may lie, in metres.
     """
 
-    normalization_mapping: dict[str, NormalizationMode] = field(
-        default_factory=lambda: dict.fromkeys(("VISUAL", "STATE", "ACTION"), NormalizationMode.IDENTITY)
+    # Poses and images are used as they are. LeRobot's processors ask for it; it is no option.
+    normalization_mapping: ClassVar[dict[str, NormalizationMode]] = dict.fromkeys(
+        ("VISUAL", "STATE", "ACTION"), NormalizationMode.IDENTITY
     )
 
     # Robot and cameras.
     cameras: str | None = None
     state_layout: list[str] | None = None
     action_layout: list[str] | None = None
-    state_rotation: str | None = None
-    action_rotation: str | None = None
+    rotation: RotationKind | None = None
     control_hz: float | None = None
     hand_radius_m: float = 0.08
 
-    # Memory and perception.
+    # Perception.
     perception: PerceptionSource = "demonstrations"
     tracking: bool = True
-    segmentation: Segmentation = "demonstrations"
-    segmentation_weights: list[str] | None = None
-    shape: Shape = "demonstrations"
-    sam3d_python: str | None = None
-    sam3d_checkout: str | None = None
-    mask_labels: dict[str, int] | None = None
+    segmentation: SegmentationConfig = field(default_factory=SegmentationConfig)
+
+    # Memory.
     memory_episodes: list[int] | None = None
     memory_update: MemoryUpdate = "keep"
     name_embeddings: str | None = None
-    phase_judge: Judge = "none"
-    phase_judge_api_base: str | None = None
-    phase_judge_model_id: str | None = None
-    phase_judge_confidence: float = 0.6
-    phase_judge_timeout_s: float = 60.0
-    phase_judge_cache: str | None = None
-    weight_semantic: float = 1.0
-    weight_geometric: float = 0.5
-    weight_quality: float = 0.5
+    lexicon: str | None = None
+    judge: JudgeConfig = field(default_factory=JudgeConfig)
 
     # Flow model.
     chunk_size: int = 5
     n_action_steps: int = 5
     conditioning: Conditioning = "equivariant"
-    hidden_dim: int = 268
     num_inference_steps: int = 8
     samples_per_frame: int = 256
-    perturbation_m: float = 0.006
-    perturbation_rad: float = 0.04
     noise_seed: int = 0
 
     # Control.
     execution: Execution = "closed_loop_trc"
-    residual_m: float = 0.004
-    residual_rad: float = 0.06
-    passing_m: float = 0.015
-    passing_rad: float = 0.15
-    max_corrections: int = 8
-    max_attempts: int = 3
     reach_margin_m: float = 0.10
-    max_jump_m: float = 0.8
-    max_jump_rad: float = 2.8
     min_clearance_m: float = 0.01
-
-    # Training.
-    optimizer_lr: float = 2e-3
-    optimizer_weight_decay: float = 1e-4
-    scheduler_warmup_steps: int = 50
-    scheduler_decay_steps: int = 3000
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        _require_choice("perception", self.perception, get_args(PerceptionSource))
-        _require_choice("segmentation", self.segmentation, get_args(Segmentation))
-        _require_choice("shape", self.shape, get_args(Shape))
+        for name, kinds in CHOICES.items():
+            _require_choice(name, getattr(self, name), get_args(kinds))
+        if self.rotation is not None:
+            _require_choice("rotation", self.rotation, get_args(RotationKind))
         self._check_segmentation()
-        _require_choice("phase_judge", self.phase_judge, get_args(Judge))
-        self._check_judge()
-        _require_choice("memory_update", self.memory_update, get_args(MemoryUpdate))
-        _require_choice("conditioning", self.conditioning, get_args(Conditioning))
-        _require_choice("execution", self.execution, get_args(Execution))
-        scaled = {k: v for k, v in self.normalization_mapping.items() if v is not NormalizationMode.IDENTITY}
-        if scaled:
-            raise ValueError(
-                f"normalization_mapping scales {scaled}, but OpenSPM works on poses and images as they are; "
-                "leave it out"
-            )
-        for name in ("state_rotation", "action_rotation"):
-            if getattr(self, name) is not None:
-                _require_choice(name, getattr(self, name), ROTATION_KINDS)
-        if not 1 <= self.n_action_steps <= self.chunk_size:
-            raise ValueError(
-                f"n_action_steps is {self.n_action_steps}, expected 1 to chunk_size ({self.chunk_size})"
-            )
-        positive = (
-            "hidden_dim", "num_inference_steps", "samples_per_frame", "residual_m", "residual_rad",
-            "passing_m", "passing_rad", "hand_radius_m", "max_jump_m", "max_jump_rad", "optimizer_lr",
-            "scheduler_decay_steps", "phase_judge_timeout_s",
-        )  # fmt: skip
-        for name in positive:
-            if not getattr(self, name) > 0:  # NaN is not either
-                raise ValueError(f"{name} is {getattr(self, name)}, expected more than 0")
-        if self.control_hz is not None and not self.control_hz > 0:
-            raise ValueError(f"control_hz is {self.control_hz}, expected more than 0, or none")
-        not_negative = (
-            "perturbation_m", "perturbation_rad", "max_corrections", "max_attempts", "reach_margin_m",
-            "min_clearance_m", "weight_semantic", "weight_geometric", "weight_quality", "noise_seed",
-        )  # fmt: skip
-        for name in not_negative:
-            if not getattr(self, name) >= 0:
-                raise ValueError(f"{name} is {getattr(self, name)}, expected 0 or more")
+        steps, most = self.n_action_steps, self.chunk_size
+        _require("n_action_steps", steps, 1 <= steps <= most, f"1 to chunk_size ({most})")
+        for name in ("num_inference_steps", "samples_per_frame", "hand_radius_m", "control_hz"):
+            value = getattr(self, name)
+            _require(name, value, value is None or value > 0, "more than 0")  # NaN is not either
+        for name in ("reach_margin_m", "min_clearance_m", "noise_seed"):
+            _require(name, getattr(self, name), getattr(self, name) >= 0, "0 or more")
 
     def _check_segmentation(self) -> None:
-        """Options that say something of masks need something that gives masks."""
-        if self.segmentation == "demonstrations" and self.shape != "demonstrations":
+        """Options of a segmenter need a segmenter."""
+        labels, has_masks = self.segmentation.labels, self.perception in SEGMENTERS
+        if not has_masks and self.segmentation.shape != "demonstrations":
             raise ValueError(
-                f"shape is {self.shape!r}, but without a segmenter colours and shape are learned together; "
-                "pass --policy.segmentation=sam3, grounded_sam2 or given"
+                f"segmentation.shape is {self.segmentation.shape!r}, but perception {self.perception!r} has "
+                "no masks; pass --policy.perception=sam3, grounded_sam2 or given"
             )
-        if self.shape != "sam3d" and (self.sam3d_python or self.sam3d_checkout):
+        if self.segmentation.weights and self.perception not in PRETRAINED:
             raise ValueError(
-                f"sam3d_python and sam3d_checkout are for shape 'sam3d', got {self.shape!r}; pass "
-                "--policy.shape=sam3d too, or leave them out"
+                f"segmentation.weights are for perception {' and '.join(PRETRAINED)}, got "
+                f"{self.perception!r}; pass --policy.perception=sam3 too, or leave them out"
             )
-        if self.segmentation != "demonstrations" and self.perception == "oracle":
+        if (self.perception == "given") != (labels is not None):
             raise ValueError(
-                f"segmentation is {self.segmentation!r}, but perception=oracle looks at no masks; leave one "
-                "of the two out"
+                f"perception is {self.perception!r}, segmentation.labels is {labels}, expected labels with "
+                "perception=given and with nothing else; pass e.g. --policy.perception=given "
+                """--policy.segmentation.labels='{"bowl": 1}'"""
             )
-        if (self.segmentation == "given") != (self.mask_labels is not None):
-            raise ValueError(
-                f"segmentation is {self.segmentation!r}, mask_labels is {self.mask_labels}, expected labels "
-                "with segmentation=given and with nothing else; pass e.g. --policy.segmentation=given "
-                """--policy.mask_labels='{"bowl": 1}'"""
-            )
-        for phrase, number in (self.mask_labels or {}).items():
-            if type(number) is not int or number < 1:
-                raise ValueError(f"mask_labels[{phrase!r}] is {number!r}, expected a number from 1 on")
 
-    def _check_judge(self) -> None:
-        """An endpoint needs a plain address, a model's name and somebody who asks it."""
-        if not 0 <= self.phase_judge_confidence <= 1:
-            raise ValueError(f"phase_judge_confidence is {self.phase_judge_confidence}, expected 0 to 1")
-        if self.phase_judge == "openai" and not self.phase_judge_model_id:
-            raise ValueError(
-                "phase_judge is 'openai', but phase_judge_model_id is not given; pass "
-                "--policy.phase_judge_model_id=NAME, one of those that the endpoint's /models lists"
-            )
-        if self.phase_judge_api_base is None:
-            return
-        if self.phase_judge != "openai":
-            raise ValueError(
-                f"phase_judge_api_base is for phase_judge 'openai', got {self.phase_judge!r}; pass "
-                "--policy.phase_judge=openai too, or leave it out"
-            )
-        address = urlsplit(self.phase_judge_api_base)
-        plain = not (address.query or address.fragment or "@" in address.netloc)
-        if address.scheme not in ("http", "https") or not address.hostname or not plain:
-            raise ValueError(
-                "phase_judge_api_base is no plain http:// or https:// address (without user, password or "
-                "query, which would be logged); pass e.g. http://localhost:8000/v1, and a key in the "
-                "environment variable OPENSPM_JUDGE_API_KEY"
-            )
+    def without_places(self) -> OpenSPMConfig:
+        """A copy to save: addresses and folders that mean nothing on another machine are left out."""
+        names = self.name_embeddings
+        return replace(
+            self,
+            cameras=None,
+            segmentation=replace(self.segmentation, sam3d_python=None, sam3d_checkout=None),
+            judge=replace(self.judge, api_base=None),
+            name_embeddings=None if names and Path(names).is_dir() else names,
+        )
 
     def set_dataset_feature_metadata(self, features: Mapping[str, Any]) -> None:
         """Take the layouts from the dataset's feature names where they were not given. Called by LeRobot."""
@@ -270,38 +263,24 @@ class OpenSPMConfig(PreTrainedConfig):
         self.action_layout = self.action_layout or feature_names(features.get(ACTION, {}).get("names"))
 
     def make_segmenter(self) -> Segmenter | None:
-        """What finds the objects' masks; None where the demonstrations teach objects' looks.
+        """What finds the objects' masks; None where there are none.
 
         Raises:
             PerceptionError: It cannot be used.
         """
-        if self.segmentation == "demonstrations":
+        if self.perception not in SEGMENTERS:
             return None
         from lerobot_openspm.perception.segmentation.make import make_segmenter
 
-        weights, labels = self.segmentation_weights or (), self.mask_labels or {}
-        return make_segmenter(self.segmentation, {}, labels, weights, str(self.device))
+        weights, labels = self.segmentation.weights or (), self.segmentation.labels or {}
+        return make_segmenter(self.perception, labels, weights, str(self.device))
 
     def layouts(self) -> tuple[VectorLayout, VectorLayout]:
         """Layouts of state and action. Raises LayoutError when names are missing or make no sense."""
-        state = parse_layout(self.state_layout or [], "state", self.state_rotation)  # type: ignore[arg-type]
-        action = parse_layout(self.action_layout or [], "action", self.action_rotation)  # type: ignore[arg-type]
-        return state, action
-
-    @property
-    def control_settings(self) -> ControlSettings:
-        """The options that say how key poses are followed."""
-        return ControlSettings(**{name: getattr(self, name) for name in ControlSettings.__dataclass_fields__})
-
-    @property
-    def transfer_limits(self) -> TransferLimits:
-        """The bounds of the checks on transferred key poses."""
-        return TransferLimits(**{name: getattr(self, name) for name in TransferLimits.__dataclass_fields__})
-
-    @property
-    def score_weights(self) -> ScoreWeights:
-        """The weights of retrieval."""
-        return ScoreWeights(self.weight_semantic, self.weight_geometric, self.weight_quality)
+        return (
+            parse_layout(self.state_layout or [], "state", self.rotation),
+            parse_layout(self.action_layout or [], "action", self.rotation),
+        )
 
     @property
     def image_sizes(self) -> dict[str, tuple[int, int]]:
@@ -330,15 +309,15 @@ class OpenSPMConfig(PreTrainedConfig):
 
     def get_optimizer_preset(self) -> AdamWConfig:
         """AdamW over the flow model, as LeRobot's training uses it unless told otherwise."""
-        return AdamWConfig(lr=self.optimizer_lr, weight_decay=self.optimizer_weight_decay, grad_clip_norm=1.0)
+        return AdamWConfig(lr=LEARNING_RATE, weight_decay=WEIGHT_DECAY, grad_clip_norm=GRADIENT_NORM)
 
     def get_scheduler_preset(self) -> CosineDecayWithWarmupSchedulerConfig:
-        """Cosine decay; LeRobot scales it to the number of training steps."""
+        """Cosine decay; LeRobot shortens it for fewer training steps."""
         return CosineDecayWithWarmupSchedulerConfig(
-            peak_lr=self.optimizer_lr,
-            decay_lr=self.optimizer_lr / 50,
-            num_warmup_steps=self.scheduler_warmup_steps,
-            num_decay_steps=self.scheduler_decay_steps,
+            peak_lr=LEARNING_RATE,
+            decay_lr=FINAL_RATE,
+            num_warmup_steps=WARMUP_STEPS,
+            num_decay_steps=DECAY_STEPS,
         )
 
     @property
@@ -358,8 +337,12 @@ class OpenSPMConfig(PreTrainedConfig):
 
 
 def _require_choice(name: str, got: str, expected: tuple[str, ...]) -> None:
-    if got not in expected:
-        raise ValueError(f"{name} is {got!r}, expected one of {', '.join(expected)}")
+    _require(name, repr(got), got in expected, f"one of {', '.join(expected)}")
+
+
+def _require(name: str, got: object, is_right: bool, expected: str) -> None:
+    if not is_right:
+        raise ValueError(f"{name} is {got}, expected {expected}")
 
 
 def feature_names(names: Any) -> list[str] | None:

@@ -25,6 +25,10 @@ class InstructionError(OpenSPMError):
     """An instruction that the memory holds no memory for."""
 
 
+class LexiconError(OpenSPMError):
+    """A file of words is missing, or holds what does not belong there."""
+
+
 class ObservationError(OpenSPMError):
     """An observation lacks a camera, has images of another size, or is not finite."""
 
@@ -33,5 +37,5 @@ class PerceptionError(OpenSPMError):
     """A perception backend cannot be used: a package, weights, a worker or a phrase is missing."""
 
 
-class JudgementError(OpenSPMError):
-    """A judge of phases cannot be used, gave no answer, or one that makes no sense."""
+class PhaseLabelError(OpenSPMError):
+    """A judge of phases cannot be used, or gave no usable answer."""

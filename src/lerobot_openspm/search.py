@@ -90,7 +90,7 @@ def search_memory(
         plan = plan_parts(instruction, entries, names)
     except InstructionError as error:
         refusal = str(error)
-    parts = tuple(_ranked(part, weights) for part in plan)
+    parts = tuple(_ranked(part, weights, names) for part in plan)
     keys = {one.source.key.sub_tasks for part in plan for one in part}
     others = [
         _without_scene(entry, entry, score(asked, entry.key.sub_tasks), weights)
@@ -101,11 +101,11 @@ def search_memory(
     return Found(asked, parts, tuple(others), refusal, {})
 
 
-def _ranked(part: Sequence[Candidate], weights: ScoreWeights) -> tuple[Hit, ...]:
+def _ranked(part: Sequence[Candidate], weights: ScoreWeights, names: NameSimilarity) -> tuple[Hit, ...]:
     """What a part can be carried out by, in the order of retrieval, where nothing is known of the scene."""
     sources = {id(one.entry): one.source for one in part}
     found = retrieve(
-        [(one.entry, one.semantic) for one in part], lambda _: 1.0, replace(weights, geometric=0.0)
+        [(one.entry, one.semantic) for one in part], lambda _: 1.0, replace(weights, geometric=0.0), names
     )
     return tuple(Hit(one.entry, sources[id(one.entry)], one.semantic, None, one.total) for one in found)
 
@@ -138,37 +138,38 @@ def search_scene(policy: OpenSPMPolicy, observation: Observation) -> Found:
     in_words = search_memory(
         observation.instruction,
         policy.require_memory().entries,
-        policy.config.score_weights,
+        ScoreWeights(),
         policy.names,
     )
     if in_words.refusal:
         return in_words
     policy.reset()
     policy.act([observation])
-    row = policy.episodes[0].controller
-    if row.refusal:
-        return replace(in_words, parts=(), refusal=row.refusal, status=row.status.value)
-    sources = {id(one.entry): one.source for one in row.planner.parts[0]}
+    controller = policy.episodes[0].controller
+    state = controller.state
+    if state.refusal:
+        return replace(in_words, parts=(), refusal=state.refusal, status=state.status.value)
+    sources = {id(one.entry): one.source for one in state.parts[0]}
     ranked = tuple(
-        Hit(one.entry, sources[id(one.entry)], one.semantic, one.geometric, one.total)
-        for one in row.planner.ranked
+        Hit(one.entry, sources[id(one.entry)], one.semantic, one.geometric, one.total) for one in state.ranked
     )
     needed = dict.fromkeys(name for hit in ranked for name in hit.entry.objects)
-    seen = {name: name in row.planner.object_poses for name in needed}
-    return replace(in_words, parts=(ranked, *in_words.parts[1:]), seen=seen, status=row.status.value)
+    poses = controller.scene.tracker.poses(observation.hand.T_world_ee)
+    seen = {name: name in poses for name in needed}
+    return replace(in_words, parts=(ranked, *in_words.parts[1:]), seen=seen, status=state.status.value)
 
 
 def observation_of(
-    policy: OpenSPMPolicy, dataset: Any, episode: int, frame: int, instruction: str
+    policy: OpenSPMPolicy, dataset: Any, episode: int, frame: int, instruction: str | None = None
 ) -> Observation:
-    """One frame of a LeRobotDataset as the policy would see it, with another instruction.
+    """One frame of a LeRobotDataset as the policy would see it.
 
     Args:
         policy: Says how the state vector is laid out.
         dataset: The ``LeRobotDataset``.
         episode: Number of the episode.
         frame: Number of the frame in it.
-        instruction: What is asked.
+        instruction: What is asked; the episode's own task if not given.
 
     Raises:
         DatasetError: There is no such episode or frame.
@@ -184,4 +185,5 @@ def observation_of(
         )
     item: dict[str, Any] = dataset[first + frame]
     batch = {name: value[None] for name, value in item.items() if name.startswith("observation.")}
-    return split_batch(batch | {"task": [instruction]}, policy.config.layouts()[0])[0]
+    task = item["task"] if instruction is None else instruction
+    return split_batch(batch | {"task": [task]}, policy.config.layouts()[0])[0]

@@ -3,21 +3,23 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Collection, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+from lerobot_openspm.checkpoint import check_labels
 from lerobot_openspm.configuration_openspm import OpenSPMConfig, feature_names
 from lerobot_openspm.errors import DatasetError, LayoutError
 from lerobot_openspm.geometry.camera import load_cameras
 from lerobot_openspm.language.instruction import read_tasks
+from lerobot_openspm.language.lexicon import read_lexicon
 from lerobot_openspm.language.own_words import normal_words
 from lerobot_openspm.memory.entry import MemoryEntry
 from lerobot_openspm.memory.indexed_entries import known_names
-from lerobot_openspm.memory.memory import Memory, check_labels
+from lerobot_openspm.memory.memory import Memory
 from lerobot_openspm.training import dataset_processor, memory_of
-from lerobot_openspm.types import Segmenter
+from lerobot_openspm.types import Segmenter, SubTask
 
 # Beside a dataset's own metadata, where `openspm collect` writes the cameras that recorded it.
 DATASET_CAMERAS = "openspm_cameras.json"
@@ -69,7 +71,7 @@ def teach(
         config: The configuration of the policy that knows it.
         dataset_meta: LeRobot's metadata of the dataset.
         episodes: The episodes to teach; all if not given.
-        segmenter: Finds the objects' masks, where the configuration's segmentation is not "demonstrations".
+        segmenter: Finds the objects' masks, where the configuration's perception has masks.
 
     Returns:
         The memory with the new entries and objects, and what is new in it.
@@ -95,12 +97,13 @@ def teach(
     for task in dict.fromkeys(tasks.values()):
         if task not in taught:
             known = known_names(memory.entries)
-            raise DatasetError(_nothing_learned(dataset_meta.repo_id, task, tasks, mined, known))
+            read = read_tasks([task], known, read_lexicon(config.lexicon))[task]
+            raise DatasetError(_nothing_learned(dataset_meta.repo_id, task, tasks, mined, read))
     named = dict.fromkeys(name for entry in added for name in entry.layout)
     objects = {name: mined.objects[name] for name in named if name in mined.objects}
     learned = replace(mined, entries=added, objects=objects)
     result = memory.appended(learned)
-    check_labels(result, config.mask_labels, f"the checkpoint of {config.type}")
+    check_labels(result, config.segmentation.labels, f"the checkpoint of {config.type}")
     used = {entry.source for entry in added}
     skipped = tuple(i for i in wanted if f"{dataset_meta.repo_id}#{i}" not in used)
     return result, _lesson(memory, learned, skipped)
@@ -180,14 +183,13 @@ def _unseen(entry: MemoryEntry) -> list[str]:
 
 
 def _nothing_learned(
-    name: str, task: str, tasks: dict[int, str], mined: Memory, known: Collection[str]
+    name: str, task: str, tasks: dict[int, str], mined: Memory, read: Sequence[SubTask]
 ) -> str:
-    """Why an instruction has no entry; it was read with the known names."""
+    """Why an instruction has no entry."""
     episodes = [index for index, told in tasks.items() if told == task]
     own = [entry for entry in mined.entries if entry.language == task]
     unseen = sorted({name for entry in own for name in _unseen(entry)})
     if not unseen:
-        read = read_tasks([task], known)[task]
         named = (one for sub_task in read for one in sub_task.objects)
         unseen = sorted(set(named) - set(mined.objects))
     why = f"could not find {' and '.join(unseen)}" if unseen else "found no key poses with all their anchors"

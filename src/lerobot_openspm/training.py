@@ -19,24 +19,27 @@ from lerobot_openspm.errors import PerceptionError
 from lerobot_openspm.flow.samples import perturbed, segment_frames
 from lerobot_openspm.flow.training_set import TrainingSet
 from lerobot_openspm.geometry.camera import Camera, load_cameras
+from lerobot_openspm.language.lexicon import read_lexicon
 from lerobot_openspm.memory.indexed_entries import known_names
 from lerobot_openspm.memory.memory import Memory
 from lerobot_openspm.memory.robot import RobotModel
 from lerobot_openspm.mining.dataset import Demonstrations, open_dataset
 from lerobot_openspm.mining.entries import build_entries
 from lerobot_openspm.mining.mined import MinedDataset, MinedEpisode, MinedKeyPoses
-from lerobot_openspm.mining.phase_labels.cache import AnswerCache
-from lerobot_openspm.mining.phase_labels.judging import judge_episodes
-from lerobot_openspm.mining.phase_labels.make import make_judge
+from lerobot_openspm.mining.phase_labels.labelling import LabelCache, label_phases, make_judge
 from lerobot_openspm.mining.processor import DatasetProcessor, MiningOptions
-from lerobot_openspm.perception.objects.object_shape import ShapeBackend
+from lerobot_openspm.perception.objects.base import ShapeBackend
 from lerobot_openspm.perception.objects.sam3d.size import Sam3dShape, worker_command
 from lerobot_openspm.types import Segmenter
 
 logger = logging.getLogger(__name__)
 
-# Copies of every frame with different perturbations, beside the frame itself.
+# Where a judge's answers are kept, so that nothing is asked twice.
+LABELS = HF_LEROBOT_HOME / "openspm" / "phase_labels"
+# Copies of every frame with different perturbations, beside the frame itself. Their spread is that of the
+# hand's error on the way: somewhat more than the tolerance at a contact key pose.
 PERTURBED_COPIES = 3
+PERTURBATION_M, PERTURBATION_RAD = 0.006, 0.04
 
 
 def learn(
@@ -99,10 +102,11 @@ def dataset_processor(
         episodes=config.memory_episodes,
         known_objects=known.objects if known else {},
         known_names=known_names(known.entries) if known else (),
+        lexicon=read_lexicon(config.lexicon),
         known_robot=known.robot if known else None,
-        judge=None if config.phase_judge == "none" else partial(judged, config=config),
+        judge=None if config.judge.type == "none" else partial(labelled, config=config),
         segmenter=segmenter or config.make_segmenter(),
-        shape=config.shape,
+        shape=config.segmentation.shape,
         open_shapes=partial(shapes_of, config),
         is_oracle=config.perception == "oracle",
     )
@@ -120,9 +124,12 @@ def memory_of(mined: MinedDataset, config: OpenSPMConfig) -> Memory:
         "mined %d entries from %d episodes (%d skipped); objects: %s",
         len(entries), len(mined.episodes), len(mined.skipped), ", ".join(sorted(mined.objects)),
     )  # fmt: skip
+    perception, segmentation = "demonstrations", config.perception
+    if config.perception == "oracle":
+        perception, segmentation = "oracle", "demonstrations"
     return Memory(
-        entries, dict(mined.objects), mined.robot, dict(mined.cameras), config.perception,
-        mined.simulator_objects, config.segmentation, config.shape, config.layouts(),
+        entries, dict(mined.objects), mined.robot, dict(mined.cameras), perception,
+        mined.simulator_objects, segmentation, config.segmentation.shape, config.layouts(),
     )  # fmt: skip
 
 
@@ -142,8 +149,7 @@ def training_set(mined: MinedKeyPoses, robot: RobotModel, config: OpenSPMConfig)
     frames = segment_frames(episodes, [item.key_poses for item in every], robot, config.chunk_size)
     rng = np.random.default_rng(0)
     copies = [
-        perturbed(frames, robot, config.perturbation_m, config.perturbation_rad, rng)
-        for _ in range(PERTURBED_COPIES if config.perturbation_m > 0 or config.perturbation_rad > 0 else 0)
+        perturbed(frames, robot, PERTURBATION_M, PERTURBATION_RAD, rng) for _ in range(PERTURBED_COPIES)
     ]
     allowed = np.array([item.episode.index for item in mined.episodes])
     starts = np.sort([episode.from_index for episode in episodes])
@@ -163,34 +169,33 @@ def shapes_of(config: OpenSPMConfig) -> AbstractContextManager[ShapeBackend | No
     Raises:
         PerceptionError: It is not said where SAM 3D is.
     """
-    if config.shape != "sam3d":
+    if config.segmentation.shape != "sam3d":
         return nullcontext(None)
-    if config.sam3d_python is None or config.sam3d_checkout is None:
+    python, checkout = config.segmentation.sam3d_python, config.segmentation.sam3d_checkout
+    if python is None or checkout is None:
         raise PerceptionError(
-            f"shape is 'sam3d', but sam3d_python is {config.sam3d_python!r} and sam3d_checkout "
-            f"{config.sam3d_checkout!r}; pass --policy.sam3d_python=PYTHON and --policy.sam3d_checkout=DIR, "
+            f"segmentation.shape is 'sam3d', but sam3d_python is {python!r} and sam3d_checkout {checkout!r}; "
+            "pass --policy.segmentation.sam3d_python=PYTHON and --policy.segmentation.sam3d_checkout=DIR, "
             "see docs/sam3d.md"
         )
-    return Sam3dShape(worker_command(Path(config.sam3d_python), Path(config.sam3d_checkout)))
+    return nullcontext(Sam3dShape(worker_command(Path(python), Path(checkout))))
 
 
-def judged(
+def labelled(
     demonstrations: Demonstrations, mined: tuple[MinedEpisode, ...], robot: RobotModel, config: OpenSPMConfig
 ) -> tuple[MinedEpisode, ...]:
-    """Episodes with what the configuration's judge of phases says of their key poses.
+    """Episodes with the phase labels of the configuration's judge merged into their key poses.
 
     Raises:
-        JudgementError: There is nothing to ask.
+        PhaseLabelError: The judge's model is not named.
         PerceptionError: A model's package or weights are missing.
         DatasetError: The dataset was never annotated, and its annotations are the judge.
     """
+    asked = config.judge
     judge = make_judge(
-        config.phase_judge, demonstrations, config.phase_judge_model_id, config.phase_judge_api_base,
-        config.phase_judge_timeout_s, str(config.device),
-    )  # fmt: skip
-    folder = config.phase_judge_cache or HF_LEROBOT_HOME / "openspm" / "phase_judgements"
-    cache = AnswerCache(Path(folder))
-    return judge_episodes(demonstrations, mined, robot, judge, config.phase_judge_confidence, cache)
+        asked.type, demonstrations, asked.model_id, asked.api_base, asked.timeout_s, str(config.device)
+    )
+    return label_phases(demonstrations, mined, robot, judge, asked.confidence, LabelCache(LABELS))
 
 
 def _take_layouts(dataset_meta: Any, config: OpenSPMConfig) -> None:

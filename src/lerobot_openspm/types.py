@@ -4,20 +4,25 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Literal, Protocol
+from typing import TYPE_CHECKING, Literal, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from lerobot_openspm.geometry.camera import Camera
-from lerobot_openspm.geometry.se3 import Array
+if TYPE_CHECKING:  # the configuration is imported by every command, and must not wait for SciPy
+    from lerobot_openspm.geometry.camera import Camera
+    from lerobot_openspm.geometry.se3 import Array
 
 Mask = NDArray[np.bool_]
-# What is learned of an object: its shape by the demonstrations' masks, the box around it, or a box of the
-# size that SAM 3D tells.
+# What is learned of an object: its shape from the demonstrations, the box around it, or a box of the size
+# that SAM 3D gives.
 Shape = Literal["demonstrations", "box", "sam3d"]
+# How key poses are followed: planned from where the hand should be, from where it is, or that and corrected.
+Execution = Literal["open_loop", "closed_loop", "closed_loop_trc"]
+# What the flow model is told: poses in the world, or the relative pose in the frame of the target key pose.
+Conditioning = Literal["paper", "equivariant"]
 
-# Standard deviation of a uniform angle: what is known of a yaw that cannot be seen.
+# Standard deviation of a uniform angle: of a yaw that cannot be seen.
 UNKNOWN_YAW_STD = float(np.pi / np.sqrt(3))
 
 
@@ -44,7 +49,7 @@ class View:
 
 @dataclass(frozen=True)
 class Segmentation:
-    """One instance of a phrase in one view: the paper's mask, bounding box and confidence.
+    """One instance of a phrase in one view: the paper's mask and confidence.
 
     Attributes:
         mask: Its pixels ``(H, W)``; at least one.
@@ -53,12 +58,6 @@ class Segmentation:
 
     mask: Mask
     confidence: float
-
-    @property
-    def box(self) -> Array:
-        """First and last column and row ``(4,)`` of the mask: u_min, v_min, u_max, v_max, pixels."""
-        u, v = np.flatnonzero(self.mask.any(0)), np.flatnonzero(self.mask.any(1))
-        return np.array([u[0], v[0], u[-1], v[-1]], float)
 
 
 class Segmenter(Protocol):
@@ -90,7 +89,7 @@ class ContactCue:
         point_world: Point ``(3,)`` between the fingertips, in metres.
         kind: ``"grasp"`` or ``"contact"``: part of the object was at this point in the first frame;
             ``"release"``: the object lies below or around this point.
-        place: Hints of one place touched the same spot of the object, as far as one can know.
+        place: Cues with the same place touched the same spot of the object, as far as one can know.
     """
 
     name: str
@@ -119,13 +118,13 @@ class Support:
     """What a pose estimate rests on: the grounds of the paper's observation covariance ``R_t``.
 
     Attributes:
-        kind: How the object is known.
+        kind: Kind of object whose fitted noise weights apply; a kind without weights gives no support.
         area_px: Pixels of the object that were used, over all views.
-        consistency: From 0 to 1: whether the views tell the same.
+        consistency: From 0 to 1: how well the views agree.
         quality: From 0 to 1: how well the learned shape or patches explain the object's own demonstrations.
     """
 
-    kind: Literal["shape", "patches"]
+    kind: str
     area_px: float
     consistency: float
     quality: float
@@ -140,19 +139,17 @@ class PoseEstimate:
         T_world_obj: Upright pose ``(4, 4)``: origin at the footprint's centre on the support plane.
         covariance: ``(4, 4)`` over x, y, z in metres and yaw in radians.
         confidence: From 0 to 1; 1 is how well the object is typically found in its demonstrations.
-        masks: Foreground mask ``(H, W)`` by camera name.
-        visible: Share of the object that is in sight in the view that shows it best, where the hand is not in
-            the way: at its place if it was found, else where it was expected.
-        support: What the estimate rests on; None where the covariance says all.
-        others: Poses ``(4, 4)`` of further places that show such an object too, the surest first. Of objects
-            known by patches none are told.
+        visible: Share of the object that the best view shows and the hand does not hide, at its place if it
+            was found, else where it was expected.
+        support: What the estimate rests on; None where the covariance needs no correction.
+        others: Poses ``(4, 4)`` of further places that show such an object too, the most confident first;
+            empty for kinds that cannot see several.
     """
 
     status: Literal["found", "not_found", "ambiguous"]
     T_world_obj: Array
     covariance: Array
     confidence: float
-    masks: dict[str, Mask]
     visible: float = 1.0
     support: Support | None = None
     others: tuple[Array, ...] = ()
@@ -212,7 +209,7 @@ class SubTask:
 
 @dataclass(frozen=True)
 class Fault:
-    """What is wrong with a camera, and seconds since its last sound picture."""
+    """What is wrong with a camera, and seconds since its last usable image."""
 
     reason: str
     seconds: float
@@ -220,11 +217,11 @@ class Fault:
 
 @dataclass(frozen=True)
 class Detections:
-    """What one look brought.
+    """What perception found in one observation.
 
     Attributes:
         estimates: By name, for the objects that were looked for.
-        faults: Cameras whose pictures cannot be used.
+        faults: Cameras whose images cannot be used.
     """
 
     estimates: Mapping[str, PoseEstimate]

@@ -10,46 +10,46 @@ import pytest
 from benchmarks.figures import FIGURES, PACKAGE, Figure, needs_libero
 from benchmarks.staleness import ROOT
 
-from lerobot_openspm.cli.bench import MEASURES, ON_THEIR_OWN
 from lerobot_openspm.cli.pipeline import RECORDED_BY
 
 # Imported, but not part of any figure: neither these nor what they import.
 PASSED_OVER = (
-    # How a result is kept and drawn, not what it is.
-    *("errors.py", "files.py", "bench/results.py", "bench/workers.py", "cli/report.py", "cli/drawing.py"),
+    # How a result is told and kept, not what it is.
+    *(f"{PACKAGE}/{name}.py" for name in ("errors", "files", "cli/main")),
+    "benchmarks/results.py",
+    "benchmarks/harness.py",
     # Backends that need a download, and what only asks one.
     *(
-        "search.py",
-        "perception/objects/sam3d",
-        "perception/segmentation/grounded_sam2",
-        "perception/segmentation/sam3",
+        f"{PACKAGE}/{name}"
+        for name in (
+            "search.py",
+            "perception/objects/sam3d",
+            "perception/segmentation/grounded_sam2",
+            "perception/segmentation/sam3",
+            "mining/phase_labels/",
+        )
     ),
-    "mining/phase_labels/",
-    # It imports all measures; whose it runs say so in their paths.
-    "cli/bench.py",
 )
-# What a figure of one simulator does not run of the other. Of the tabletop, LIBERO's hand shares constants.
+# What a figure of one simulator does not run of the other.
 OTHER_SIMULATOR = {
-    "openspm_tabletop": ("envs/libero/", "bench/libero.py"),
-    "libero": (
-        *(
-            f"envs/tabletop/{name}.py"
-            for name in ("experts", "placement", "scene", "tasks", "env", "recording")
-        ),
-        "bench/tabletop.py",
+    "openspm_tabletop": (f"{PACKAGE}/envs/libero/", "benchmarks/libero/"),
+    "libero": tuple(
+        f"{PACKAGE}/envs/tabletop/{name}.py"
+        for name in ("experts", "placement", "scene", "tasks", "env", "recording")
     ),
 }
 # What a figure imports for types alone, or of which it uses only what keeps its folder, or reads a dataset.
 OF_FIGURE = {
-    "keyposes_": ("cli/pipeline.py",),
-    "language": ("flow/", "perception/"),
-    "memory": ("perception/",),
+    "keyposes_": (f"{PACKAGE}/cli/",),
+    "language": (f"{PACKAGE}/flow/", f"{PACKAGE}/perception/", f"{PACKAGE}/cli/"),
+    "memory": (f"{PACKAGE}/perception/",),
     "calibration": (
-        "training.py",
-        "configuration_openspm.py",
-        "mining/key_poses.py",
-        "memory/entry.py",
-        "perception/",
+        f"{PACKAGE}/training.py",
+        f"{PACKAGE}/configuration_openspm.py",
+        f"{PACKAGE}/mining/key_poses.py",
+        f"{PACKAGE}/memory/entry.py",
+        f"{PACKAGE}/perception/",
+        f"{PACKAGE}/cli/options.py",
     ),
 }
 
@@ -70,7 +70,7 @@ def test_what_a_figure_imports_lies_within_its_paths(name: str):
 def test_what_records_demonstrations_is_what_they_are_kept_for(simulator: str):
     package = ROOT / PACKAGE
     found = {str(p.relative_to(ROOT)) for pattern in RECORDED_BY[simulator] for p in package.glob(pattern)}
-    needed = closure(f"{PACKAGE}/cli/collect.py", PASSED_OVER + OTHER_SIMULATOR[simulator])
+    needed = closure(f"{PACKAGE}/envs/collection.py", PASSED_OVER + OTHER_SIMULATOR[simulator])
     assert needed - found == set()
 
 
@@ -85,12 +85,6 @@ def entry(figure: Figure) -> str:
     match shlex.split(figure.command):
         case ["python", "-m", module, *_]:
             return f"{module.replace('.', '/')}.py"
-        case ["openspm", "bench", what, *_] if what in ON_THEIR_OWN:
-            return f"src/{ON_THEIR_OWN[what].replace('.', '/')}.py"
-        case ["openspm", "bench", what, *_] if what in MEASURES:
-            return f"{PACKAGE}/bench/{'tracking' if what == 'cameras' else what}.py"
-        case ["openspm", what, *_]:
-            return f"{PACKAGE}/cli/{what}.py"
     raise AssertionError(figure.command)
 
 
@@ -103,10 +97,9 @@ def covered(paths: tuple[str, ...]) -> set[str]:
 
 def closure(first: str, passed_over: tuple[str, ...]) -> set[str]:
     """A module's file, and those of all modules of the project that it imports, however far down."""
-    left_out = tuple(f"{PACKAGE}/{name}" for name in passed_over)
     found, left = {first}, [first]
     while left:
-        new = {name for name in imported(left.pop()) if not name.startswith(left_out)} - found
+        new = {name for name in imported(left.pop()) if not name.startswith(passed_over)} - found
         found |= new
         left += new
     return found

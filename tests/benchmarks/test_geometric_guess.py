@@ -3,12 +3,11 @@
 import numpy as np
 import pytest
 from benchmarks.libero.geometric_guess import ABOVE_M, PULL_M, GuessConfig, _Guesser, remembered, source_of
+from benchmarks.libero.guessed_key_poses import HOLDING, GuessedKeyPose
 
-from lerobot_openspm.errors import JudgementError
+from lerobot_openspm.errors import PhaseLabelError
 from lerobot_openspm.geometry import se3
 from lerobot_openspm.language.instruction import parse_instruction
-from lerobot_openspm.mining.phase_labels.structure import HOLDING
-from lerobot_openspm.mining.phase_labels.zero_shot import GuessedKeyPose
 
 DOWN = np.diag([1.0, -1.0, -1.0])
 MIDDLES = {name: np.array([0.0, 0.0, z]) for name, z in (("bowl", 0.03), ("plate", 0.01), ("cabinet", 0.2))}
@@ -74,6 +73,6 @@ def test_a_models_key_poses_are_kept_relative_to_what_the_instruction_names():
 
 
 def test_a_source_without_a_model_is_refused():
-    with pytest.raises(JudgementError, match="pass --model_id=NAME"):
+    with pytest.raises(PhaseLabelError, match="pass --model_id=NAME"):
         source_of(GuessConfig("a", "b", "openai"))
     assert source_of(GuessConfig("a", "b")) is None

@@ -7,14 +7,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from benchmarks.guard import FALSE_ALARM, POWER, STANDARDS, GuardConfig, Run, Standard
+from benchmarks.guard import FALSE_ALARM, POWER, STANDARDS, GuardConfig, Standard
 from benchmarks.libero import evaluate as harness
-from benchmarks.libero import stages
 from scipy.stats import binom
 
 from benchmarks import guard
 from lerobot_openspm.cli import pipeline
-from lerobot_openspm.cli.pipeline import rate
+from lerobot_openspm.cli.pipeline import Episode, rate
 from lerobot_openspm.envs.seeds import TUNING_SEEDS
 
 ROOT = Path(__file__).parents[2]
@@ -22,10 +21,10 @@ STANDARD = Standard(expected=0.98, demos=1, episodes=8, seed=2_800_000)
 TASKS = [f"task_{i}" for i in range(10)]
 
 
-def runs(failures: dict[str, int]) -> list[Run]:
+def runs(failures: dict[str, int]) -> list[Episode]:
     """Episodes of all tasks, the first so many of which fail."""
     return [
-        Run(task, STANDARD.seed + i, i >= failures.get(task, 0), 100 + i, "done")
+        Episode(task, STANDARD.seed + i, 100 + i, i >= failures.get(task, 0), "done")
         for task in TASKS
         for i in range(STANDARD.episodes)
     ]
@@ -96,7 +95,7 @@ def test_the_verdict_is_the_exit_code(
 ):
     asked = []
 
-    def suite(found: list[Run]):
+    def suite(found: list[Episode]):
         return lambda standard, output: asked.append((standard, output)) or found
 
     monkeypatch.setitem(guard.STANDARDS, "tabletop", STANDARD)
@@ -121,7 +120,7 @@ def test_the_tabletops_episodes_are_those_of_the_demos_steps(monkeypatch: pytest
     monkeypatch.setattr(pipeline, "train", lambda *given: done.append(given) or (tmp_path / "trained", 1.0))
     episode = pipeline.Episode("push_plate", STANDARD.seed, 212, False, "time_limit")
     monkeypatch.setattr(pipeline, "evaluate", lambda *given: done.append(given) or [episode])
-    assert guard.tabletop(STANDARD, tmp_path) == [Run("push_plate", STANDARD.seed, False, 212, "time_limit")]
+    assert guard.tabletop(STANDARD, tmp_path) == [episode]
     assert done == [
         (tmp_path / "dataset", STANDARD.demos),
         (tmp_path / "dataset", tmp_path / "train"),
@@ -137,22 +136,21 @@ def test_liberos_scenes_are_drawn_from_the_guards_own_seeds(monkeypatch: pytest.
     for name in ("model.safetensors", "memory.json", "config.json"):
         (checkpoint / name).write_text(name)
 
-    def run_one(job: harness.Job):
-        config, task, state = job
+    def run_one(config: harness.EvaluationConfig, task: str, state: int):
         jobs.append((config.tuning, config.tuning_seed + state))
         told = {"steps": 90, "success": state == 0, "status": "done", "phase": "retreat"}
         return {"task": task, "state": state, "seed": config.tuning_seed + state, **told}
 
     monkeypatch.setattr(pipeline, "collect_dataset", lambda *given: collected.append(given))
-    monkeypatch.setattr(stages, "policy", lambda root, variant: (checkpoint, 1.0))
+    monkeypatch.setattr(guard.stages, "policy", lambda simulator, root: (checkpoint, 1.0))
     monkeypatch.setattr(harness, "tasks", lambda: {"push_the_plate": "push the plate"})
     monkeypatch.setattr(harness, "evaluate_one", run_one)
-    monkeypatch.setattr(harness, "EvaluationConfig", partial(harness.EvaluationConfig, processes=1))
+    monkeypatch.setattr(harness, "EvaluationConfig", partial(harness.EvaluationConfig, workers=1))
     standard = Standard(expected=0.95, demos=1, episodes=2, seed=STANDARDS["libero"].seed)
     reason = "every key pose was met, but the goal does not hold"
     assert guard.libero(standard, tmp_path) == [
-        Run("push_the_plate", standard.seed, True, 90, reason),
-        Run("push_the_plate", standard.seed + 1, False, 90, reason),
+        Episode("push_the_plate", standard.seed, 90, True, reason),
+        Episode("push_the_plate", standard.seed + 1, 90, False, reason),
     ]
     assert jobs == [(True, standard.seed), (True, standard.seed + 1)]
     assert collected == [(tmp_path / "dataset", 1, "libero")]

@@ -13,10 +13,10 @@ from typing import Any
 
 import pytest
 from benchmarks.figures import FIGURES, PACKAGE, Figure
+from benchmarks.results import PROVENANCE, write
 from benchmarks.staleness import ROOT, Quote, origin, quotes, read_result
 
-from benchmarks import calibration, common, figures, tables
-from lerobot_openspm.bench.results import PROVENANCE, write_result
+from benchmarks import calibration, figures, results, tables
 from lerobot_openspm.errors import OpenSPMError
 
 CODE = '"""Moves."""\n\n\ndef speed():\n    """How fast."""\n    return 1  # m/s\n'
@@ -74,8 +74,8 @@ def test_a_result_is_current_until_what_it_measures_changes(checkout: Checkout):
 
 
 def test_a_result_of_other_options_is_not_the_published_one(checkout: Checkout):
-    expected = "python -m src.move --n=50 --result=benchmarks/results/speed.json"
-    for options, is_published in (("--n=50 --started_at=3", True), ("--n=5", False), ("", False)):
+    expected = "python -m src.move --n=50 --k=2"
+    for options, is_published in (("--k=2 --n=50", True), ("--n=5", False), ("", False)):
         checkout.measure(command=f"python -m src.move {options}")
         problem = origin("speed", ["src", "configs"], checkout.root, expected).problem
         assert (problem is None) is is_published, problem
@@ -142,7 +142,7 @@ def test_comments_of_a_configuration_are_words_and_its_values_are_not(checkout: 
         ({"dirty": True}, "changes that were not committed"),
         ({"command": None}, "its command is gone"),
         ({"command": "python -m src.gone"}, "its command is gone: python -m src.gone"),
-        ({"command": "openspm bench juggling"}, "its command is gone"),
+        ({"command": "openspm bench speed"}, "its command is gone"),
         ({"commit": "0123456789ab"}, "0123456789ab is not in this history"),
     ],
 )
@@ -181,6 +181,7 @@ def test_the_report_counts_what_the_pages_quote(checkout: Checkout):
     checkout.commit("scripts/stale_figures.py", (ROOT / "scripts/stale_figures.py").read_text())
     bank = f"{PACKAGE}/memory/bank.py"
     checkout.commit(bank, CODE)
+    checkout.commit("benchmarks/memory.py", CODE)
     assert report(checkout.root, "--check") == ({"quoted": 0, "stale": 0, "unreproducible": 0}, 0)
     checkout.commit("README.md", "<!-- figure: memory.n -->")
     checkout.measure("memory", command=FIGURES["memory"].command, n=3)
@@ -220,15 +221,17 @@ def test_published_results_say_where_they_come_from():
     [
         ("memory", {}, []),
         ("speed", {}, ["name"]),
-        ("memory", {"command": "openspm bench memory --result=/home/me/memory.json"}, ["command"]),
+        ("memory", {"command": "python -m benchmarks.memory --output=/home/me"}, ["command"]),
         ("memory", {"command": None}, ["command"]),
         ("memory", {"machine": {"cpu": "Some CPU"}}, ["machine"]),
     ],
 )
 def test_a_result_that_does_not_say_where_it_comes_from_is_seen(
-    tmp_path: Path, name: str, changed: dict[str, Any], found: list[str]
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str, changed: dict[str, Any], found: list[str]
 ):
-    written = write_result(tmp_path / "memory.json", {"seed": None, "n": 3})
+    monkeypatch.setattr(results, "RESULTS", tmp_path)
+    monkeypatch.setattr(results, "is_published", lambda *_: True)
+    written = write("memory", {"seed": None, "n": 3})
     assert complaints(name, {**written, "command": FIGURES["memory"].command, **changed}) == found
     del written["date"]
     assert "provenance" in complaints(name, {**written, **changed})
@@ -280,16 +283,15 @@ def not_in_their_results(root: Path) -> list[Quote]:
 
 @pytest.fixture
 def taking(monkeypatch: pytest.MonkeyPatch) -> list[str]:
-    """The programs that taking figures starts, of which `openspm` fails; nothing is written."""
+    """The programs that taking figures starts, of which tracking's fails; nothing is written."""
     started: list[str] = []
 
     def run(command: list[str], check: bool) -> None:
         started.append(" ".join([Path(command[0]).name, *command[1:]]))
-        if check and "openspm" in started[-1]:
+        if check and "tracking" in started[-1]:
             raise CalledProcessError(1, command)
 
     monkeypatch.setattr(figures.subprocess, "run", run)
-    monkeypatch.setattr(figures, "make_checkpoint", lambda simulator: started.append(f"train {simulator}"))
     monkeypatch.setattr(tables, "write_pages", lambda: None)
     monkeypatch.setattr(figures, "code_version", lambda: ("0123456789ab", False))
     problems: dict[str, str | None] = {
@@ -302,20 +304,8 @@ def taking(monkeypatch: pytest.MonkeyPatch) -> list[str]:
 def test_what_is_current_is_not_taken_again_and_one_failure_does_not_stop_the_rest(taking: list[str]):
     told = figures.main(["tracking", "oracle", "execution"])
     commands = [FIGURES[name].command for name in ("tracking", "execution")]
-    assert taking == ["train openspm_tabletop", *commands]
+    assert taking == commands
     assert told == {"tracking": "no result file", "oracle": "current", "execution": "stale by 2 changes"}
-
-
-@pytest.mark.parametrize("error", [CalledProcessError(1, ["lerobot-train"]), FileExistsError("a folder")])
-def test_without_its_checkpoint_nothing_is_measured(
-    taking: list[str], monkeypatch: pytest.MonkeyPatch, error: Exception
-):
-    def fail(simulator: str) -> None:
-        raise error
-
-    monkeypatch.setattr(figures, "make_checkpoint", fail)
-    assert figures.main(["tracking"]) == {"tracking": "no result file"}
-    assert taking == []
 
 
 def test_no_figure_is_taken_of_changes_that_are_not_committed(
@@ -331,7 +321,7 @@ def test_no_figure_is_taken_of_changes_that_are_not_committed(
 def test_without_names_all_figures_are_taken_and_those_left_out_are_told(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture, installed: bool
 ):
-    monkeypatch.setattr(figures.importlib.util, "find_spec", lambda _: object() if installed else None)
+    monkeypatch.setattr(figures, "has_libero", lambda: installed)
     names = figures.takeable()
     assert {"calibration", "tabletop"} <= set(names)
     left_out = sorted(set(FIGURES) - set(names))
@@ -346,10 +336,13 @@ def test_cameras_are_estimated_of_one_simulator_at_a_time(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path, simulator: str
 ):
     recorded = []
-    monkeypatch.setattr(calibration, "collect_dataset", lambda *given: recorded.append(given))
+    monkeypatch.setattr(calibration, "dataset", lambda *given: recorded.append(given))
     monkeypatch.setattr(calibration, "read", lambda *_: SimpleNamespace(cameras={}))
-    monkeypatch.setattr(common, "RESULTS", tmp_path)
-    calibration.main(simulator)
-    assert [given[1:] for given in recorded] == [(10, simulator)]
+    monkeypatch.setattr(results, "RESULTS", tmp_path)
+    monkeypatch.setattr(results, "is_published", lambda *_: True)
+    config = calibration.CalibrationConfig()
+    config.env.type = simulator
+    calibration.main(config)
+    assert recorded == [(simulator,)]
     (name,) = [path.stem for path in tmp_path.iterdir()]
     assert FIGURES[name].command.endswith("--env.type=libero") is (simulator == "libero")

@@ -134,13 +134,12 @@ def test_a_result_that_is_there_is_read():
 
 def test_what_had_no_episode_is_a_dash():
     none = {"success": None, "interval": None, "n": 0, "mean_steps": None}
-    assert markdown.rates({"moved late": none}).splitlines()[-1] == "| moved late | - | - | 0 | - |"
+    told = markdown.grid({"moved late": none}, markdown.STEPS)
+    assert told.splitlines()[-1] == "| moved late | - | - | 0 | - |"
 
 
-@pytest.mark.parametrize("started", ["", " --started_at=1795371102"])
-def test_the_time_of_the_demo_includes_the_set_up_only_where_make_told_when_it_began(results, started):
+def test_the_time_of_the_whole_is_told_where_nothing_was_kept(results):
     put(results, "tabletop", **RATE, train_s=100.0, total_s=200.0, per_task={"push_plate": 0.5})
-    results["tabletop"]["command"] = f"openspm demo --demos=10{started} --episodes=20"
-    text = tables.results_page()
-    assert ("set-up" in text) is bool(started)
-    assert "`openspm demo --demos=10 --episodes=20`" in text
+    assert "with recording and evaluating 200 s" in tables.results_page()
+    results["tabletop"]["total_s"] = None
+    assert "with recording" not in tables.results_page()

@@ -45,7 +45,7 @@ def reason(result: tuple[int, str, str]) -> str:
 @pytest.fixture(scope="session")
 def turning_dataset(make_once: Callable[..., Path]) -> Path:
     """Two demonstrations each of two tasks in which the hand turns about different axes."""
-    from lerobot_openspm.cli.collect import CollectConfig, SimulatorConfig, collect
+    from lerobot_openspm.envs.collection import CollectConfig, SimulatorConfig, collect
 
     env = SimulatorConfig(task="open_middle_drawer,turn_on_stove")
     config = functools.partial(CollectConfig, env, 2, height=160, width=160, workers=0)
@@ -53,7 +53,7 @@ def turning_dataset(make_once: Callable[..., Path]) -> Path:
 
 
 def test_a_dataset_that_is_not_there_is_one_line(calibrate: Callable[..., tuple], tmp_path: Path):
-    assert "no dataset in" in reason(calibrate(f"--root={tmp_path / 'nowhere'}"))
+    assert "no dataset in" in reason(calibrate(f"--dataset.root={tmp_path / 'nowhere'}"))
 
 
 @pytest.mark.slow
@@ -67,7 +67,11 @@ def test_the_hand_camera_is_found_and_other_cameras_are_kept(
     del document["cameras"][WRIST]
     output.write_text(json.dumps(document))
     code, out, err = calibrate(
-        f"--root={turning_dataset}", f"--camera={WRIST}", "--mount=ee", "--fov_deg=75", f"--output={output}"
+        f"--dataset.root={turning_dataset}",
+        f"--camera={WRIST}",
+        "--mount=ee",
+        "--fov_deg=75",
+        f"--output={output}",
     )
     assert code == 0, err
     summary = json.loads(out.splitlines()[-1])
@@ -90,7 +94,9 @@ def test_the_wrong_mount_is_refused_and_nothing_is_written(
     calibrate: Callable[..., tuple], tiny_dataset: Path, tmp_path: Path
 ):
     output = tmp_path / "cameras.json"
-    result = calibrate(f"--root={tiny_dataset}", f"--camera={WRIST}", "--fov_deg=75", f"--output={output}")
+    result = calibrate(
+        f"--dataset.root={tiny_dataset}", f"--camera={WRIST}", "--fov_deg=75", f"--output={output}"
+    )
     reason(result)
     assert list(tmp_path.iterdir()) == []
 
@@ -101,7 +107,7 @@ def test_the_wrong_mount_is_refused_and_nothing_is_written(
         ("--camera=observation.images.roof", "has no camera 'observation.images.roof'; it has"),
         ("--mount=ceiling", "--mount is 'ceiling', expected 'world' or 'ee'"),
         ("--fov_deg=0", "--fov_deg is 0.0, expected 5 to 150 degrees"),
-        ("--episodes=[99]", "got [99]"),
+        ("--dataset.episodes=[99]", "got [99]"),
         ("--truth=nowhere.json", "no calibration file at nowhere.json"),
     ],
 )
@@ -109,7 +115,7 @@ def test_bad_input_is_one_line_and_writes_nothing(
     calibrate: Callable[..., tuple], tiny_dataset: Path, tmp_path: Path, option: str, words: str
 ):
     output = tmp_path / "cameras.json"
-    assert words in reason(calibrate(f"--root={tiny_dataset}", f"--output={output}", option))
+    assert words in reason(calibrate(f"--dataset.root={tiny_dataset}", f"--output={output}", option))
     assert list(tmp_path.iterdir()) == []
 
 
@@ -118,7 +124,7 @@ def test_a_damaged_file_is_not_overwritten(
 ):
     output = tmp_path / "cameras.json"
     output.write_text('{"format": "openspm-cam')
-    assert "not JSON" in reason(calibrate(f"--root={tiny_dataset}", f"--output={output}"))
+    assert "not JSON" in reason(calibrate(f"--dataset.root={tiny_dataset}", f"--output={output}"))
     assert output.read_text() == '{"format": "openspm-cam'
 
 

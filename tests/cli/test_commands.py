@@ -40,6 +40,7 @@ def test_an_unknown_command_is_named_with_the_known_ones(openspm: Openspm):
 def test_a_command_lists_its_options(openspm: Openspm, command: str):
     code, out, _ = openspm(command, "--help")
     assert code == 0
+    assert out.startswith(f"usage: openspm {command} [-h]")
     options = {
         "collect": "--episodes",
         "calibrate": "--fov_deg",
@@ -52,7 +53,7 @@ def test_a_command_lists_its_options(openspm: Openspm, command: str):
 def test_mining_then_inspecting(openspm: Openspm, tiny_dataset: Path, checkpoint: Path, tmp_path: Path):
     memory, annotated = tmp_path / "memory", tmp_path / "annotated"
     code, out, _ = openspm(
-        "mine", f"--root={tiny_dataset}", f"--output={memory}", f"--policy.cameras={CALIBRATION}",
+        "mine", f"--dataset.root={tiny_dataset}", f"--output={memory}", f"--policy.cameras={CALIBRATION}",
         f"--annotated={annotated}",
     )  # fmt: skip
     assert code == 0
@@ -95,7 +96,7 @@ def one_line_error(result: tuple[int, str, str], command: str) -> str:
 
 
 def test_mining_without_a_calibration_is_one_line(openspm: Openspm, tiny_dataset: Path, tmp_path: Path):
-    result = openspm("mine", f"--root={tiny_dataset}", f"--output={tmp_path / 'memory'}")
+    result = openspm("mine", f"--dataset.root={tiny_dataset}", f"--output={tmp_path / 'memory'}")
     assert "got none; pass --policy.cameras=FILE" in one_line_error(result, "mine")
     assert not (tmp_path / "memory").exists()
 
@@ -104,7 +105,10 @@ def test_mining_with_a_calibration_that_is_not_there_is_one_line(
     openspm: Openspm, tiny_dataset: Path, tmp_path: Path
 ):
     result = openspm(
-        "mine", f"--root={tiny_dataset}", f"--output={tmp_path / 'memory'}", "--policy.cameras=nowhere.json"
+        "mine",
+        f"--dataset.root={tiny_dataset}",
+        f"--output={tmp_path / 'memory'}",
+        "--policy.cameras=nowhere.json",
     )
     assert "no calibration file at nowhere.json" in one_line_error(result, "mine")
     assert not (tmp_path / "memory").exists()
@@ -114,8 +118,8 @@ def test_annotating_into_a_folder_that_exists_is_one_line(
     openspm: Openspm, tiny_dataset: Path, tmp_path: Path
 ):
     result = openspm(
-        "mine", f"--root={tiny_dataset}", f"--output={tmp_path / 'memory'}", f"--annotated={tmp_path}",
-        f"--policy.cameras={CALIBRATION}",
+        "mine", f"--dataset.root={tiny_dataset}", f"--output={tmp_path / 'memory'}",
+        f"--annotated={tmp_path}", f"--policy.cameras={CALIBRATION}",
     )  # fmt: skip
     assert "exists already; choose another --annotated" in one_line_error(result, "mine")
     assert list(tmp_path.iterdir()) == []

@@ -13,10 +13,12 @@ from tests.memory.memories import LAYOUTS, a_memory, merged_entry, same
 from tests.perception.builders import model
 
 from lerobot_openspm.cli.memory import COMMANDS
-from lerobot_openspm.memory import memory as module
+from lerobot_openspm.geometry.camera import cameras_to_dict
+from lerobot_openspm.memory import io as module
 from lerobot_openspm.memory.bank import EntryBank
 from lerobot_openspm.memory.entry import Anchor, Outcome
-from lerobot_openspm.memory.memory import Memory, read_memory, write_memory
+from lerobot_openspm.memory.io import read_memory, write_memory
+from lerobot_openspm.memory.memory import Memory
 
 BOWL, DRAWER, STOVE = "put the bowl on the plate", "open the top drawer", "put the bowl on the stove"
 OBJECTS = {"bowl": model("bowl", 1), "plate": model("plate", 2), "cabinet": model("cabinet", 3)}
@@ -158,7 +160,7 @@ def test_add_refuses_what_is_no_memory(openspm: Openspm, memory: Path, tmp_path:
     assert "pass --other=FOLDER" in refused(openspm, memory, "add")
     assert "nothing at nowhere" in refused(openspm, memory, "add", "--other=nowhere")
     (tmp_path / "some.json").write_text('{"format": "zip"}')
-    assert "expected format 'openspm-entries'" in refused(
+    assert "expected 'openspm-entries' and 7" in refused(
         openspm, memory, "add", f"--other={tmp_path / 'some.json'}"
     )
     empty = tmp_path / "empty"
@@ -210,8 +212,8 @@ def test_what_was_merged_or_removed_is_not_added_again(openspm: Openspm, memory:
     write_memory(made(), other)  # its entries have no outcomes, so are not quite what was merged
     run(openspm, memory, "export", f"--output={file}")
     run(openspm, memory, "merge")
-    for parcel in (other, file):
-        again = run(openspm, memory, "add", f"--other={parcel}")
+    for source in (other, file):
+        again = run(openspm, memory, "add", f"--other={source}")
         assert again == {"entries": 2, "superseded": 2, "added": 0, "unchanged": 3}
     # Also where nothing is known of how the merged entry came about.
     run(openspm, memory, "export", f"--output={merged}")
@@ -239,17 +241,20 @@ def test_a_file_can_bring_back_what_an_entry_was(openspm: Openspm, memory: Path,
     [
         (
             lambda e: e["entries"][0].update(quality=3),
-            r"entries[0] is malformed: ValueError(\"'quality' is 3",
+            "entries[0]: malformed: Expected `float` <= 1.0 - at `$.quality`",
         ),
         (
             lambda e: e["entries"][1]["key_poses"][0].pop("T_obj_ee"),
-            "entries[1] is malformed: KeyError('T_obj_ee')",
+            "entries[1]: malformed: Object missing required field `T_obj_ee` - at `$.key_poses[0]`",
         ),
         (lambda e: e["objects"].update(bowl="0" * 16), "'bowl' is known by another model"),
-        (lambda e: e.update(entries=3), "'entries' must be a list"),
-        (lambda e: e.update(colour="red"), "unknown fields ['colour']"),
-        (lambda e: e["robot"].pop("open_width"), "'robot' is malformed"),
-        (lambda e: e.update(version=99), "'version': 99"),
+        (lambda e: e.update(entries=3), "Expected `array`, got `int` - at `$.entries`"),
+        (lambda e: e.update(colour="red"), "unknown field `colour`"),
+        (lambda e: e["robot"].pop("open_width"), "field `open_width` - at `$.robot`"),
+        (
+            lambda e: e.update(version=99),
+            "got format and version ['openspm-entries', 99], expected 'openspm-entries' and 7",
+        ),
     ],
 )
 def test_a_badly_edited_file_is_refused(
@@ -262,7 +267,7 @@ def test_a_badly_edited_file_is_refused(
     file.write_text(json.dumps(exported))
     error = refused(openspm, memory, "add", f"--other={file}")
     assert str(file) in error
-    assert message.replace("\\", "") in error
+    assert message in error
 
 
 def test_an_exported_folder_is_a_memory(openspm: Openspm, memory: Path, tmp_path: Path):
@@ -329,13 +334,9 @@ def test_of_entries_of_one_source_and_instruction_one_is_rated_by_its_number(ope
 
 def test_another_calibration_is_put_into_a_memory(openspm: Openspm, memory: Path, tmp_path: Path):
     file = tmp_path / "cameras.json"
-    file.write_text((memory / "cameras.json").read_text().replace("50.1", "60.5"))
+    cameras = {key: replace(camera, fx=60.5) for key, camera in made().cameras.items()}
+    file.write_text(json.dumps(cameras_to_dict(cameras)))
     assert run(openspm, memory, "cameras", f"--file={file}")["cameras"] == ["observation.images.front"]
     assert load(memory).cameras["observation.images.front"].fx == 60.5
-    # One that was edited in its place is meant likewise.
-    file = memory / "cameras.json"
-    file.write_text(file.read_text().replace("60.5", "70.5"))
-    assert "--file=" in refused(openspm, memory, "list")
-    run(openspm, memory, "cameras", f"--file={file}")
-    assert load(memory).cameras["observation.images.front"].fx == 70.5
-    assert np.isfinite(load(memory).cameras["observation.images.front"].T_mount_cam).all()
+    file.write_text(file.read_text().replace("60.5", "-0.0"))
+    assert "focal lengths must be positive" in refused(openspm, memory, "cameras", f"--file={file}")

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 from tests.cli.conftest import Openspm
 
-from lerobot_openspm.memory.files import data_files
+from lerobot_openspm.memory.io import arrays_file
 
 BOWL = "put the bowl on the plate"
 
@@ -76,7 +76,7 @@ def test_in_a_scene_a_sequence_of_known_tasks_is_shown_part_by_part(
 
 
 def test_a_mined_memory_can_be_searched_too(openspm: Openspm, checkpoint: Path, tmp_path: Path):
-    for file in ("memory.json", "cameras.json", *data_files(checkpoint)):
+    for file in ("memory.json", arrays_file(checkpoint)):
         (tmp_path / file).write_bytes((checkpoint / file).read_bytes())
     assert search(openspm, BOWL, f"--path={tmp_path}") == search(openspm, BOWL, f"--path={checkpoint}")
 

@@ -18,8 +18,8 @@ from tests.conftest import record
 from tests.memory.memory_files import names
 
 from lerobot_openspm.files import LOCK_WAIT_S
-from lerobot_openspm.memory.files import LOCK
-from lerobot_openspm.memory.memory import Memory, read_memory, write_memory
+from lerobot_openspm.memory.io import LOCK, read_memory, write_memory
+from lerobot_openspm.memory.memory import Memory
 from lerobot_openspm.modeling_openspm import OpenSPMPolicy
 
 PUSH = "push the plate to the front of the stove"
@@ -68,7 +68,7 @@ def test_a_task_is_appended_and_the_weights_stay(openspm: Openspm, into: Path, o
     assert f"{PUSH!r}: 1 new entry\n" in out
     after = contents(into)
     same = {name for name in before if before[name] == after.get(name)}
-    assert {"config.json", "model.safetensors", "cameras.json"} <= same
+    assert {"config.json", "model.safetensors"} <= same
     assert set(after) == {*same, *names(into), LOCK}
     taught = read_memory(into)
     assert [entry.language for entry in taught.entries] == [e.language for e in known.entries] + [PUSH]

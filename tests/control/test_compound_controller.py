@@ -5,11 +5,19 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
-from tests.control.test_controller import HAND, LOOK_AGAIN_STEPS, Perception, knowledge, shifted, watch
+from tests.control.test_controller import (
+    HAND,
+    LOOK_AGAIN_STEPS,
+    Perception,
+    observe,
+    planning_context,
+    shifted,
+    watch,
+)
 from tests.memory.builders import entry, hand_pose, key_pose
 
 from lerobot_openspm.control.controller import EpisodeController
-from lerobot_openspm.control.status import Status
+from lerobot_openspm.control.state import Status
 from lerobot_openspm.geometry import se3
 from lerobot_openspm.memory.entry import Anchor
 from lerobot_openspm.types import Hand
@@ -31,46 +39,46 @@ def opening(instruction="open the top drawer", thing="cabinet", phase="open"):
     return entry(instruction, poses, {thing: np.eye(4)}, source="local/demos#2")
 
 
-def row(*entries, instruction=BOTH, **options):
-    return EpisodeController(knowledge(*entries, **options), instruction, 7, 0)
+def controller(*entries, instruction=BOTH, **options):
+    return EpisodeController(planning_context(*entries, **options), instruction, 7, 0)
 
 
-def finish_part(one, eyes, hand=None):
+def finish_part(one, perception, hand=None):
     """Bring the hand to every key pose of the present part in turn, and what it carries along with it."""
-    part = one.planner.part
+    part = one.state.part
     for _ in range(400):
-        if one.status is not Status.RUNNING or one.planner.part != part:
+        if one.state.status is not Status.RUNNING or one.state.part != part:
             return hand
         target = one.executor.target
         before = hand
         hand = Hand(target.T_world_ee, target.key_pose.opening)
         for name in one.scene.tracker.held:
-            eyes.layout[name] = hand.T_world_ee @ se3.inverse(before.T_world_ee) @ eyes.layout[name]
-        watch(one, eyes, hand, 1)
-    pytest.fail(f"the part did not end: {one.status} at key pose {one.executor.index}")
+            perception.layout[name] = (
+                hand.T_world_ee @ se3.inverse(before.T_world_ee) @ perception.layout[name]
+            )
+        watch(one, perception, hand, 1)
+    pytest.fail(f"the part did not end: {one.state.status} at key pose {one.state.index}")
 
 
 def test_the_second_part_goes_where_the_first_one_has_put_things():
-    eyes, one = Perception(LAYOUT), row(PLATE, BOX)
-    one.observe(HAND, eyes)
-    assert one.planner.used == [
-        PLATE,
-    ]
-    assert sorted(eyes.asked[0]) == ["bowl", "box", "plate"], "what comes later is looked for at once"
-    hand = finish_part(one, eyes, HAND)
-    assert one.status is Status.RUNNING
-    assert one.planner.part == 1
-    assert not np.allclose(eyes.layout["bowl"], LAYOUT["bowl"])
-    place = next(target for target in one.executor.plan if target.key_pose.phase == "place")
-    assert_allclose(place.T_world_ee, eyes.layout["bowl"] @ place.key_pose.T_obj_ee, atol=2e-3)
-    assert [used.source for used in one.planner.used] == [PLATE.source, BOX.source]
-    finish_part(one, eyes, hand)
-    assert one.status is Status.DONE
+    perception, one = Perception(LAYOUT), controller(PLATE, BOX)
+    observe(one, HAND, perception)
+    assert one.state.used == (PLATE,)
+    assert sorted(perception.asked[0]) == ["bowl", "box", "plate"], "what comes later is looked for at once"
+    hand = finish_part(one, perception, HAND)
+    assert one.state.status is Status.RUNNING
+    assert one.state.part == 1
+    assert not np.allclose(perception.layout["bowl"], LAYOUT["bowl"])
+    place = next(target for target in one.executor.targets if target.key_pose.phase == "place")
+    assert_allclose(place.T_world_ee, perception.layout["bowl"] @ place.key_pose.T_obj_ee, atol=2e-3)
+    assert [used.source for used in one.state.used] == [PLATE.source, BOX.source]
+    finish_part(one, perception, hand)
+    assert one.state.status is Status.DONE
 
 
 def test_what_is_not_recognised_any_more_is_where_the_hand_let_it_go():
-    eyes, one = Perception(LAYOUT), row(PLATE, BOX)
-    one.observe(HAND, eyes)
+    perception, one = Perception(LAYOUT), controller(PLATE, BOX)
+    observe(one, HAND, perception)
 
     class Blind(Perception):
         """Recognises nothing where it was not at first."""
@@ -81,114 +89,112 @@ def test_what_is_not_recognised_any_more_is_where_the_hand_let_it_go():
 
     blind = Blind(LAYOUT)
     hand = finish_part(one, blind, HAND)
-    assert one.planner.part == 1
-    assert_allclose(one.planner.object_poses["bowl"], blind.layout["bowl"], atol=1e-9)
-    assert not np.allclose(one.planner.object_poses["bowl"], LAYOUT["bowl"])
-    index = next(i for i, pose in enumerate(one.executor.plan) if pose.key_pose.anchor.place == "bowl")
-    one.executor.begin(one.executor.plan, hand, index)  # the box in the hand, on its way
+    assert one.state.part == 1
+    assert_allclose(one.state.plan.object_poses["bowl"], blind.layout["bowl"], atol=1e-9)
+    assert not np.allclose(one.state.plan.object_poses["bowl"], LAYOUT["bowl"])
+    index = next(i for i, pose in enumerate(one.executor.targets) if pose.key_pose.anchor.place == "bowl")
+    one.executor.begin(one.executor.targets, hand, index)  # the box in the hand, on its way
     watch(one, blind, hand, 100)  # five seconds in which it is in sight and not recognised
-    assert one.status is not Status.OBJECT_LOST
-    assert_allclose(one.planner.object_poses["bowl"], blind.layout["bowl"], atol=1e-9)
+    assert one.state.status is not Status.OBJECT_LOST
+    assert_allclose(one.state.plan.object_poses["bowl"], blind.layout["bowl"], atol=1e-9)
 
 
 def test_a_part_ends_as_high_as_the_episode_began_but_the_last_one_does_not():
-    eyes, one = Perception(LAYOUT), row(PLATE, BOX)
-    one.observe(HAND, eyes)
-    last, before = one.executor.plan[-1], one.executor.plan[-2]
+    perception, one = Perception(LAYOUT), controller(PLATE, BOX)
+    observe(one, HAND, perception)
+    last, before = one.executor.targets[-1], one.executor.targets[-2]
     assert_allclose(last.T_world_ee[:3, 3], [*before.T_world_ee[:2, 3], HAND.T_world_ee[2, 3]])
     assert_allclose(last.T_world_ee[:3, :3], before.T_world_ee[:3, :3])
-    assert len(one.executor.plan) == len(PLATE.key_poses) + 1
-    finish_part(one, eyes, HAND)
-    assert len(one.executor.plan) == len(BOX.key_poses)
-    low, one = Hand(hand_pose(0, 0, 0.1), HAND.opening), row(PLATE, BOX)
-    one.observe(low, Perception(LAYOUT))
-    assert len(one.executor.plan) == len(PLATE.key_poses), "it began lower than it ends"
+    assert len(one.executor.targets) == len(PLATE.key_poses) + 1
+    finish_part(one, perception, HAND)
+    assert len(one.executor.targets) == len(BOX.key_poses)
+    low, one = Hand(hand_pose(0, 0, 0.1), HAND.opening), controller(PLATE, BOX)
+    observe(one, low, Perception(LAYOUT))
+    assert len(one.executor.targets) == len(PLATE.key_poses), "it began lower than it ends"
 
 
 def test_another_object_of_the_same_name_is_not_taken_to_be_where_the_first_one_was():
     asked = "put the left bowl on the plate and put the right bowl on the plate"
-    eyes, one = Perception(LAYOUT), row(PLATE, instruction=asked)
-    one.observe(HAND, eyes)
-    del eyes.layout["bowl"]
+    perception, one = Perception(LAYOUT), controller(PLATE, instruction=asked)
+    observe(one, HAND, perception)
+    del perception.layout["bowl"]
     one.scene.tracker.release(one.scene.tracker.held, HAND.T_world_ee)
-    one.executor.begin(one.executor.plan, HAND, len(one.executor.plan) - 1)
-    watch(one, eyes, Hand(one.executor.plan[-1].T_world_ee, HAND.opening), 12)
-    assert one.planner.part == 1
-    assert one.status is Status.OBJECT_NOT_FOUND
+    one.executor.begin(one.executor.targets, HAND, len(one.executor.targets) - 1)
+    watch(one, perception, Hand(one.executor.targets[-1].T_world_ee, HAND.opening), 12)
+    assert one.state.part == 1
+    assert one.state.status is Status.OBJECT_NOT_FOUND
 
 
 def test_the_second_of_two_like_things_is_looked_for_after_the_first_was_opened():
     poses = [replace(pose, anchor=Anchor("box", "box")) for pose in opening().key_poses]
     memory = entry("open the box", poses, {"box": np.eye(4)})
-    eyes = Perception({"box": se3.from_yaw([0.2, 0.1, 0.0], 0.0)})
-    one = row(memory, instruction="open the left box then open the right box")
-    one.observe(HAND, eyes)
-    last = len(one.executor.plan) - 1
-    one.executor.begin(one.executor.plan, HAND, 1)
+    perception = Perception({"box": se3.from_yaw([0.2, 0.1, 0.0], 0.0)})
+    one = controller(memory, instruction="open the left box then open the right box")
+    observe(one, HAND, perception)
+    last = len(one.executor.targets) - 1
+    one.executor.begin(one.executor.targets, HAND, 1)
     for index in range(1, last + 1):
-        target = one.executor.plan[index]
+        target = one.executor.targets[index]
         hand = Hand(target.T_world_ee, target.key_pose.opening)
-        one.executor.begin(one.executor.plan, hand, index)
-        watch(one, eyes, hand, target.key_pose.n_steps + 2)
-    assert one.planner.part == 1
-    assert "box" in eyes.asked[-1]
-    assert one.status is Status.RUNNING
+        one.executor.begin(one.executor.targets, hand, index)
+        watch(one, perception, hand, target.key_pose.n_steps + 2)
+    assert one.state.part == 1
+    assert "box" in perception.asked[-1]
+    assert one.state.status is Status.RUNNING
 
 
 def test_the_whole_is_preferred_where_it_was_demonstrated():
     whole = entry(BOTH, PLATE.key_poses, LAYOUT, source="local/demos#9")
-    one = row(PLATE, BOX, whole)
-    one.observe(HAND, Perception(LAYOUT))
-    assert one.planner.used == [
-        whole,
-    ]
-    assert len(one.executor.plan) == len(whole.key_poses)
+    one = controller(PLATE, BOX, whole)
+    observe(one, HAND, Perception(LAYOUT))
+    assert one.state.used == (whole,)
+    assert len(one.executor.targets) == len(whole.key_poses)
 
 
 def test_a_part_of_an_entry_is_used_in_the_name_of_the_entry():
     both = "open the top drawer and put the bowl inside"
     whole = entry(both, opening().key_poses, {"cabinet": np.eye(4), "bowl": LAYOUT["bowl"]})
-    one = row(whole, instruction="open the top drawer")
-    one.observe(HAND, Perception({"cabinet": LAYOUT["plate"]}))
-    assert one.status is Status.RUNNING
-    assert one.planner.ranked[0].entry.language == "open the top drawer of the cabinet"
-    assert len(one.planner.used) == 1
-    assert one.planner.used[0] is whole
+    one = controller(whole, instruction="open the top drawer")
+    observe(one, HAND, Perception({"cabinet": LAYOUT["plate"]}))
+    assert one.state.status is Status.RUNNING
+    assert one.state.ranked[0].entry.language == "open the top drawer of the cabinet"
+    assert len(one.state.used) == 1
+    assert one.state.used[0] is whole
 
 
 def test_an_opened_drawer_looks_different_and_is_not_looked_for_again():
     cabinet = se3.from_yaw([0.2, 0.2, 0.0], 0.3)
-    eyes = Perception({**LAYOUT, "cabinet": cabinet})
-    one = row(opening(), entry("put the bowl on the cabinet"),
+    perception = Perception({**LAYOUT, "cabinet": cabinet})
+    one = controller(opening(), entry("put the bowl on the cabinet"),
               instruction="open the top drawer and put the bowl on the cabinet")  # fmt: skip
-    one.observe(HAND, eyes)
-    hand = finish_part(one, eyes, HAND)
-    assert one.planner.part == 1
-    eyes.asked.clear()
-    eyes.layout["cabinet"] = shifted(cabinet, 0.08)  # what its looks seem to say now
-    finish_part(one, eyes, hand)
-    assert one.status is Status.DONE
-    assert not any("cabinet" in names for names in eyes.asked)
-    place = next(target for target in one.executor.plan if target.key_pose.phase == "place")
+    observe(one, HAND, perception)
+    hand = finish_part(one, perception, HAND)
+    assert one.state.part == 1
+    perception.asked.clear()
+    perception.layout["cabinet"] = shifted(cabinet, 0.08)  # what its looks seem to say now
+    finish_part(one, perception, hand)
+    assert one.state.status is Status.DONE
+    assert not any("cabinet" in names for names in perception.asked)
+    place = next(target for target in one.executor.targets if target.key_pose.phase == "place")
     assert_allclose(place.T_world_ee, cabinet @ place.key_pose.T_obj_ee)
 
 
 def test_what_an_opened_drawer_hides_is_not_lost():
-    eyes = Perception({**LAYOUT, "cabinet": se3.from_yaw([0.2, 0.2, 0.0], 0.3)})
-    one = row(opening(), PLATE, instruction="open the top drawer and put the bowl on the plate")
-    one.observe(HAND, eyes)
-    del eyes.layout["bowl"]  # it should be in sight, and is not recognised
-    finish_part(one, eyes, HAND)
-    assert one.planner.part == 1
+    perception = Perception({**LAYOUT, "cabinet": se3.from_yaw([0.2, 0.2, 0.0], 0.3)})
+    one = controller(opening(), PLATE, instruction="open the top drawer and put the bowl on the plate")
+    observe(one, HAND, perception)
+    del perception.layout["bowl"]  # it should be in sight, and is not recognised
+    finish_part(one, perception, HAND)
+    assert one.state.part == 1
     away = Hand(hand_pose(-0.4, -0.4, 0.5), HAND.opening)
-    watch(one, eyes, away, 100)
-    assert one.status is Status.RUNNING
-    assert one.status is not Status.PAUSED
-    eyes.layout["bowl"] = LAYOUT["bowl"]
-    watch(one, eyes, away, 12)
-    del eyes.layout["bowl"]
-    watch(one, eyes, away, 100)
-    assert one.status is Status.OBJECT_LOST, "it was seen since, so it is gone now"
+    watch(one, perception, away, 100)
+    assert one.state.status is Status.RUNNING
+    assert one.state.status is not Status.PAUSED
+    perception.layout["bowl"] = LAYOUT["bowl"]
+    watch(one, perception, away, 12)
+    del perception.layout["bowl"]
+    watch(one, perception, away, 100)
+    assert one.state.status is Status.OBJECT_LOST, "it was seen since, so it is gone now"
 
 
 @pytest.mark.parametrize(
@@ -196,14 +202,14 @@ def test_what_an_opened_drawer_hides_is_not_lost():
     [("close the top drawer", "cabinet", "open"), ("turn on the stove", "stove", "turn")],
 )
 def test_what_closes_or_turns_hides_nothing(instruction: str, thing: str, phase: str):
-    eyes = Perception({**LAYOUT, thing: se3.from_yaw([0.2, 0.2, 0.0], 0.3)})
+    perception = Perception({**LAYOUT, thing: se3.from_yaw([0.2, 0.2, 0.0], 0.3)})
     both = f"{instruction} and put the bowl on the plate"
-    one = row(opening(instruction, thing, phase), PLATE, instruction=both)
-    one.observe(HAND, eyes)
-    del eyes.layout["bowl"]
-    finish_part(one, eyes, HAND)
-    watch(one, eyes, Hand(hand_pose(-0.4, -0.4, 0.5), HAND.opening), 100)
-    assert one.status is Status.OBJECT_LOST
+    one = controller(opening(instruction, thing, phase), PLATE, instruction=both)
+    observe(one, HAND, perception)
+    del perception.layout["bowl"]
+    finish_part(one, perception, HAND)
+    watch(one, perception, Hand(hand_pose(-0.4, -0.4, 0.5), HAND.opening), 100)
+    assert one.state.status is Status.OBJECT_LOST
 
 
 def test_what_was_opened_is_not_looked_for_when_a_later_grasp_is_tried_again():
@@ -211,63 +217,61 @@ def test_what_was_opened_is_not_looked_for_when_a_later_grasp_is_tried_again():
     putting = entry("put the bowl on the cabinet").key_poses
     both = "open the top drawer and put the bowl on the cabinet"
     whole = entry(both, (*opening().key_poses, *putting), {"cabinet": cabinet, "bowl": LAYOUT["bowl"]})
-    eyes, one = Perception({**LAYOUT, "cabinet": cabinet}), row(whole, instruction=both)
-    one.observe(HAND, eyes)
+    perception, one = Perception({**LAYOUT, "cabinet": cabinet}), controller(whole, instruction=both)
+    observe(one, HAND, perception)
     hand = HAND
-    while one.executor.index < 9:  # the bowl is lifted
+    while one.state.index < 9:  # the bowl is lifted
         target = one.executor.target
         hand = Hand(target.T_world_ee, target.key_pose.opening)
-        watch(one, eyes, hand, 1)
-    eyes.asked.clear()
-    watch(one, eyes, Hand(hand.T_world_ee, 0.0), 1)
-    assert one.executor.attempts == 1
-    assert eyes.asked == [["bowl"]]
+        watch(one, perception, hand, 1)
+    perception.asked.clear()
+    watch(one, perception, Hand(hand.T_world_ee, 0.0), 1)
+    assert one.state.attempts == 1
+    assert perception.asked == [["bowl"]]
 
 
 def test_a_part_that_cannot_be_found_is_waited_for():
-    eyes, one = Perception({k: T for k, T in LAYOUT.items() if k != "box"}), row(PLATE, BOX)
-    one.observe(HAND, eyes)
-    hand = finish_part(one, eyes, HAND)
-    assert one.status is Status.OBJECT_NOT_FOUND
-    assert one.planner.used == [
-        PLATE,
-    ]
-    assert not one.next_action(hand)[:6].any()
-    eyes.layout["box"] = LAYOUT["box"]
-    watch(one, eyes, hand, LOOK_AGAIN_STEPS)
-    assert one.status is Status.RUNNING
-    assert one.planner.used == [PLATE, BOX]
+    perception, one = Perception({k: T for k, T in LAYOUT.items() if k != "box"}), controller(PLATE, BOX)
+    observe(one, HAND, perception)
+    hand = finish_part(one, perception, HAND)
+    assert one.state.status is Status.OBJECT_NOT_FOUND
+    assert one.state.used == (PLATE,)
+    assert not one.executor.next_action(hand)[:6].any()
+    perception.layout["box"] = LAYOUT["box"]
+    watch(one, perception, hand, LOOK_AGAIN_STEPS)
+    assert one.state.status is Status.RUNNING
+    assert one.state.used == (PLATE, BOX)
 
 
 def test_a_part_out_of_reach_is_infeasible():
-    eyes, one = Perception({**LAYOUT, "box": shifted(LAYOUT["box"], 3.0)}), row(PLATE, BOX)
-    one.observe(HAND, eyes)
-    assert one.status is Status.RUNNING
-    finish_part(one, eyes, HAND)
-    assert one.status is Status.INFEASIBLE
+    perception, one = Perception({**LAYOUT, "box": shifted(LAYOUT["box"], 3.0)}), controller(PLATE, BOX)
+    observe(one, HAND, perception)
+    assert one.state.status is Status.RUNNING
+    finish_part(one, perception, HAND)
+    assert one.state.status is Status.INFEASIBLE
 
 
 def test_every_part_has_attempts_of_its_own():
-    eyes, one = Perception(LAYOUT), row(PLATE, BOX)
-    one.observe(HAND, eyes)
-    one.executor.attempts = 3
-    finish_part(one, eyes, HAND)
-    assert one.planner.part == 1
-    assert one.executor.attempts == 0
+    perception, one = Perception(LAYOUT), controller(PLATE, BOX)
+    observe(one, HAND, perception)
+    one.state.attempts = 3
+    finish_part(one, perception, HAND)
+    assert one.state.part == 1
+    assert one.state.attempts == 0
 
 
 def test_nothing_is_begun_where_a_part_is_unknown():
-    one = row(PLATE, BOX, instruction="put the bowl on the plate and turn on the stove")
-    one.observe(HAND, Perception(LAYOUT))
-    assert one.status is Status.NOT_UNDERSTOOD
-    assert "'turn on the stove' is a part of the instruction" in one.refusal
-    assert one.executor.plan == ()
+    one = controller(PLATE, BOX, instruction="put the bowl on the plate and turn on the stove")
+    observe(one, HAND, Perception(LAYOUT))
+    assert one.state.status is Status.NOT_UNDERSTOOD
+    assert "'turn on the stove' is a part of the instruction" in one.state.refusal
+    assert one.executor.targets == ()
 
 
 @pytest.mark.parametrize("off", [{"tracking": False}, {"execution": "open_loop"}])
 def test_without_tracking_every_part_is_still_planned_from_a_look(off):
-    eyes, one = Perception(LAYOUT), row(PLATE, BOX, **off)
-    one.observe(HAND, eyes)
-    finish_part(one, eyes, HAND)
-    assert one.planner.part == 1
-    assert len(eyes.asked) == 2
+    perception, one = Perception(LAYOUT), controller(PLATE, BOX, **off)
+    observe(one, HAND, perception)
+    finish_part(one, perception, HAND)
+    assert one.state.part == 1
+    assert len(perception.asked) == 2

@@ -5,6 +5,7 @@ from numpy.testing import assert_allclose
 from tests.memory.builders import OPEN_WIDTH, entry, hand_pose, key_pose, robot
 
 from lerobot_openspm.control.executor import Executor
+from lerobot_openspm.control.state import EpisodeState
 from lerobot_openspm.control.strategies import ControlSettings
 from lerobot_openspm.control.transfer import transfer
 from lerobot_openspm.geometry import se3
@@ -26,25 +27,25 @@ def drawer(axis=None):
     ]
     layout = {"cabinet": se3.from_yaw([0.05, 0.1, 0.0], 0.6)}
     memory = entry("open the top drawer of the cabinet", key_poses=poses, layout=layout)
-    executor = Executor(ControlSettings(), ROBOT)
+    executor = Executor(ControlSettings(), ROBOT, EpisodeState())
     executor.begin(transfer(memory, layout, {}, HOME), Hand(HOME, OPEN_WIDTH))
     return executor, layout["cabinet"]
 
 
 def test_a_drawer_is_pulled_along_its_axis_from_where_its_handle_was_taken():
     executor, T_world_obj = drawer()
-    taken = executor.plan[1].T_world_ee @ se3.from_yaw([0.004, -0.006, 0.003], 0.02)
-    executor.begin(executor.plan, Hand(taken, 0.03), 2)
-    target = executor.plan[2]
+    taken = executor.targets[1].T_world_ee @ se3.from_yaw([0.004, -0.006, 0.003], 0.02)
+    executor.begin(executor.targets, Hand(taken, 0.03), 2)
+    target = executor.targets[2]
     assert_allclose(target.T_world_ee[:3, 3] - taken[:3, 3], 0.15 * T_world_obj[:3, 0], atol=1e-9)
     assert_allclose(target.T_world_ee[:3, :3], taken[:3, :3])
-    executor.change(drawer()[0].plan)  # a look at something else does not take it back
-    assert_allclose(executor.plan[2].T_world_ee, target.T_world_ee)
+    executor.change(drawer()[0].targets)  # a look at something else does not take it back
+    assert_allclose(executor.targets[2].T_world_ee, target.T_world_ee)
 
 
 def test_the_open_loop_follows_an_axis_from_where_the_hand_should_be():
     executor, _ = drawer()
-    executor = Executor(ControlSettings(execution="open_loop"), ROBOT)
-    executor.begin(drawer()[0].plan, Hand(HOME, OPEN_WIDTH))
-    executor.begin(executor.plan, Hand(HOME, OPEN_WIDTH), 2)
-    assert_allclose(executor.plan[2].T_world_ee, drawer()[0].plan[2].T_world_ee, atol=1e-9)
+    executor = Executor(ControlSettings(execution="open_loop"), ROBOT, EpisodeState())
+    executor.begin(drawer()[0].targets, Hand(HOME, OPEN_WIDTH))
+    executor.begin(executor.targets, Hand(HOME, OPEN_WIDTH), 2)
+    assert_allclose(executor.targets[2].T_world_ee, drawer()[0].targets[2].T_world_ee, atol=1e-9)

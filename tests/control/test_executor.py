@@ -8,7 +8,7 @@ from numpy.testing import assert_allclose
 from tests.memory.builders import OPEN_WIDTH, entry, hand_pose, key_pose, robot
 
 from lerobot_openspm.control.executor import Executor
-from lerobot_openspm.control.status import Status
+from lerobot_openspm.control.state import EpisodeState, Status
 from lerobot_openspm.control.strategies import ControlSettings
 from lerobot_openspm.control.transfer import transfer
 from lerobot_openspm.errors import OpenSPMError
@@ -52,7 +52,7 @@ class World:
 
 def make(settings=None, key_poses=None, hand=HOME):
     memory = entry(key_poses=key_poses)
-    executor = Executor(settings or ControlSettings(), ROBOT)
+    executor = Executor(settings or ControlSettings(), ROBOT, EpisodeState())
     executor.begin(transfer(memory, memory.layout, {}, hand), Hand(hand, OPEN_WIDTH))
     return executor
 
@@ -61,22 +61,22 @@ def run(executor, world, n_steps=600, until=lambda _: False, flow=toward):
     """Act until done; returns, by key pose, the hand at the moment it was left, and the retries asked for."""
     left, retries, steps_at = {}, 0, {}
     for _ in range(n_steps):
-        index = executor.index
+        index = executor.state.index
         again = executor.advance(world.hand)
-        for passed in range(index, executor.index):
+        for passed in range(index, executor.state.index):
             left[passed] = world.T
         if again:
             retries += 1
-            executor.begin(executor.plan, world.hand, executor.retry_index())
-        if executor.status is not Status.RUNNING or until(executor):
-            if executor.status is Status.DONE:
-                left[executor.index] = world.T
+            executor.begin(executor.targets, world.hand, executor.contact_index())
+        if executor.state.status is not Status.RUNNING or until(executor):
+            if executor.state.status is Status.DONE:
+                left[executor.state.index] = world.T
             break
         action = executor.next_action(world.hand)
         if action is None:
             executor.push_chunk(flow(executor.query(world.hand)))
             action = executor.next_action(world.hand)
-        steps_at[executor.index] = steps_at.get(executor.index, 0) + 1
+        steps_at[executor.state.index] = steps_at.get(executor.state.index, 0) + 1
         world.step(action)
     return left, retries, steps_at
 
@@ -84,11 +84,11 @@ def run(executor, world, n_steps=600, until=lambda _: False, flow=toward):
 def test_the_closed_loop_meets_every_key_pose_as_exactly_as_it_must():
     executor, world = make(), World()
     left, retries, _ = run(executor, world)
-    assert executor.status is Status.DONE
+    assert executor.state.status is Status.DONE
     assert retries == 0
     assert sorted(left) == list(range(8))
     settings = ControlSettings()
-    for i, target in enumerate(executor.plan):
+    for i, target in enumerate(executor.targets):
         metres, radians = se3.distances(left[i], target.T_world_ee)
         if target.key_pose.dwell:
             continue
@@ -104,7 +104,7 @@ def test_the_closed_loop_meets_every_key_pose_as_exactly_as_it_must():
 def test_waiting_for_the_fingers_takes_the_demonstrated_steps():
     executor, world = make(), World()
     _, _, steps_at = run(executor, world)
-    for i, target in enumerate(executor.plan):
+    for i, target in enumerate(executor.targets):
         if target.key_pose.dwell:
             assert steps_at[i] == target.key_pose.n_steps
 
@@ -112,8 +112,8 @@ def test_waiting_for_the_fingers_takes_the_demonstrated_steps():
 @pytest.mark.parametrize("settings", [ControlSettings(), ControlSettings(execution="open_loop")])
 def test_a_hand_that_drifts_while_the_fingers_close_is_brought_back(settings):
     executor, world = make(settings), World()
-    run(executor, world, until=lambda e: e.plan[e.index].key_pose.dwell)
-    target = executor.plan[executor.index]
+    run(executor, world, until=lambda e: e.targets[e.state.index].key_pose.dwell)
+    target = executor.targets[executor.state.index]
     drift = np.array([0.012, -0.008, 0.005, 0.0, 0.0, 0.05])
     world.T = se3.apply_increment(target.T_world_ee, drift)
     actions = []
@@ -134,7 +134,7 @@ def test_a_hand_that_drifts_while_the_fingers_close_is_brought_back(settings):
 def test_via_points_are_passed_without_stopping_short():
     loose, world = make(ControlSettings(passing_m=0.05, passing_rad=1.0)), World()
     loose_left, _, _ = run(loose, world)
-    metres, _ = se3.distances(loose_left[0], loose.plan[0].T_world_ee)
+    metres, _ = se3.distances(loose_left[0], loose.targets[0].T_world_ee)
     assert ControlSettings().passing_m < metres <= 0.05
 
 
@@ -142,20 +142,20 @@ def test_via_points_are_passed_without_stopping_short():
 def test_a_key_pose_is_met_in_angle_too(sign):
     T = hand_pose(0, 0, 0.3, sign * 0.5)
     executor = make(key_poses=[key_pose("bowl", np.eye(4), "place")])
-    executor.begin([replace(executor.plan[0], T_world_ee=T)], Hand(HOME, OPEN_WIDTH))
+    executor.begin([replace(executor.targets[0], T_world_ee=T)], Hand(HOME, OPEN_WIDTH))
     executor.advance(Hand(HOME, OPEN_WIDTH))
-    assert executor.status is Status.RUNNING
+    assert executor.state.status is Status.RUNNING
     executor.advance(Hand(hand_pose(0, 0, 0.3, sign * (0.5 - 0.059)), OPEN_WIDTH))
-    assert executor.status is Status.DONE
+    assert executor.state.status is Status.DONE
 
 
 def test_time_runs_out_in_the_closed_loop():
     executor = make(ControlSettings(execution="closed_loop"))
     world = World(stuck=lambda T: True)
     _, retries, steps_at = run(executor, world)
-    assert executor.status is Status.DONE
+    assert executor.state.status is Status.DONE
     assert retries == 0
-    length = float(se3.distance(HOME, executor.plan[0].T_world_ee))
+    length = float(se3.distance(HOME, executor.targets[0].T_world_ee))
     assert steps_at[0] == max(10, int(np.ceil(length / ROBOT.metres_per_step)))
 
 
@@ -165,35 +165,35 @@ def test_residual_correction_reaches_what_time_alone_does_not():
     left_without, _, _ = run(without, World(gain=slow))
     corrected = make()
     left_with, retries, _ = run(corrected, World(gain=slow))
-    assert corrected.status is Status.DONE
+    assert corrected.state.status is Status.DONE
     assert retries == 0
-    error = lambda left, executor: float(se3.distances(left[1], executor.plan[1].T_world_ee)[0])  # noqa: E731
+    error = lambda left, executor: float(se3.distances(left[1], executor.targets[1].T_world_ee)[0])  # noqa: E731
     assert error(left_with, corrected) <= ControlSettings().residual_m < error(left_without, without)
 
 
 def test_a_correction_contracts_the_error_whatever_the_flow_model_says():
     executor, world = make(), World()
     still = lambda query: np.zeros((CHUNK, 7))  # noqa: E731
-    start = float(se3.distance(HOME, executor.plan[0].T_world_ee))
+    start = float(se3.distance(HOME, executor.targets[0].T_world_ee))
     left, retries, _ = run(executor, world, flow=still)
-    assert executor.status is Status.DONE
+    assert executor.state.status is Status.DONE
     assert retries == 0
-    assert float(se3.distances(left[0], executor.plan[0].T_world_ee)[0]) <= 0.015 < start
+    assert float(se3.distances(left[0], executor.targets[0].T_world_ee)[0]) <= 0.015 < start
 
 
 @given(st.lists(st.floats(-0.3, 0.3), min_size=6, max_size=6))
 def test_a_corrective_action_points_straight_at_the_key_pose_and_is_bounded(offset):
     executor = make(key_poses=[key_pose("bowl", np.eye(4), "place")])
-    T = se3.apply_increment(executor.plan[0].T_world_ee, np.array(offset))
-    action = executor.strategy.toward(executor.plan[0], Hand(T, OPEN_WIDTH))
-    residual = se3.increment(T, executor.plan[0].T_world_ee) / GAINS
+    T = se3.apply_increment(executor.targets[0].T_world_ee, np.array(offset))
+    action = executor.strategy.toward(executor.targets[0], T)
+    residual = se3.increment(T, executor.targets[0].T_world_ee) / GAINS
     assert np.abs(action[:6]).max() <= 1 + 1e-12
     assert float(action[:6] @ residual) >= 0
     assert_allclose(np.outer(action[:6], residual), np.outer(residual, action[:6]), atol=1e-6)
 
 
 def blocked_at_the_bowl(executor):
-    height = executor.plan[1].T_world_ee[2, 3]
+    height = executor.targets[1].T_world_ee[2, 3]
     return lambda T: bool(T[2, 3] < height + 0.02)
 
 
@@ -202,52 +202,52 @@ def test_what_cannot_be_met_is_corrected_then_tried_again_then_given_up():
     executor = make(settings)
     world = World(stuck=blocked_at_the_bowl(executor))
     _, retries, _ = run(executor, world, 2000)
-    assert executor.status is Status.NO_PROGRESS
+    assert executor.state.status is Status.NO_PROGRESS
     assert retries == 2
-    assert executor.attempts == 3
+    assert executor.state.attempts == 3
     assert executor.next_action(world.hand)[:6].tolist() == [0.0] * 6
 
 
 def test_corrections_are_counted_once_time_is_up_and_forgotten_at_the_next_key_pose():
     executor = make(ControlSettings(max_corrections=3))
     world = World(stuck=blocked_at_the_bowl(executor))
-    run(executor, world, until=lambda e: e.index == 1)
-    assert executor.present.corrections == 0
-    run(executor, world, until=lambda e: e.present.corrections == 3)
-    assert executor.index == 1
-    assert executor.attempts == 0
+    run(executor, world, until=lambda e: e.state.index == 1)
+    assert executor.approach.corrections == 0
+    run(executor, world, until=lambda e: e.approach.corrections == 3)
+    assert executor.state.index == 1
+    assert executor.state.attempts == 0
     # One more chunk makes it four, more than the three that are allowed.
-    run(executor, world, until=lambda e: e.attempts == 1)
-    assert executor.index == 0
-    assert executor.present.corrections == 0
+    run(executor, world, until=lambda e: e.state.attempts == 1)
+    assert executor.state.index == 0
+    assert executor.approach.corrections == 0
 
 
 def test_a_via_point_that_is_blocked_is_left_behind():
     executor = make()
-    high = executor.plan[0].T_world_ee[2, 3]
+    high = executor.targets[0].T_world_ee[2, 3]
     world = World(stuck=lambda T: bool(T[2, 3] < high + 0.03) and world.step_count < 200)
-    _, retries, _ = run(executor, world, until=lambda e: e.index == 1)
-    assert executor.index == 1
+    _, retries, _ = run(executor, world, until=lambda e: e.state.index == 1)
+    assert executor.state.index == 1
     assert retries == 0
-    assert executor.status is Status.RUNNING
+    assert executor.state.status is Status.RUNNING
 
 
 def test_empty_fingers_after_the_grasp_ask_for_another_try():
     executor, world = make(), World(held=0.001)
-    run(executor, world, until=lambda e: e.attempts == 1)
-    assert executor.status is Status.RUNNING
-    assert executor.index == 0  # back to the first approach of this grasp
+    run(executor, world, until=lambda e: e.state.attempts == 1)
+    assert executor.state.status is Status.RUNNING
+    assert executor.state.index == 0  # back to the first approach of this grasp
     world.held = 0.03
     run(executor, world)
-    assert executor.status is Status.DONE
-    assert executor.attempts == 1
+    assert executor.state.status is Status.DONE
+    assert executor.state.attempts == 1
 
 
 @pytest.mark.parametrize(("share", "lost"), [(0.39, True), (0.41, False)])
 def test_fingers_hold_something_above_a_share_of_the_demonstrated_opening(share, lost):
     executor = make()
-    executor.begin(executor.plan, Hand(HOME, OPEN_WIDTH), 4)  # carrying
-    grasped = executor.plan[2].key_pose.opening
+    executor.begin(executor.targets, Hand(HOME, OPEN_WIDTH), 4)  # carrying
+    grasped = executor.targets[2].key_pose.opening
     assert executor.advance(Hand(HOME, share * grasped)) is lost
 
 
@@ -255,17 +255,17 @@ def test_grip_is_not_judged_before_the_grasp_nor_in_a_push_nor_without_correctio
     empty = Hand(HOME, 0.0)
     executor = make()
     for index in (0, 1, 2, 7):
-        executor.begin(executor.plan, empty, index)
+        executor.begin(executor.targets, empty, index)
         assert executor.advance(empty) is False
     plain = make(ControlSettings(execution="closed_loop"))
-    plain.begin(plain.plan, empty, 4)
+    plain.begin(plain.targets, empty, 4)
     assert plain.advance(empty) is False
     fist = [
         key_pose("plate", hand_pose(0, 0, 0.02), "approach", closed=True, opening=0.0),
         key_pose("plate", hand_pose(0.2, 0, 0.02), "push", closed=True, opening=0.0),
     ]
     pushing = make(key_poses=fist)
-    pushing.begin(pushing.plan, empty, 1)
+    pushing.begin(pushing.targets, empty, 1)
     assert pushing.advance(empty) is False
 
 
@@ -276,8 +276,8 @@ def test_a_retry_begins_at_the_first_approach_of_the_same_contact():
     executor = make(key_poses=[*entry().key_poses, *second])
     found = []
     for index in range(12):
-        executor.begin(executor.plan, Hand(HOME, OPEN_WIDTH), index)
-        found.append(executor.retry_index())
+        executor.begin(executor.targets, Hand(HOME, OPEN_WIDTH), index)
+        found.append(executor.contact_index())
     assert found == [0] * 8 + [8] * 4
 
 
@@ -292,7 +292,7 @@ def test_the_open_loop_never_looks_at_the_hand():
             return toward(query)
 
         run(executor, world, flow=flow)
-        assert executor.status is Status.DONE
+        assert executor.state.status is Status.DONE
         seen.append(np.stack([query.T_world_ee for query in queries]))
     assert_allclose(seen[1], seen[0])
     assert_allclose(seen[2], seen[0])
@@ -304,10 +304,10 @@ def test_closed_loop_queries_start_from_the_hand():
     elsewhere = Hand(hand_pose(0.1, 0.1, 0.2, 0.4), OPEN_WIDTH / 2)
     query = executor.query(elsewhere)
     assert_allclose(query.T_world_ee, elsewhere.T_world_ee)
-    assert_allclose(query.T_world_target, executor.plan[0].T_world_ee)
+    assert_allclose(query.T_world_target, executor.targets[0].T_world_ee)
     assert query.opening == pytest.approx(0.5)
     assert query.closed == 0
-    assert executor.replans == 1
+    assert executor.state.replans == 1
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
@@ -324,21 +324,21 @@ def test_actions_left_over_are_dropped_at_the_next_key_pose():
     executor = make()
     executor.push_chunk(np.ones((CHUNK, 7)))
     executor.next_action(Hand(HOME, OPEN_WIDTH))
-    executor.advance(Hand(executor.plan[0].T_world_ee, OPEN_WIDTH))
-    assert executor.index == 1
+    executor.advance(Hand(executor.targets[0].T_world_ee, OPEN_WIDTH))
+    assert executor.state.index == 1
     assert executor.next_action(Hand(HOME, OPEN_WIDTH)) is None
 
 
 def test_holding_still_keeps_the_fingers_as_they_are():
-    executor = Executor(ControlSettings(), ROBOT)
+    executor = Executor(ControlSettings(), ROBOT, EpisodeState())
     assert executor.hold().tolist() == [0] * 6 + [ROBOT.open_command]
     assert executor.next_action(Hand(HOME, OPEN_WIDTH)).tolist() == [0] * 6 + [ROBOT.open_command]
     carrying = make()
-    carrying.begin(carrying.plan, Hand(HOME, 0.03), 4)
+    carrying.begin(carrying.targets, Hand(HOME, 0.03), 4)
     assert carrying.hold().tolist() == [0] * 6 + [ROBOT.close_command]
     done = make(key_poses=[key_pose("bowl", HOME, "lift", closed=True)])
-    done.advance(Hand(done.plan[0].T_world_ee, 0.03))
-    assert done.status is Status.DONE
+    done.advance(Hand(done.targets[0].T_world_ee, 0.03))
+    assert done.state.status is Status.DONE
     assert done.next_action(Hand(HOME, OPEN_WIDTH)).tolist() == [0] * 6 + [ROBOT.close_command]
 
 
@@ -346,25 +346,25 @@ def test_holding_still_keeps_the_fingers_as_they_are():
 def test_what_is_in_the_way_counts_as_met_when_the_key_pose_is_near(gap, retries_wanted):
     """Something solid holds the hand up above the place: within three tolerances it has arrived."""
     executor = make()
-    floor = executor.plan[1].T_world_ee[2, 3] + gap
-    world = World(stuck=lambda T: T[2, 3] < floor and executor.index <= 1)
-    _, retries, _ = run(executor, world, n_steps=150, until=lambda e: e.index > 1)
-    assert (executor.index > 1) == (retries_wanted == 0)
+    floor = executor.targets[1].T_world_ee[2, 3] + gap
+    world = World(stuck=lambda T: T[2, 3] < floor and executor.state.index <= 1)
+    _, retries, _ = run(executor, world, n_steps=150, until=lambda e: e.state.index > 1)
+    assert (executor.state.index > 1) == (retries_wanted == 0)
     assert (retries > 0) == (retries_wanted > 0)
 
 
 def test_a_correction_that_gets_nowhere_pushes_harder():
     executor = make()
     world = World(stuck=blocked_at_the_bowl(executor))
-    run(executor, world, until=lambda e: e.index == 1)
+    run(executor, world, until=lambda e: e.state.index == 1)
     pushes = {}
-    while executor.present.corrections < 6 and executor.attempts == 0:
+    while executor.approach.corrections < 6 and executor.state.attempts == 0:
         action = executor.next_action(world.hand)
         if action is None:
             executor.push_chunk(toward(executor.query(world.hand)))
             continue
-        if executor.present.corrections:
-            pushes.setdefault(executor.present.corrections, float(np.abs(action[:3]).max()))
+        if executor.approach.corrections:
+            pushes.setdefault(executor.approach.corrections, float(np.abs(action[:3]).max()))
         world.step(action)
         executor.advance(world.hand)
     values = [pushes[i] for i in sorted(pushes)]
@@ -382,9 +382,9 @@ def test_closed_fingers_that_push_after_something_was_put_down_hold_nothing_that
     ]
     executor = make(key_poses=(*entry().key_poses, *pushing))
     fist = Hand(HOME, 0.0)
-    phases = [target.key_pose.phase for target in executor.plan]
+    phases = [target.key_pose.phase for target in executor.targets]
     for index in (9, 10):
-        executor.begin(executor.plan, fist, index)
+        executor.begin(executor.targets, fist, index)
         assert not executor.has_lost_grip(fist), phases[index]
-    executor.begin(executor.plan, fist, phases.index("lift"))
+    executor.begin(executor.targets, fist, phases.index("lift"))
     assert executor.has_lost_grip(fist)

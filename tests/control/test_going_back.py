@@ -5,11 +5,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
-from tests.control.test_controller import HAND, Perception, row, watch
+from tests.control.test_controller import HAND, Perception, controller, observe, watch
 from tests.memory.builders import entry, hand_pose, key_pose, pick_and_place
 
 from lerobot_openspm.control.scene import GIVE_UP_S
-from lerobot_openspm.control.status import Status
+from lerobot_openspm.control.state import Status
 from lerobot_openspm.geometry import se3
 from lerobot_openspm.memory.entry import Anchor, Axis, Outcome
 from lerobot_openspm.types import Detections, Fault, Hand
@@ -44,151 +44,152 @@ def test_travel_is_the_inverse_of_following(axis):
 
 @pytest.mark.parametrize("axis", KINDS.values(), ids=list(KINDS))
 def test_a_handle_that_slipped_out_is_taken_again_where_it_is_now_for_the_rest_of_its_way(axis):
-    eyes, one = Perception(CABINET), row(handle(axis), instruction=OPEN)
-    one.observe(HAND, eyes)
-    shown = [target.T_world_ee for target in one.executor.plan]
+    perception, one = Perception(CABINET), controller(handle(axis), instruction=OPEN)
+    observe(one, HAND, perception)
+    shown = [target.T_world_ee for target in one.executor.targets]
     here = Hand(shown[2], 0.03)
-    one.executor.begin(one.executor.plan, here, 3)
-    world_axis = one.executor.plan[3].axis
+    one.executor.begin(one.executor.targets, here, 3)
+    world_axis = one.executor.targets[3].axis
     way = Axis(axis.kind, world_axis.direction, 0.4 * axis.amount)
-    watch(one, eyes, Hand(way.follow(shown[2]), 0.03), 1)
-    assert one.executor.index == 3
-    watch(one, eyes, Hand(axis.follow(shown[2]), 0.0), 1)  # the fingers have closed
-    assert one.executor.index == 0
+    watch(one, perception, Hand(way.follow(shown[2]), 0.03), 1)
+    assert one.state.index == 3
+    watch(one, perception, Hand(axis.follow(shown[2]), 0.0), 1)  # the fingers have closed
+    assert one.state.index == 0
     for index in (0, 1, 2):
-        assert_allclose(one.executor.plan[index].T_world_ee, way.follow(shown[index]), atol=1e-9)
-    again = Hand(one.executor.plan[2].T_world_ee, 0.03)
-    one.executor.begin(one.executor.plan, again, 3)
-    assert_allclose(one.executor.plan[3].T_world_ee, shown[3], atol=1e-9)
+        assert_allclose(one.executor.targets[index].T_world_ee, way.follow(shown[index]), atol=1e-9)
+    again = Hand(one.executor.targets[2].T_world_ee, 0.03)
+    one.executor.begin(one.executor.targets, again, 3)
+    assert_allclose(one.executor.targets[3].T_world_ee, shown[3], atol=1e-9)
 
 
 def test_a_handle_that_went_back_when_it_slipped_out_is_looked_for_nearer_to_where_it_was():
     axis = KINDS["slide"]
-    eyes, one = Perception(CABINET), row(handle(axis), instruction=OPEN)
-    one.observe(HAND, eyes)
-    shown = [target.T_world_ee for target in one.executor.plan]
-    one.executor.begin(one.executor.plan, Hand(shown[2], 0.03), 3)
-    way = Axis(axis.kind, one.executor.plan[3].axis.direction, 0.4 * axis.amount)
-    watch(one, eyes, Hand(way.follow(shown[2]), 0.03), 1)
-    watch(one, eyes, Hand(way.follow(shown[2]), 0.0), 1)
+    perception, one = Perception(CABINET), controller(handle(axis), instruction=OPEN)
+    observe(one, HAND, perception)
+    shown = [target.T_world_ee for target in one.executor.targets]
+    one.executor.begin(one.executor.targets, Hand(shown[2], 0.03), 3)
+    way = Axis(axis.kind, one.executor.targets[3].axis.direction, 0.4 * axis.amount)
+    watch(one, perception, Hand(way.follow(shown[2]), 0.03), 1)
+    watch(one, perception, Hand(way.follow(shown[2]), 0.0), 1)
     for share in (0.2, 0.1):  # it is not where it slipped out
-        there = one.executor.plan[2].T_world_ee
-        one.executor.begin(one.executor.plan, Hand(there, 0.0), 3)
-        watch(one, eyes, Hand(there, 0.0), 1)
+        there = one.executor.targets[2].T_world_ee
+        one.executor.begin(one.executor.targets, Hand(there, 0.0), 3)
+        watch(one, perception, Hand(there, 0.0), 1)
         nearer = Axis(axis.kind, way.direction, share * axis.amount)
-        assert_allclose(one.executor.plan[2].T_world_ee, nearer.follow(shown[2]), atol=1e-9)
+        assert_allclose(one.executor.targets[2].T_world_ee, nearer.follow(shown[2]), atol=1e-9)
 
 
 @pytest.mark.parametrize("share", [0.93, 0.97, 1.1])
 def test_a_handle_that_slipped_out_near_the_end_and_went_back_is_not_looked_for_further_out(share):
     axis = KINDS["slide"]
-    eyes, one = Perception(CABINET), row(handle(axis), instruction=OPEN)
-    one.observe(HAND, eyes)
-    shown = [target.T_world_ee for target in one.executor.plan]
-    one.executor.begin(one.executor.plan, Hand(shown[2], 0.03), 3)
-    direction = one.executor.plan[3].axis.direction
+    perception, one = Perception(CABINET), controller(handle(axis), instruction=OPEN)
+    observe(one, HAND, perception)
+    shown = [target.T_world_ee for target in one.executor.targets]
+    one.executor.begin(one.executor.targets, Hand(shown[2], 0.03), 3)
+    direction = one.executor.targets[3].axis.direction
 
     def pulled(metres):
         return Axis("slide", direction, metres).follow(shown[2])
 
-    watch(one, eyes, Hand(pulled(share * axis.amount), 0.03), 1)
-    watch(one, eyes, Hand(pulled(share * axis.amount), 0.0), 1)
-    slipped = np.linalg.norm(one.executor.plan[2].T_world_ee[:3, 3] - shown[2][:3, 3])
+    watch(one, perception, Hand(pulled(share * axis.amount), 0.03), 1)
+    watch(one, perception, Hand(pulled(share * axis.amount), 0.0), 1)
+    slipped = np.linalg.norm(one.executor.targets[2].T_world_ee[:3, 3] - shown[2][:3, 3])
     assert slipped < axis.amount
-    there = one.executor.plan[2].T_world_ee
-    one.executor.begin(one.executor.plan, Hand(there, 0.0), 3)
+    there = one.executor.targets[2].T_world_ee
+    one.executor.begin(one.executor.targets, Hand(there, 0.0), 3)
     drifted = there.copy()
     drifted[:3, 3] += 0.003 * (there[:3, 3] - shown[2][:3, 3]) / slipped  # the hand never stands quite still
-    watch(one, eyes, Hand(drifted, 0.0), 1)
-    assert_allclose(one.executor.plan[2].T_world_ee, pulled(0.5 * slipped), atol=1e-9)
+    watch(one, perception, Hand(drifted, 0.0), 1)
+    assert_allclose(one.executor.targets[2].T_world_ee, pulled(0.5 * slipped), atol=1e-9)
 
 
 def test_a_handle_that_does_not_move_on_in_the_fingers_is_taken_again_where_it_is():
     axis = KINDS["slide"]
-    eyes, one = Perception(CABINET), row(handle(axis), instruction=OPEN)
-    one.observe(HAND, eyes)
-    shown = [target.T_world_ee for target in one.executor.plan]
-    one.executor.begin(one.executor.plan, Hand(shown[2], 0.03), 3)
-    way = Axis(axis.kind, one.executor.plan[3].axis.direction, 0.4 * axis.amount)
-    watch(one, eyes, Hand(way.follow(shown[2]), 0.03), 1)
-    watch(one, eyes, Hand(way.follow(shown[2]), 0.0), 1)
-    held = Hand(one.executor.plan[2].T_world_ee, 0.03)
-    one.executor.begin(one.executor.plan, held, 3)
+    perception, one = Perception(CABINET), controller(handle(axis), instruction=OPEN)
+    observe(one, HAND, perception)
+    shown = [target.T_world_ee for target in one.executor.targets]
+    one.executor.begin(one.executor.targets, Hand(shown[2], 0.03), 3)
+    way = Axis(axis.kind, one.executor.targets[3].axis.direction, 0.4 * axis.amount)
+    watch(one, perception, Hand(way.follow(shown[2]), 0.03), 1)
+    watch(one, perception, Hand(way.follow(shown[2]), 0.0), 1)
+    held = Hand(one.executor.targets[2].T_world_ee, 0.03)
+    one.executor.begin(one.executor.targets, held, 3)
     for _ in range(200):
-        watch(one, eyes, held, 1)
-        if one.executor.attempts == 2:
+        watch(one, perception, held, 1)
+        if one.state.attempts == 2:
             break
-    assert one.executor.attempts == 2
-    assert_allclose(one.executor.plan[2].T_world_ee, way.follow(shown[2]), atol=1e-9)
+    assert one.state.attempts == 2
+    assert_allclose(one.executor.targets[2].T_world_ee, way.follow(shown[2]), atol=1e-9)
 
 
-def stuck(one, eyes, hand, index):
+def stuck(one, perception, hand, index):
     """The hand, held up short of a key pose until it is given up."""
-    one.executor.begin(one.executor.plan, hand, index)
+    one.executor.begin(one.executor.targets, hand, index)
     for _ in range(200):
-        watch(one, eyes, hand, 1)
-        if one.executor.attempts:
+        watch(one, perception, hand, 1)
+        if one.state.attempts:
             return
     pytest.fail("it was not given up")
 
 
 def carrying(opening):
     """The bowl is in the hand, and its place is not reached."""
-    eyes, one = Perception(entry().layout), row()
-    one.observe(HAND, eyes)
-    one.executor.begin(one.executor.plan, HAND, 2)
-    grasp = one.executor.plan[2]
-    watch(one, eyes, Hand(grasp.T_world_ee, grasp.key_pose.opening), grasp.key_pose.n_steps + 1)
+    perception, one = Perception(entry().layout), controller()
+    observe(one, HAND, perception)
+    one.executor.begin(one.executor.targets, HAND, 2)
+    grasp = one.executor.targets[2]
+    watch(one, perception, Hand(grasp.T_world_ee, grasp.key_pose.opening), grasp.key_pose.n_steps + 1)
     assert one.scene.tracker.held == {"bowl"}
-    eyes.visible = 0.0
-    place = one.executor.plan[5].T_world_ee.copy()
+    perception.visible = 0.0
+    place = one.executor.targets[5].T_world_ee.copy()
     place[2, 3] += 0.02
-    stuck(one, eyes, Hand(place, opening), 5)
+    stuck(one, perception, Hand(place, opening), 5)
     return one
 
 
 def test_what_is_still_in_the_hand_is_not_fetched_again_but_set_down_once_more():
     one = carrying(opening=0.03)
-    assert one.status is Status.RUNNING
-    assert one.executor.plan[one.executor.index].key_pose.phase == "pre-place"
+    assert one.state.status is Status.RUNNING
+    assert one.executor.targets[one.state.index].key_pose.phase == "pre-place"
     assert one.scene.tracker.held == {"bowl"}
 
 
 def test_what_is_no_more_in_the_hand_is_fetched():
     one = carrying(opening=0.0)
-    assert one.executor.plan[one.executor.index].key_pose.phase == "approach"
+    assert one.executor.targets[one.state.index].key_pose.phase == "approach"
     assert one.scene.tracker.held == frozenset()
 
 
 def test_what_slipped_out_while_it_was_lifted_stands_where_it_stood_and_does_not_hang_in_the_air():
-    eyes, one = Perception(entry().layout), row()
-    one.observe(HAND, eyes)
-    first = one.executor.plan[0].T_world_ee
-    one.executor.begin(one.executor.plan, HAND, 2)
-    grasp, lift = one.executor.plan[2], one.executor.plan[3]
-    watch(one, eyes, Hand(grasp.T_world_ee, grasp.key_pose.opening), grasp.key_pose.n_steps + 1)
+    perception, one = Perception(entry().layout), controller()
+    observe(one, HAND, perception)
+    first = one.executor.targets[0].T_world_ee
+    one.executor.begin(one.executor.targets, HAND, 2)
+    grasp, lift = one.executor.targets[2], one.executor.targets[3]
+    watch(one, perception, Hand(grasp.T_world_ee, grasp.key_pose.opening), grasp.key_pose.n_steps + 1)
     assert one.scene.tracker.held == {"bowl"}
-    eyes.visible = 0.0  # the hand hides it
-    watch(one, eyes, Hand(lift.T_world_ee, 0.0), 1)
-    assert one.executor.index == 0
-    assert_allclose(one.executor.plan[0].T_world_ee, first, atol=1e-6)
+    perception.visible = 0.0  # the hand hides it
+    watch(one, perception, Hand(lift.T_world_ee, 0.0), 1)
+    assert one.state.index == 0
+    assert_allclose(one.executor.targets[0].T_world_ee, first, atol=1e-6)
 
 
 def test_what_a_later_sub_task_grasps_again_stays_in_the_hand():
     both = "put the bowl on the plate and put the bowl on the stove"
     again = [replace(pose, sub_task=1) for pose in pick_and_place("bowl", "stove")]
     layout = {**entry().layout, "stove": se3.from_yaw([-0.2, -0.1, 0.0], 0.0)}
-    eyes, one = Perception(layout), row(entry(both, (*pick_and_place(), *again), layout), instruction=both)
-    one.observe(HAND, eyes)
-    one.executor.begin(one.executor.plan, HAND, 2)
-    grasp, lift = one.executor.plan[2], one.executor.plan[3]
-    watch(one, eyes, Hand(grasp.T_world_ee, 0.03), grasp.key_pose.n_steps + 1)
-    eyes.layout["bowl"] = lift.T_world_ee @ se3.inverse(grasp.T_world_ee) @ layout["bowl"]
-    watch(one, eyes, Hand(lift.T_world_ee, 0.03), 1)
-    assert one.executor.plan[one.executor.index].key_pose.phase == "pre-place"
-    eyes.layout["plate"] = layout["plate"] @ se3.from_yaw([0.05, 0.05, 0.0], 0.0)
-    watch(one, eyes, Hand(lift.T_world_ee, 0.03), 15)
-    assert one.executor.attempts == 0
+    perception = Perception(layout)
+    one = controller(entry(both, (*pick_and_place(), *again), layout), instruction=both)
+    observe(one, HAND, perception)
+    one.executor.begin(one.executor.targets, HAND, 2)
+    grasp, lift = one.executor.targets[2], one.executor.targets[3]
+    watch(one, perception, Hand(grasp.T_world_ee, 0.03), grasp.key_pose.n_steps + 1)
+    perception.layout["bowl"] = lift.T_world_ee @ se3.inverse(grasp.T_world_ee) @ layout["bowl"]
+    watch(one, perception, Hand(lift.T_world_ee, 0.03), 1)
+    assert one.executor.targets[one.state.index].key_pose.phase == "pre-place"
+    perception.layout["plate"] = layout["plate"] @ se3.from_yaw([0.05, 0.05, 0.0], 0.0)
+    watch(one, perception, Hand(lift.T_world_ee, 0.03), 15)
+    assert one.state.attempts == 0
     assert one.scene.tracker.held == {"bowl"}
 
 
@@ -198,36 +199,36 @@ ON_PLATE = Outcome(0, "bowl", Anchor("plate", "plate"), np.zeros(3), np.zeros(3)
 def ended(at, look=None):
     """A bowl that was let go at a place relative to the plate, the hand gone, and looks from then on."""
     place = entry().layout["plate"] @ se3.from_yaw([*at], 0.0)
-    eyes, one = Perception(entry().layout), row(entry(outcomes=(ON_PLATE,)))
-    one.observe(HAND, eyes)
-    one.executor.begin(one.executor.plan, HAND, 7)
-    eyes.layout["bowl"] = place
-    watch(one, look or eyes, Hand(one.executor.plan[7].T_world_ee, 0.08), 12)
+    perception, one = Perception(entry().layout), controller(entry(outcomes=(ON_PLATE,)))
+    observe(one, HAND, perception)
+    one.executor.begin(one.executor.targets, HAND, 7)
+    perception.layout["bowl"] = place
+    watch(one, look or perception, Hand(one.executor.targets[7].T_world_ee, 0.08), 12)
     return one, place
 
 
 def test_what_fell_beside_its_place_is_fetched_from_where_it_lies():
     one, place = ended([0.06, 0.0, 0.0])
-    assert one.status is Status.RUNNING
-    assert one.executor.attempts == 1
-    assert one.executor.index == 0
-    assert_allclose(one.executor.plan[0].T_world_ee, place @ entry().key_poses[0].T_obj_ee, atol=1e-9)
-    assert one.succeeded is None, "it is not over"
+    assert one.state.status is Status.RUNNING
+    assert one.state.attempts == 1
+    assert one.state.index == 0
+    assert_allclose(one.executor.targets[0].T_world_ee, place @ entry().key_poses[0].T_obj_ee, atol=1e-9)
+    assert one.state.succeeded is None, "it is not over"
 
 
 def test_what_lies_in_its_place_is_left_alone():
     one, _ = ended([0.01, 0.0, -0.03])
-    assert one.status is Status.DONE
-    assert one.succeeded is True
+    assert one.state.status is Status.DONE
+    assert one.state.succeeded is True
 
 
 @pytest.mark.parametrize("seconds", [0.1, GIVE_UP_S])
 @pytest.mark.parametrize("off_m", [0.0, 0.06])
 def test_without_a_picture_what_was_done_is_neither_seen_nor_tried_again(off_m, seconds):
     one, _ = ended([off_m, 0.0, 0.0], lambda *_: Detections({}, {"front": Fault("black", seconds)}))
-    assert one.status is Status.DONE
-    assert one.executor.attempts == 0
-    assert one.succeeded is None
+    assert one.state.status is Status.DONE
+    assert one.state.attempts == 0
+    assert one.state.succeeded is None
 
 
 def drawer_opened_but_bowl_missed(putting):
@@ -236,30 +237,30 @@ def drawer_opened_but_bowl_missed(putting):
     layout = {**entry().layout, **CABINET}
     both = "put the bowl on the plate and open the top drawer"
     whole = entry(both, (*putting, *pull), layout, outcomes=(ON_PLATE,))
-    eyes, one = Perception(layout), row(whole, instruction=both)
-    one.observe(HAND, eyes)
-    last = len(one.executor.plan) - 1
-    one.executor.begin(one.executor.plan, HAND, last)
-    eyes.layout["bowl"] = layout["plate"] @ se3.from_yaw([0.06, 0.0, 0.0], 0.0)
-    watch(one, eyes, Hand(one.executor.plan[last].T_world_ee, 0.08), 12)
-    return eyes, one
+    perception, one = Perception(layout), controller(whole, instruction=both)
+    observe(one, HAND, perception)
+    last = len(one.executor.targets) - 1
+    one.executor.begin(one.executor.targets, HAND, last)
+    perception.layout["bowl"] = layout["plate"] @ se3.from_yaw([0.06, 0.0, 0.0], 0.0)
+    watch(one, perception, Hand(one.executor.targets[last].T_world_ee, 0.08), 12)
+    return perception, one
 
 
 def test_of_several_things_to_do_only_the_one_that_is_missed_is_done_again():
-    eyes, one = drawer_opened_but_bowl_missed(pick_and_place())
-    assert one.executor.index == 0
-    assert {target.key_pose.sub_task for target in one.executor.plan} == {0}
-    one.executor.begin(one.executor.plan, HAND, 7)
-    eyes.layout["bowl"] = entry().layout["plate"]
-    watch(one, eyes, Hand(one.executor.plan[7].T_world_ee, 0.08), 12)
-    assert one.status is Status.DONE
-    assert one.executor.attempts == 1
-    assert one.succeeded is True, "the drawer went all the way before"
+    perception, one = drawer_opened_but_bowl_missed(pick_and_place())
+    assert one.state.index == 0
+    assert {target.key_pose.sub_task for target in one.executor.targets} == {0}
+    one.executor.begin(one.executor.targets, HAND, 7)
+    perception.layout["bowl"] = entry().layout["plate"]
+    watch(one, perception, Hand(one.executor.targets[7].T_world_ee, 0.08), 12)
+    assert one.state.status is Status.DONE
+    assert one.state.attempts == 1
+    assert one.state.succeeded is True, "the drawer went all the way before"
 
 
 def test_what_is_done_again_ends_with_the_hand_backed_off():
     _, one = drawer_opened_but_bowl_missed(pick_and_place()[:-1])
-    assert [target.key_pose.phase for target in one.executor.plan[-2:]] == ["release", "retreat"]
+    assert [target.key_pose.phase for target in one.executor.targets[-2:]] == ["release", "retreat"]
 
 
 def test_an_outcome_that_no_key_pose_leads_to_is_not_tried_again():
@@ -267,35 +268,35 @@ def test_an_outcome_that_no_key_pose_leads_to_is_not_tried_again():
     memory = entry("put both bowls on the plate", pick_and_place(), layout,
                    outcomes=(replace(ON_PLATE, sub_task=1),))  # fmt: skip
     assert len(memory.key.sub_tasks) == 2
-    eyes, one = Perception(layout), row(memory, instruction="put both bowls on the plate")
-    one.observe(HAND, eyes)
-    one.executor.begin(one.executor.plan, HAND, 7)
-    eyes.layout["bowl"] = layout["plate"] @ se3.from_yaw([0.06, 0.0, 0.0], 0.0)
-    watch(one, eyes, Hand(one.executor.plan[7].T_world_ee, 0.08), 12)
-    assert one.status is Status.DONE
-    assert one.executor.attempts == 0
-    assert one.succeeded is None
+    perception, one = Perception(layout), controller(memory, instruction="put both bowls on the plate")
+    observe(one, HAND, perception)
+    one.executor.begin(one.executor.targets, HAND, 7)
+    perception.layout["bowl"] = layout["plate"] @ se3.from_yaw([0.06, 0.0, 0.0], 0.0)
+    watch(one, perception, Hand(one.executor.targets[7].T_world_ee, 0.08), 12)
+    assert one.state.status is Status.DONE
+    assert one.state.attempts == 0
+    assert one.state.succeeded is None
 
 
 def test_of_a_whole_of_which_a_part_was_not_seen_nothing_is_said():
     one, _ = ended([0.01, 0.0, 0.0])
-    one._earlier_parts_known = False
-    assert one.succeeded is None
+    one.state.verdicts = (None,)
+    assert one.state.succeeded is None
 
 
 def test_an_episode_that_is_given_up_has_failed():
     one = carrying(opening=0.0)
     one.executor.stop(Status.NO_PROGRESS)
-    assert one.succeeded is False
+    assert one.state.succeeded is False
 
 
 def test_a_handle_that_went_all_the_way_is_a_success_if_the_fingers_could_feel_it():
     for opening, expected in ((0.03, True), (0.001, None)):
         poses = [replace(pose, opening=opening) for pose in handle(KINDS["slide"]).key_poses]
-        eyes, one = Perception(CABINET), row(entry(OPEN, poses, CABINET), instruction=OPEN)
-        one.observe(HAND, eyes)
-        last = len(one.executor.plan) - 1
-        one.executor.begin(one.executor.plan, HAND, last)
-        watch(one, eyes, Hand(one.executor.plan[last].T_world_ee, 0.08), 12)
-        assert one.status is Status.DONE
-        assert one.succeeded is expected
+        perception, one = Perception(CABINET), controller(entry(OPEN, poses, CABINET), instruction=OPEN)
+        observe(one, HAND, perception)
+        last = len(one.executor.targets) - 1
+        one.executor.begin(one.executor.targets, HAND, last)
+        watch(one, perception, Hand(one.executor.targets[last].T_world_ee, 0.08), 12)
+        assert one.state.status is Status.DONE
+        assert one.state.succeeded is expected

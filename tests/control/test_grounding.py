@@ -2,7 +2,7 @@ import dataclasses
 
 import numpy as np
 import pytest
-from tests.control.test_controller import knowledge
+from tests.control.test_controller import planning_context
 
 from lerobot_openspm.control.grounding import Grounding, references
 from lerobot_openspm.geometry import se3
@@ -17,18 +17,18 @@ def at(x, y):
     return se3.from_yaw([x, y, 0.0], 0.0)
 
 
-KNOWLEDGE = knowledge()
+CONTEXT = planning_context()
 RACK = at(0.3, 0.3)
 NEAR, FAR = at(0.3, 0.18), at(0.0, -0.2)
 
 
 def seen(T, *others, status=None):
     status = status or ("ambiguous" if others else "found")
-    return PoseEstimate(status, T, 1e-6 * np.eye(4), 1.0, {}, others=tuple(others))
+    return PoseEstimate(status, T, 1e-6 * np.eye(4), 1.0, others=tuple(others))
 
 
-def look(referents, bowl, layout=None):
-    return referents.sort_out({"bowl": bowl, "rack": seen(RACK)}, layout or {})["bowl"]
+def look(grounding, bowl, layout=None):
+    return grounding.sort_out({"bowl": bowl, "rack": seen(RACK)}, layout or {})["bowl"]
 
 
 @pytest.mark.parametrize("bowl", [seen(NEAR, FAR), seen(FAR, NEAR), seen(FAR, NEAR, status="found")])
@@ -58,24 +58,24 @@ def test_two_that_fit_as_well_as_one_another_stay_ambiguous():
 
 
 def test_the_other_one_is_never_taken_for_it_afterwards():
-    referents = Grounding({"bowl": NEXT_TO_RACK})
-    look(referents, seen(NEAR, FAR))
-    assert look(referents, seen(FAR)).status == "not_found"  # the meant one is behind the hand
+    grounding = Grounding({"bowl": NEXT_TO_RACK})
+    look(grounding, seen(NEAR, FAR))
+    assert look(grounding, seen(FAR)).status == "not_found"  # the meant one is behind the hand
     moved = at(0.1, 0.1)
     for bowl in (seen(moved), seen(FAR, moved), seen(moved, FAR)):
-        again = look(referents, bowl)
+        again = look(grounding, bowl)
         assert again.status == "found"
         np.testing.assert_array_equal(again.T_world_obj, moved)
 
 
 def test_what_the_next_part_means_is_told_anew():
-    referents = Grounding()
-    assert referents.hear({"bowl": NEXT_TO_RACK}) == frozenset()
-    look(referents, seen(NEAR, FAR))
-    assert referents.hear({"bowl": NEXT_TO_RACK}) == frozenset()
-    assert look(referents, seen(FAR)).status == "not_found"
-    assert referents.hear({"bowl": Reference("left")}) == {"bowl"}
-    left = look(referents, seen(NEAR, FAR))
+    grounding = Grounding()
+    assert grounding.hear({"bowl": NEXT_TO_RACK}) == frozenset()
+    look(grounding, seen(NEAR, FAR))
+    assert grounding.hear({"bowl": NEXT_TO_RACK}) == frozenset()
+    assert look(grounding, seen(FAR)).status == "not_found"
+    assert grounding.hear({"bowl": Reference("left")}) == {"bowl"}
+    left = look(grounding, seen(NEAR, FAR))
     np.testing.assert_array_equal(left.T_world_obj, FAR)  # -y is left, seen from opposite the robot
 
 
@@ -92,8 +92,8 @@ def test_references_are_told_by_the_names_of_the_entry():
 
 
 def test_the_objects_that_others_are_told_by_may_go_by_other_names():
-    knowledge = dataclasses.replace(
-        KNOWLEDGE, yaw_periods=dict.fromkeys(("bowl", "cream cheese box", "wine bottle", "plate"), 0.0)
+    context = dataclasses.replace(
+        CONTEXT, yaw_periods=dict.fromkeys(("bowl", "cream cheese box", "wine bottle", "plate"), 0.0)
     )
     said = {
         "box": "cream cheese box",
@@ -101,14 +101,12 @@ def test_the_objects_that_others_are_told_by_may_go_by_other_names():
         "bottle": "wine bottle",
         "moon": "moon",
     }
-    assert {name: knowledge.object_meant(name) for name in said} == said
+    assert {name: context.object_meant(name) for name in said} == said
 
 
 def test_the_center_of_the_table_is_the_middle_of_where_the_hand_was():
-    referents = Grounding({"bowl": Reference("center", ("table",))})
-    low, high = KNOWLEDGE.robot.workspace
+    grounding = Grounding({"bowl": Reference("center", ("table",))})
+    low, high = CONTEXT.robot.workspace
     middle, side = at(*(low + high)[:2] / 2 + 0.03), at(*high[:2])
     estimates = {"bowl": seen(side, middle)}
-    np.testing.assert_array_equal(
-        referents.sort_out(estimates, KNOWLEDGE.surfaces)["bowl"].T_world_obj, middle
-    )
+    np.testing.assert_array_equal(grounding.sort_out(estimates, CONTEXT.surfaces)["bowl"].T_world_obj, middle)

@@ -6,15 +6,14 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose
-from tests.control.test_controller import HAND, Perception, row, shifted, watch
+from tests.control.test_controller import HAND, Perception, controller, observe, shifted, watch
 from tests.memory.builders import entry, hand_pose, key_pose, robot
 
-from lerobot_openspm.control.contact import LEFT_BEHIND_M, OUTRUN_M
 from lerobot_openspm.control.executor import Executor
-from lerobot_openspm.control.pushes import push_ways
-from lerobot_openspm.control.status import Status
+from lerobot_openspm.control.scene import LEFT_BEHIND_M, OUTRUN_M
+from lerobot_openspm.control.state import EpisodeState, Status
 from lerobot_openspm.control.strategies import ControlSettings
-from lerobot_openspm.control.transfer import Target, transfer
+from lerobot_openspm.control.transfer import Target, push_paths, transfer
 from lerobot_openspm.geometry import se3
 from lerobot_openspm.memory.entry import Anchor, Outcome
 from lerobot_openspm.perception.tracking.tracker import TrackStatus
@@ -105,10 +104,10 @@ def test_a_push_without_a_known_outcome_ends_where_the_demonstration_did():
 
 
 def test_a_hand_that_strays_while_it_pushes_is_led_back_to_its_way():
-    executor = Executor(ControlSettings(), robot())
-    memory, ways = push().key_poses[2], push_ways(push(), LAYOUT)[0]
+    executor = Executor(ControlSettings(), robot(), EpisodeState())
+    memory, path = push().key_poses[2], push_paths(push(), LAYOUT)[0]
     start, end = hand_pose(0.3, 0.0, 0.02), hand_pose(0.1, 0.0, 0.02)
-    executor.begin([Target(end, memory, precise=True, push=ways)], Hand(start, 0.0))
+    executor.begin([Target(end, memory, precise=True, push=path)], Hand(start, 0.0))
     strayed = Hand(hand_pose(0.2, 0.004, 0.028), 0.0)
     executor.push_chunk(np.tile([-0.5, 0.3, 0.3, 0, 0, 0.1, 1.0], (5, 1)))
     action = executor.next_action(strayed)
@@ -120,10 +119,10 @@ def test_a_hand_that_strays_while_it_pushes_is_led_back_to_its_way():
 
 @given(st.floats(-0.05, 0.05), st.floats(-0.05, 0.05), st.floats(-1, 1), st.floats(-1, 1))
 def test_an_action_that_leads_back_to_the_way_stays_within_bounds(y, z, along, across):
-    executor = Executor(ControlSettings(), robot())
-    memory, ways = push().key_poses[2], push_ways(push(), LAYOUT)[0]
+    executor = Executor(ControlSettings(), robot(), EpisodeState())
+    memory, path = push().key_poses[2], push_paths(push(), LAYOUT)[0]
     start, end = hand_pose(0.3, 0.0, 0.02), hand_pose(0.1, -0.1, 0.02)
-    executor.begin([Target(end, memory, precise=True, push=ways)], Hand(start, 0.0))
+    executor.begin([Target(end, memory, precise=True, push=path)], Hand(start, 0.0))
     executor.push_chunk(np.array([[along, across, 0.0, 0.0, 0.0, 0.0, 1.0]]))
     action = executor.next_action(Hand(hand_pose(0.2, -0.05 + y, 0.02 + z), 0.0))
     assert np.abs(action[:3]).max() <= 1 + 1e-9
@@ -142,16 +141,16 @@ def test_where_a_push_turns_the_hand_passes_by():
 
 
 def test_a_plate_goes_along_around_the_turn_of_a_push_and_is_let_go_at_its_end():
-    eyes, one = Perception(LAYOUT), row(turning_push(), instruction=INSTRUCTION)
-    one.observe(HAND, eyes)
-    eyes.visible = 0.0
-    ends = [target.T_world_ee for target in one.executor.plan]
-    one.executor.begin(one.executor.plan, HAND, 1)
+    perception, one = Perception(LAYOUT), controller(turning_push(), instruction=INSTRUCTION)
+    observe(one, HAND, perception)
+    perception.visible = 0.0
+    ends = [target.T_world_ee for target in one.executor.targets]
+    one.executor.begin(one.executor.targets, HAND, 1)
     for index, is_held in ((1, True), (2, True), (3, False)):
-        watch(one, eyes, Hand(ends[index], 0.0), 1)
-        assert one.executor.index == index + 1
+        watch(one, perception, Hand(ends[index], 0.0), 1)
+        assert one.state.index == index + 1
         assert (one.scene.tracker.held == {"plate"}) is is_held, index
-        assert_allclose(one.executor.plan[2].T_world_ee, ends[2], atol=1e-9)
+        assert_allclose(one.executor.targets[2].T_world_ee, ends[2], atol=1e-9)
 
 
 def test_what_is_pushed_goes_along_and_not_what_the_hand_began_relative_to():
@@ -161,41 +160,41 @@ def test_what_is_pushed_goes_along_and_not_what_the_hand_began_relative_to():
         contact, anchor=Anchor("stove", "stove"), T_obj_ee=se3.inverse(T_stove) @ T_plate @ contact.T_obj_ee
     )
     memory = entry(INSTRUCTION, (approach, of_stove, corner, end), LAYOUT)
-    eyes, one = Perception(LAYOUT), row(memory, instruction=INSTRUCTION)
-    one.observe(HAND, eyes)
-    one.executor.begin(one.executor.plan, HAND, 1)
-    watch(one, eyes, Hand(one.executor.plan[1].T_world_ee, 0.0), 1)
+    perception, one = Perception(LAYOUT), controller(memory, instruction=INSTRUCTION)
+    observe(one, HAND, perception)
+    one.executor.begin(one.executor.targets, HAND, 1)
+    watch(one, perception, Hand(one.executor.targets[1].T_world_ee, 0.0), 1)
     assert one.scene.tracker.held == {"plate"}
 
 
 def test_a_plate_that_the_hand_has_not_reached_yet_is_not_left_behind():
     for gone, is_fetched in ((0.5 * OUTRUN_M, False), (3 * OUTRUN_M, True)):
-        eyes, one = Perception(LAYOUT), row(turning_push(), instruction=INSTRUCTION)
-        one.observe(HAND, eyes)
-        contact = one.executor.plan[1].T_world_ee
-        one.executor.begin(one.executor.plan, HAND, 1)
-        watch(one, eyes, Hand(contact, 0.0), 1)
+        perception, one = Perception(LAYOUT), controller(turning_push(), instruction=INSTRUCTION)
+        observe(one, HAND, perception)
+        contact = one.executor.targets[1].T_world_ee
+        one.executor.begin(one.executor.targets, HAND, 1)
+        watch(one, perception, Hand(contact, 0.0), 1)
         assert one.scene.tracker.held == {"plate"}
         ahead = contact.copy()
         ahead[1, 3] += gone
-        watch(one, eyes, Hand(ahead, 0.0), 12)
-        assert (one.executor.index < 2) is is_fetched, gone
+        watch(one, perception, Hand(ahead, 0.0), 12)
+        assert (one.state.index < 2) is is_fetched, gone
 
 
 def test_a_hand_that_is_on_its_way_to_the_plate_has_not_outrun_it():
     approach, contact, corner, end = turning_push().key_poses
     far = replace(contact, T_obj_ee=hand_pose(0.0, -0.2, 0.02))
     memory = entry(INSTRUCTION, (approach, far, corner, end), LAYOUT)
-    eyes, one = Perception(LAYOUT), row(memory, instruction=INSTRUCTION)
-    one.observe(HAND, eyes)
-    met = one.executor.plan[1].T_world_ee
-    one.executor.begin(one.executor.plan, HAND, 1)
-    watch(one, eyes, Hand(met, 0.0), 1)
+    perception, one = Perception(LAYOUT), controller(memory, instruction=INSTRUCTION)
+    observe(one, HAND, perception)
+    met = one.executor.targets[1].T_world_ee
+    one.executor.begin(one.executor.targets, HAND, 1)
+    watch(one, perception, Hand(met, 0.0), 1)
     assert one.scene.tracker.held == {"plate"}
     nearer = met.copy()
     nearer[1, 3] += 1.5 * OUTRUN_M
-    watch(one, eyes, Hand(nearer, 0.0), 12)
-    assert one.executor.attempts == 0
+    watch(one, perception, Hand(nearer, 0.0), 12)
+    assert one.state.attempts == 0
 
 
 def test_where_a_push_turns_the_place_of_meeting_is_not_told_by_its_end():
@@ -211,24 +210,24 @@ def test_what_a_push_leads_to_is_watched_beyond_a_turn():
     approach, contact, _, end = turning_push().key_poses
     corner = replace(end, T_obj_ee=end.T_obj_ee @ se3.from_yaw([0.1, 0.0, 0.0], 0.0))
     memory = entry(INSTRUCTION, (approach, contact, corner, end), LAYOUT)
-    eyes, one = Perception(LAYOUT), row(memory, instruction=INSTRUCTION)
-    one.observe(HAND, eyes)
-    here = Hand(one.executor.plan[2].T_world_ee, 0.0)
-    shown = one.executor.plan[3].T_world_ee
-    one.executor.begin(one.executor.plan, here, 3)
+    perception, one = Perception(LAYOUT), controller(memory, instruction=INSTRUCTION)
+    observe(one, HAND, perception)
+    here = Hand(one.executor.targets[2].T_world_ee, 0.0)
+    shown = one.executor.targets[3].T_world_ee
+    one.executor.begin(one.executor.targets, here, 3)
     one.scene.tracker.hold("plate", here.T_world_ee)
-    eyes.layout["stove"] = shifted(LAYOUT["stove"], 0.04)
-    del eyes.layout["plate"]
-    watch(one, eyes, here, 10)
-    assert_allclose(one.executor.plan[3].T_world_ee, shifted(shown, 0.04), atol=2e-3)
+    perception.layout["stove"] = shifted(LAYOUT["stove"], 0.04)
+    del perception.layout["plate"]
+    watch(one, perception, here, 10)
+    assert_allclose(one.executor.targets[3].T_world_ee, shifted(shown, 0.04), atol=2e-3)
 
 
-def pushing(one, eyes, ahead_m):
+def pushing(one, perception, ahead_m):
     """The hand during a push, so far ahead of where it entered the plate."""
-    one.observe(HAND, eyes)
-    one.executor.begin(one.executor.plan, HAND, 1)
-    inside = one.executor.plan[1].T_world_ee
-    one.observe(Hand(inside, 0.0), eyes)
+    observe(one, HAND, perception)
+    one.executor.begin(one.executor.targets, HAND, 1)
+    inside = one.executor.targets[1].T_world_ee
+    observe(one, Hand(inside, 0.0), perception)
     assert one.executor.target.key_pose.phase == "push"
     way = one.executor.target.T_world_ee[:3, 3] - inside[:3, 3]
     T = inside.copy()
@@ -237,75 +236,117 @@ def pushing(one, eyes, ahead_m):
 
 
 def test_the_plate_goes_along_from_where_the_hand_meets_its_rim():
-    eyes, one = Perception(LAYOUT), row(push(), instruction=INSTRUCTION)
-    hand = pushing(one, eyes, 0.5 * (LEAD_M - 0.03))
-    watch(one, eyes, hand, 1)
+    perception, one = Perception(LAYOUT), controller(push(), instruction=INSTRUCTION)
+    hand = pushing(one, perception, 0.5 * (LEAD_M - 0.03))
+    watch(one, perception, hand, 1)
     assert one.scene.tracker.held == frozenset()
-    hand = pushing(one, eyes, LEAD_M - 0.03 + 0.001)
-    watch(one, eyes, hand, 1)
+    hand = pushing(one, perception, LEAD_M - 0.03 + 0.001)
+    watch(one, perception, hand, 1)
     assert one.scene.tracker.held == {"plate"}
 
 
 def test_a_plate_that_slides_under_the_hand_is_pushed_on_and_one_left_behind_is_fetched():
     for behind, is_fetched in ((0.4 * LEFT_BEHIND_M, False), (3 * LEFT_BEHIND_M, True)):
-        eyes, one = Perception(LAYOUT), row(push(), instruction=INSTRUCTION)
-        hand = pushing(one, eyes, LEAD_M - 0.03 + 0.1)
-        watch(one, eyes, hand, 1)
+        perception, one = Perception(LAYOUT), controller(push(), instruction=INSTRUCTION)
+        hand = pushing(one, perception, LEAD_M - 0.03 + 0.1)
+        watch(one, perception, hand, 1)
         met = hand.T_world_ee[:3, 3].copy()
         way = se3.apply(LAYOUT["stove"], GOAL[None])[0] - LAYOUT["plate"][:3, 3]
         way /= np.linalg.norm(way)
-        eyes.layout["plate"] = se3.from_yaw([*(met - (LEAD_M + behind) * way)[:2], 0.0], 0.0)
-        watch(one, eyes, hand, 20)
-        assert one.status is Status.RUNNING
-        assert (one.executor.index < 2) is is_fetched, behind
+        perception.layout["plate"] = se3.from_yaw([*(met - (LEAD_M + behind) * way)[:2], 0.0], 0.0)
+        watch(one, perception, hand, 20)
+        assert one.state.status is Status.RUNNING
+        assert (one.state.index < 2) is is_fetched, behind
 
 
-def done(one, eyes, end):
+def done(one, perception, end):
     """The push, finished, with the plate where it is told, looked at once."""
-    one.observe(HAND, eyes)
-    last = one.executor.plan[-1]
-    eyes.layout["plate"] = end
+    observe(one, HAND, perception)
+    last = one.executor.targets[-1]
+    perception.layout["plate"] = end
     one.scene.tracker.forget(["plate"])
-    one.executor.begin(one.executor.plan, HAND, len(one.executor.plan) - 1)
+    one.executor.begin(one.executor.targets, HAND, len(one.executor.targets) - 1)
     hand = Hand(last.T_world_ee, 0.0)
-    watch(one, eyes, hand, 1)
+    watch(one, perception, hand, 1)
     return hand
 
 
 def test_a_plate_in_its_place_is_a_success():
-    eyes, one = Perception(LAYOUT), row(push(), instruction=INSTRUCTION)
+    perception, one = Perception(LAYOUT), controller(push(), instruction=INSTRUCTION)
     goal = se3.from_yaw(se3.apply(LAYOUT["stove"], GOAL[None])[0], 0.0)
-    done(one, eyes, goal)
-    assert one.status is Status.DONE
-    assert one.succeeded is True
+    done(one, perception, goal)
+    assert one.state.status is Status.DONE
+    assert one.state.succeeded is True
 
 
 def test_a_plate_that_stopped_short_is_pushed_on_until_attempts_are_used_up():
-    eyes, one = Perception(LAYOUT), row(push(), instruction=INSTRUCTION)
+    perception, one = Perception(LAYOUT), controller(push(), instruction=INSTRUCTION)
     goal = se3.from_yaw(se3.apply(LAYOUT["stove"], GOAL[None])[0], 0.0)
-    hand = done(one, eyes, shifted(goal, 0.05))
+    hand = done(one, perception, shifted(goal, 0.05))
     for attempt in range(1, ControlSettings().max_attempts + 1):
-        assert one.status is Status.RUNNING
-        assert one.executor.attempts == attempt
-        assert one.executor.index == 0
-        inside = one.executor.plan[1].T_world_ee[:3, 3]
+        assert one.state.status is Status.RUNNING
+        assert one.state.attempts == attempt
+        assert one.state.index == 0
+        inside = one.executor.targets[1].T_world_ee[:3, 3]
         assert_allclose(inside[:2], goal[:2, 3] + [0.05 - 0.03, 0.0], atol=2e-3)
-        one.executor.begin(one.executor.plan, HAND, 3)
-        hand = Hand(one.executor.plan[-1].T_world_ee, 0.0)
-        watch(one, eyes, hand, 10)
-    assert one.status is Status.NO_PROGRESS
-    assert one.succeeded is False
+        one.executor.begin(one.executor.targets, HAND, 3)
+        hand = Hand(one.executor.targets[-1].T_world_ee, 0.0)
+        watch(one, perception, hand, 10)
+    assert one.state.status is Status.NO_PROGRESS
+    assert one.state.succeeded is False
 
 
 def test_what_cannot_be_seen_in_the_end_is_done_and_not_known():
-    eyes, one = Perception(LAYOUT), row(push(), instruction=INSTRUCTION)
-    one.observe(HAND, eyes)
-    one.executor.begin(one.executor.plan, HAND, 3)
-    eyes.visible = 0.0
-    watch(one, eyes, Hand(one.executor.plan[-1].T_world_ee, 0.0), 40)
-    assert one.status is Status.DONE
-    assert one.succeeded is None
+    perception, one = Perception(LAYOUT), controller(push(), instruction=INSTRUCTION)
+    observe(one, HAND, perception)
+    one.executor.begin(one.executor.targets, HAND, 3)
+    perception.visible = 0.0
+    watch(one, perception, Hand(one.executor.targets[-1].T_world_ee, 0.0), 40)
+    assert one.state.status is Status.DONE
+    assert one.state.succeeded is None
     assert one.scene.tracker.status("plate") is TrackStatus.HIDDEN
-    asked = len(eyes.asked)
-    watch(one, eyes, Hand(one.executor.plan[-1].T_world_ee, 0.0), 40)
-    assert len(eyes.asked) == asked, "it is not looked for on and on"
+    asked = len(perception.asked)
+    watch(one, perception, Hand(one.executor.targets[-1].T_world_ee, 0.0), 40)
+    assert len(perception.asked) == asked, "it is not looked for on and on"
+
+
+def landmark_push():
+    """A push whose key poses all belong to the stove, where the plate should end."""
+
+    def of_stove(pose):
+        T_world_ee = pose.anchor.frame(LAYOUT) @ pose.T_obj_ee
+        return replace(
+            pose, anchor=Anchor("stove", "stove"), T_obj_ee=se3.inverse(LAYOUT["stove"]) @ T_world_ee
+        )
+
+    return replace(push(), key_poses=tuple(of_stove(pose) for pose in push().key_poses))
+
+
+def test_what_is_pushed_is_looked_for_although_no_key_pose_belongs_to_it():
+    perception, one = Perception(LAYOUT), controller(landmark_push(), instruction=INSTRUCTION)
+    observe(one, HAND, perception)
+    assert set(perception.asked[0]) == {"plate", "stove"}
+    perception.layout["plate"] = moved = shifted(LAYOUT["plate"], 0.05)
+    watch(one, perception, HAND, 12)
+    assert_allclose(one.state.plan.object_poses["plate"], moved, atol=2e-3)
+    phases = [pose.phase for pose in landmark_push().key_poses]
+    for index, phase in enumerate(phases):
+        is_before = phase == "approach"
+        assert ("plate" in one.state.plan.objects(index, ())) is is_before, "the hand meets it in the push"
+
+
+def test_a_push_by_its_landmark_alone_begins_beside_the_plate_wherever_it_stands():
+    layout = {**LAYOUT, "plate": se3.from_yaw([0.25, -0.15, 0.0], 0.0)}
+    for scene in (LAYOUT, layout):
+        found, expected = (ends(memory, scene) for memory in (landmark_push(), push()))
+        assert_allclose(found, expected, atol=1e-9)
+
+
+def test_a_plate_that_no_key_pose_belongs_to_and_that_is_not_found_does_not_hold_up_its_push():
+    perception = Perception({"stove": LAYOUT["stove"]})
+    one = controller(landmark_push(), instruction=INSTRUCTION)
+    observe(one, HAND, perception)
+    assert one.state.status is Status.RUNNING
+    perception.layout["plate"] = LAYOUT["plate"]
+    watch(one, perception, HAND, 6)
+    assert "plate" in one.state.plan.object_poses, "it is taken up when it is seen"

@@ -7,7 +7,6 @@ from lerobot_openspm.envs.seeds import (
     TUNING_SEED_START,
     TUNING_SEEDS,
     require_demo_seeds,
-    seed_purpose,
 )
 
 
@@ -22,26 +21,6 @@ def test_ranges_never_overlap():
         == (DEMO_SEED_START, TUNING_SEED_START)
         == (1_000_000, 2_000_000)
     )
-
-
-@pytest.mark.parametrize(
-    ("seed", "purpose"),
-    [
-        (0, "evaluation"),
-        (999_999, "evaluation"),
-        (1_000_000, "demonstration"),
-        (1_999_999, "demonstration"),
-        (2_000_000, "tuning"),
-    ],
-)
-def test_purpose_at_the_borders(seed, purpose):
-    assert seed_purpose(seed) == purpose
-
-
-@pytest.mark.parametrize("seed", [-1, 3_000_000])
-def test_seeds_outside_are_refused(seed):
-    with pytest.raises(ValueError, match="no range"):
-        seed_purpose(seed)
 
 
 @pytest.mark.parametrize(("first", "count"), [(0, 1), (999_999, 2), (1_999_999, 2), (2_000_000, 1)])

@@ -9,7 +9,6 @@ from tests.geometry.strategies import rotvecs, transforms, vectors
 
 from lerobot_openspm.flow.condition import (
     CONDITION_DIM,
-    CONDITIONINGS,
     Query,
     encode,
     progress,
@@ -50,16 +49,16 @@ def test_an_answer_of_the_equivariant_model_turns_with_the_scene(G, T_target, sh
     assert_allclose(moved, np.concatenate([R @ here[:3], R @ here[3:6], [1.0]]), atol=1e-9)
 
 
-@given(transforms(), transforms(), st.sampled_from(CONDITIONINGS))
+@given(transforms(), transforms(), st.sampled_from(list(CONDITION_DIM)))
 def test_executing_a_turned_answer_in_a_turned_scene_leads_to_the_turned_place(G, T_ee, conditioning):
     """The whole loop: what the model answers in its frame moves the hand alike, wherever the scene is."""
-    T_target = T_ee @ se3.from_position_rotvec([0.1, 0.2, 0.3], [0.2, 0.1, 0.4])
+    T_target = T_ee @ se3.transform(se3.exp_so3([0.2, 0.1, 0.4]), [0.1, 0.2, 0.3])
     answer = to_model_frame(np.append(se3.increment(T_ee, T_target), 1.0), T_target, "equivariant")
     step = to_world_frame(answer, G @ T_target, "equivariant")[:6]
     assert_allclose(se3.apply_increment(G @ T_ee, step), G @ T_target, atol=1e-7)
 
 
-@given(transforms(), st.sampled_from(CONDITIONINGS), st.integers(0, 5))
+@given(transforms(), st.sampled_from(list(CONDITION_DIM)), st.integers(0, 5))
 def test_the_two_frames_of_actions_are_inverse(T_target, conditioning, seed):
     actions = np.random.default_rng(seed).normal(size=(5, 7))
     assert_allclose(
@@ -101,11 +100,11 @@ def test_the_papers_condition_by_hand():
     assert_allclose(condition[18:24], [0, 0.5, 0, 0, 0, 0], atol=1e-12)
 
 
-@pytest.mark.parametrize("conditioning", CONDITIONINGS)
+@pytest.mark.parametrize("conditioning", CONDITION_DIM)
 @pytest.mark.parametrize("batch", [(), (1,), (4,), (2, 3)])
 def test_conditions_are_batched(conditioning, batch):
     rng = np.random.default_rng(0)
-    T = se3.from_position_rotvec(rng.normal(size=(2, *batch, 3)), rng.normal(size=(2, *batch, 3)))
+    T = se3.transform(se3.exp_so3(rng.normal(size=(2, *batch, 3))), rng.normal(size=(2, *batch, 3)))
     numbers = rng.uniform(size=(3, *batch))
     whole = Query(T[0], T[1], *numbers, rng.integers(len(PHASES), size=batch))
     out = encode(whole, conditioning)
@@ -115,7 +114,7 @@ def test_conditions_are_batched(conditioning, batch):
         assert_allclose(out[i], encode(alone, conditioning))
 
 
-@pytest.mark.parametrize("conditioning", CONDITIONINGS)
+@pytest.mark.parametrize("conditioning", CONDITION_DIM)
 @pytest.mark.parametrize(
     "change", [{"progress": 0.5}, {"closed": 0.0}, {"opening": 0.1}, {"phase": PHASES.index("lift")}]
 )

@@ -3,7 +3,7 @@ import pytest
 import torch
 
 from lerobot_openspm.configuration_openspm import OpenSPMConfig
-from lerobot_openspm.flow.condition import CONDITION_DIM, CONDITIONINGS
+from lerobot_openspm.flow.condition import CONDITION_DIM
 from lerobot_openspm.flow.network import VelocityField
 
 
@@ -12,10 +12,10 @@ def field(condition_dim=6, chunk_size=5, action_dim=7, width=16, seed=0):
     return VelocityField(condition_dim, chunk_size, action_dim, width)
 
 
-@pytest.mark.parametrize("conditioning", CONDITIONINGS)
+@pytest.mark.parametrize("conditioning", CONDITION_DIM)
 def test_the_default_network_has_the_papers_size(conditioning):
     config = OpenSPMConfig(push_to_hub=False)
-    network = VelocityField(CONDITION_DIM[conditioning], config.chunk_size, 7, config.hidden_dim)
+    network = VelocityField(CONDITION_DIM[conditioning], config.chunk_size, 7)
     n_parameters = sum(p.numel() for p in network.parameters())
     assert 0.9 * 240_000 <= n_parameters <= 1.1 * 240_000
 

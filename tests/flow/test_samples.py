@@ -4,7 +4,7 @@ from numpy.testing import assert_allclose
 from tests.mining import episodes
 from tests.mining.episodes import Drawer
 
-from lerobot_openspm.flow.condition import CONDITION_DIM, CONDITIONINGS, progress, to_world_frame
+from lerobot_openspm.flow.condition import CONDITION_DIM, progress, to_world_frame
 from lerobot_openspm.flow.samples import action_scale, conditions_and_chunks, perturbed, segment_frames
 from lerobot_openspm.geometry import se3
 from lerobot_openspm.memory.entry import PHASES
@@ -166,7 +166,7 @@ def test_what_the_robot_was_never_commanded_to_do_is_not_corrected(demonstration
     assert_allclose(moved.actions[..., 3:6], frames.actions[..., 3:6])
 
 
-@pytest.mark.parametrize("conditioning", CONDITIONINGS)
+@pytest.mark.parametrize("conditioning", CONDITION_DIM)
 def test_network_inputs_and_targets(frames, conditioning):
     conditions, chunks = conditions_and_chunks(frames, conditioning)
     assert conditions.shape == (len(frames), CONDITION_DIM[conditioning])

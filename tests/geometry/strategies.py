@@ -26,4 +26,4 @@ def rotvecs(draw: st.DrawFn, max_angle: float = np.pi - 1e-3) -> np.ndarray:
 
 @st.composite
 def transforms(draw: st.DrawFn) -> np.ndarray:
-    return se3.from_position_rotvec(draw(vectors()), draw(rotvecs()))
+    return se3.transform(se3.exp_so3(draw(rotvecs())), draw(vectors()))

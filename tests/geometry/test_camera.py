@@ -83,7 +83,7 @@ def test_points_along_the_ray_of_a_pixel_project_to_it(T_world_cam, u, v, along)
 
 @given(st.floats(-0.4, 0.4), st.floats(-0.4, 0.4), st.floats(-0.1, 0.4), st.floats(-0.6, 0.6))
 def test_a_point_is_found_again_where_its_ray_meets_its_plane(x, y, height, tilt):
-    T_world_cam = T_DOWN @ se3.from_position_rotvec(np.zeros(3), [tilt, tilt / 2, 0.3])
+    T_world_cam = T_DOWN @ se3.transform(se3.exp_so3([tilt, tilt / 2, 0.3]), np.zeros(3))
     uv, depth = project(camera(), T_world_cam, [x, y, height])
     if depth > 0.1:
         assert_allclose(intersect_plane(camera(), T_world_cam, uv, height), [x, y, height], atol=1e-9)

@@ -19,7 +19,7 @@ def rodrigues(axis, angle):
 
 def batch_of(batch, seed=0):
     rng = np.random.default_rng(seed)
-    return se3.from_position_rotvec(rng.normal(size=(*batch, 3)), rng.normal(size=(*batch, 3)))
+    return se3.transform(se3.exp_so3(rng.normal(size=(*batch, 3))), rng.normal(size=(*batch, 3)))
 
 
 @given(transforms())
@@ -141,7 +141,7 @@ def test_wrapped_angles_lie_in_one_period_and_differ_by_whole_ones(angle, period
 
 @pytest.mark.parametrize(("period", "count"), [(0.0, 1), (2 * np.pi, 1), (np.pi, 2), (np.pi / 2, 4)])
 def test_yaw_equivalents_are_turns_about_the_objects_own_axis(period, count):
-    T = se3.from_position_rotvec([0.3, -0.2, 0.1], [0.4, 0.2, 1.0])
+    T = se3.transform(se3.exp_so3([0.4, 0.2, 1.0]), [0.3, -0.2, 0.1])
     equivalents = se3.yaw_equivalents(T, period)
     assert len(equivalents) == count
     assert_allclose(equivalents[0], T, atol=1e-12)

@@ -4,8 +4,8 @@ import contextlib
 import time
 
 import pytest
+from benchmarks.language import known_instructions
 
-from lerobot_openspm.bench.language import known_instructions
 from lerobot_openspm.errors import InstructionError
 from lerobot_openspm.language.instruction import parse_instruction
 from lerobot_openspm.language.meaning import same_meaning

@@ -27,7 +27,7 @@ def merged_entry(**changes):
 
 
 def a_memory(**changes):
-    T = se3.from_position_rotvec([0.1, 0.2, 0.3], [0.3, 0.2, 0.1])
+    T = se3.transform(se3.exp_so3([0.3, 0.2, 0.1]), [0.1, 0.2, 0.3])
     entries = (
         entry("put the bowl on the plate", source="local/demos#0"),
         entry("open the top drawer", [key_pose("cabinet", T, "open", axis=SLIDE)], source="local/demos#1"),
@@ -58,5 +58,5 @@ def same(a, b):
     if isinstance(a, tuple):
         return len(a) == len(b) and all(same(x, y) for x, y in zip(a, b, strict=True))
     if hasattr(a, "__dataclass_fields__"):
-        return type(a) is type(b) and same(vars(a), vars(b))
+        return type(a) is type(b) and all(same(getattr(a, f), getattr(b, f)) for f in a.__dataclass_fields__)
     return type(a) is type(b) and a == b

@@ -6,65 +6,71 @@ import json
 import numpy as np
 from safetensors.numpy import load, save
 
-from lerobot_openspm.memory.bank import DIGEST_BYTES, HEAD, TAIL, Lines
-from lerobot_openspm.memory.files import lines_to_arrays, read_header, sealed
-
-
-def name_of(directory, kind):
-    """Name of the file of "entries", "arrays" or "cameras"."""
-    return read_header(directory)["files"][kind]["file"]
+from lerobot_openspm.memory.bank import BETWEEN, DIGEST_BYTES, TAIL
+from lerobot_openspm.memory.io import ENTRIES, SEAL, arrays_file
 
 
 def names(directory):
-    """Names of the memory's files, as its header has them."""
-    return ["memory.json", *(name_of(directory, kind) for kind in ("entries", "arrays", "cameras"))]
+    """Names of the memory's files."""
+    return ["memory.json", arrays_file(directory)]
+
+
+def parts(directory):
+    """The header's fields, and the text of the entries with the end of the file."""
+    head, _, entries = (directory / "memory.json").read_bytes().partition(ENTRIES)
+    return json.loads(head.rpartition(SEAL)[0] + b"}"), entries
+
+
+def write_parts(directory, header, entries):
+    body = json.dumps(header, indent=1).encode().removesuffix(b"\n}")
+    seal = SEAL + hashlib.sha256(body).hexdigest().encode()
+    (directory / "memory.json").write_bytes(body + seal + ENTRIES + entries)
 
 
 def edit_header(directory, change):
-    path = directory / "memory.json"
-    header = json.loads(path.read_text())
+    header, entries = parts(directory)
     change(header)
-    try:
-        path.write_text(json.dumps(sealed(header)))
-    except ValueError:  # NaN has no canonical form; it is refused before the checksum is looked at
-        path.write_text(json.dumps(header))
+    write_parts(directory, header, entries)
 
 
 def edit_arrays(directory, change):
-    arrays = load((directory / name_of(directory, "arrays")).read_bytes())
+    arrays = load((directory / arrays_file(directory)).read_bytes())
     change(arrays)
     vouch_for(directory, save(arrays))
 
 
 def vouch_for(directory, blob):
     """Put a blob in the place of the arrays."""
-    (directory / name_of(directory, "arrays")).write_bytes(blob)
-    sha256 = hashlib.sha256(blob).hexdigest()
-    edit_header(directory, lambda header: header["files"]["arrays"].update(sha256=sha256))
+    (directory / arrays_file(directory)).unlink()
+    name = f"memory-{hashlib.sha256(blob).hexdigest()}.safetensors"
+    (directory / name).write_bytes(blob)
+    edit_header(directory, lambda header: header.update(arrays=name))
 
 
 def edit_entries(directory, change):
     """Change the list of the entries' fields."""
-    path = directory / name_of(directory, "entries")
-    rows = json.loads(path.read_text())
+    rows = json.loads((directory / "memory.json").read_bytes())["entries"]
     change(rows)
     write_texts(directory, [json.dumps(row).encode() for row in rows])
 
 
 def write_texts(directory, texts):
     """Put texts in the place of the entries, each on its line."""
-    ends, position = [], len(HEAD)
-    for text in texts:
-        position += len(text) + 2 * bool(ends)
-        ends.append(position)
+    header, _ = parts(directory)
+    write_parts(directory, header, BETWEEN.join(texts) + TAIL)
+    ends = np.cumsum([len(text) + len(BETWEEN) for text in texts]) - len(BETWEEN)
     digests = [hashlib.blake2b(text, digest_size=DIGEST_BYTES).digest() for text in texts]
-    lines = Lines(np.array(ends), np.frombuffer(b"".join(digests), np.uint8).reshape(-1, DIGEST_BYTES))
-    (directory / name_of(directory, "entries")).write_bytes(HEAD + b",\n".join(texts) + TAIL)
-    columns = {
-        "entries.keys": np.zeros(len(texts), np.uint64),
-        "entries.qualities": np.array([_quality(text) for text in texts], float),
-    }
-    edit_arrays(directory, lambda arrays: arrays.update(lines_to_arrays(lines) | columns))
+
+    def change(arrays):
+        n_more = len(texts) - len(arrays["entries.keys"])
+        arrays |= {
+            "entries.ends": ends.astype(np.int64),
+            "entries.digests": np.frombuffer(b"".join(digests), np.uint8).reshape(-1, DIGEST_BYTES),
+            "entries.keys": np.pad(arrays["entries.keys"][: len(texts)], (0, max(0, n_more))),
+            "entries.qualities": np.array([_quality(text) for text in texts], float),
+        }
+
+    edit_arrays(directory, change)
 
 
 def _quality(text):

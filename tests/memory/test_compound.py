@@ -6,12 +6,10 @@ import numpy as np
 import pytest
 from tests.memory.builders import entry, hand_pose, key_pose, pick_and_place
 
-from lerobot_openspm.envs.tabletop.tasks import ANY_TASK
 from lerobot_openspm.errors import InstructionError
 from lerobot_openspm.geometry import se3
-from lerobot_openspm.language.instruction import parse_instruction
-from lerobot_openspm.memory.compose import parts, phrase, plan_parts, sub_task_index
-from lerobot_openspm.types import Reference, SubTask
+from lerobot_openspm.memory.compose import parts, plan_parts, sub_task_index
+from lerobot_openspm.types import SubTask
 
 DRAWER = "open the top drawer and put the bowl inside"
 
@@ -51,13 +49,6 @@ def test_an_entry_with_one_sub_task_is_its_own_part():
     assert parts(one)[0] is one
 
 
-def test_an_older_memory_that_does_not_say_the_sub_tasks_is_told_by_its_gripper():
-    new = drawer_entry()
-    old = drawer_entry(key_poses=tuple(replace(pose, sub_task=0) for pose in new.key_poses))
-    assert [part.key for part in parts(old)] == [part.key for part in parts(new)]
-    assert [len(part.key_poses) for part in parts(old)] == [5, 8]
-
-
 def test_contacts_at_an_object_that_is_not_named_make_no_part():
     T = hand_pose(0.0, 0.0, 0.1)
     elsewhere = [replace(pose, anchor=key_pose("bowl", T, "open").anchor) for pose in opened()]
@@ -86,37 +77,6 @@ def test_contacts_at_an_object_that_is_not_named_make_no_part():
 )
 def test_a_sub_task_takes_two_transitions_and_leaving_is_part_of_it(contact, phase, expected):
     assert sub_task_index(contact, phase, 2) == expected
-
-
-@pytest.mark.parametrize("task", ANY_TASK)
-def test_a_phrase_says_the_sub_task(task):
-    for sub_task in parse_instruction(ANY_TASK[task].instruction):
-        assert parse_instruction(phrase(sub_task)) == (sub_task,)
-
-
-ON_PLATE = ("put", "bowl", "", "on", "plate")
-
-
-@pytest.mark.parametrize(
-    ("sub_task", "words"),
-    [
-        (SubTask(*ON_PLATE, None, Reference("left")), "put the bowl on the left plate"),
-        (
-            SubTask(*ON_PLATE, Reference("between", ("cup", "ramekin"))),
-            "put the bowl between the cup and the ramekin on the plate",
-        ),
-        (
-            SubTask("pick", "mug", target_where=Reference("front", ("box",))),
-            "pick up the mug in front of the box",
-        ),
-        (
-            SubTask("open", "cabinet", "top drawer", target_where=Reference("left")),
-            "open the top drawer of the left cabinet",
-        ),
-    ],
-)
-def test_a_phrase_says_which_is_meant(sub_task, words):
-    assert phrase(sub_task) == words
 
 
 def languages(instruction, *entries):

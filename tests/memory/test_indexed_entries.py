@@ -2,13 +2,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from benchmarks.synthetic import distinct_keys, said_otherwise
 from tests.memory.builders import entry, semantic_candidates
 
-from lerobot_openspm.bench.synthetic_keys import distinct_keys, said_otherwise
 from lerobot_openspm.errors import InstructionError
 from lerobot_openspm.language.instruction import parse_instruction
 from lerobot_openspm.memory import indexed_entries as module
-from lerobot_openspm.memory.columns import columns_of, key_digest
+from lerobot_openspm.memory.bank import key_digest
 from lerobot_openspm.memory.entry import RetrievalKey
 from lerobot_openspm.memory.indexed_entries import (
     ENTRIES_IN_ALL,
@@ -43,21 +43,6 @@ def sources(entries):
 @pytest.fixture(scope="module")
 def many():
     return bank_of(distinct_keys(INDEX_FROM + 500, np.random.default_rng(0)))
-
-
-class Bank(list):
-    """A bank with columns, which remembers which entries were read."""
-
-    def __init__(self, entries, kept=None):
-        super().__init__(entries)
-        self.read, self.kept = [], kept
-
-    def columns(self):
-        return self.kept
-
-    def __getitem__(self, i):
-        self.read.append(i)
-        return list.__getitem__(self, i)
 
 
 def test_it_is_the_sequence_it_indexes(many):
@@ -147,42 +132,9 @@ def test_parts_are_found_in_either_direction():
     assert "part" in chain
 
 
-def test_of_a_bank_with_columns_one_entry_of_each_key_is_read(many):
-    plain = many[:20] * 30
-    bank = Bank(plain, columns_of(plain))
-    made = IndexedEntries(bank)
-    assert sorted(bank.read) == list(range(20))
-    for asked in (many[7].key.sub_tasks, many[11].key.sub_tasks):
-        found = made.near(asked, semantic_score)
-        assert sources(found) == sources(IndexedEntries(plain).near(asked, semantic_score))
-
-
-def test_a_bank_may_have_no_columns_yet(many):
-    found = IndexedEntries(Bank(many[:20])).near(many[2].key.sub_tasks, semantic_score)
-    assert found[0] is many[2]
-
-
-def test_columns_of_other_entries_are_not_believed(many, caplog):
-    found = IndexedEntries(Bank(many[:20], columns_of(many[5:25])), "bank").near(
-        many[2].key.sub_tasks, semantic_score
-    )
-    assert found[0] is many[2]
-    assert caplog.text.count("bank: its digests are not those of its keys") == 1
-
-
-def test_columns_are_those_that_were_kept_or_made(many):
-    made = columns_of(many[:5])
-    assert (made.digests.dtype, made.qualities.dtype) == (np.uint64, np.float64)
-    assert made.digests.tolist() == [key_digest(one.key.sub_tasks) for one in many[:5]]
-    assert made.qualities.tolist() == [one.quality for one in many[:5]]
-    assert made[1:3].digests.tolist() == made.digests[1:3].tolist()
-    assert columns_of(Bank(many[:5], made)) is made
-    assert columns_of(()).digests.shape == (0,)
-
-
 def test_digests_tell_keys_apart_and_are_the_same_everywhere(many):
     assert len({key_digest(one.key.sub_tasks) for one in many}) == len(many)
-    assert key_digest([SubTask("put", "bowl", "", "on", "plate")]) == DIGEST_OF_BOWL
+    assert key_digest((SubTask("put", "bowl", "", "on", "plate"),)) == DIGEST_OF_BOWL
 
 
 def test_the_gate_of_retrieval_holds_for_what_is_near(many):

@@ -97,7 +97,7 @@ def test_axes_are_averaged():
 
 def test_the_mean_of_poses_is_where_increments_balance():
     rng = np.random.default_rng(2)
-    T = se3.from_position_rotvec(rng.normal(0, 0.1, (9, 3)), rng.normal(0, 0.3, (9, 3)))
+    T = se3.transform(se3.exp_so3(rng.normal(0, 0.3, (9, 3))), rng.normal(0, 0.1, (9, 3)))
     weights = rng.uniform(1, 3, 9)
     mean = mean_pose(T, weights)
     assert_allclose(weights @ se3.increment(mean, T), np.zeros(6), atol=1e-9)

@@ -31,7 +31,7 @@ def demonstrations(n, place_axes="plate", seed=0, error_m=0.0):
     rng, made = np.random.default_rng(seed), []
     for _ in range(n):
         layout = scene(rng)
-        wobble = se3.from_position_rotvec(error_m * rng.normal(size=3), np.zeros(3))
+        wobble = se3.transform(np.eye(3), error_m * rng.normal(size=3))
         T_place = Anchor("plate", place_axes).frame(layout)
         poses = (
             key_pose("grasp", layout["bowl"] @ wobble @ hand_pose(0.04, 0.01, 0.02, 0.3)),
@@ -99,9 +99,10 @@ def test_the_second_sub_task_has_its_own_objects():
 
 
 def test_objects_that_the_instruction_does_not_name_are_no_anchors():
-    made = [Demonstration(d.key_poses, d.layout | {"cup": np.eye(4)}) for d in demonstrations(6)]
+    made = [Demonstration(d.key_poses, d.object_poses | {"cup": np.eye(4)}) for d in demonstrations(6)]
     fixed = [
-        Demonstration((*d.key_poses[:1], key_pose("place", hand_pose(0.1, 0.1, 0.1))), d.layout) for d in made
+        Demonstration((*d.key_poses[:1], key_pose("place", hand_pose(0.1, 0.1, 0.1))), d.object_poses)
+        for d in made
     ]
     assert all("cup" not in anchor.objects for anchor in consensus(fixed, SUB_TASKS).values())
 
@@ -109,7 +110,7 @@ def test_objects_that_the_instruction_does_not_name_are_no_anchors():
 def test_an_object_that_is_never_found_gives_no_anchor():
     blind = [Demonstration(d.key_poses, {}) for d in demonstrations(3)]
     assert consensus(blind, SUB_TASKS) == {}
-    half = [Demonstration(d.key_poses, {"bowl": d.layout["bowl"]}) for d in demonstrations(3)]
+    half = [Demonstration(d.key_poses, {"bowl": d.object_poses["bowl"]}) for d in demonstrations(3)]
     assert {anchor.place for anchor in consensus(half, SUB_TASKS).values()} == {"bowl"}
 
 
@@ -129,7 +130,7 @@ def test_the_outlier_among_the_demonstrations_has_the_lowest_quality():
     made = demonstrations(7, error_m=0.001)
     grasp, place = made[3].key_poses
     shifted = key_pose("grasp", grasp.T_world_ee @ se3.from_yaw([0.03, 0.0, 0.0], 0.0))
-    made[3] = Demonstration((shifted, place), made[3].layout)
+    made[3] = Demonstration((shifted, place), made[3].object_poses)
     scores = qualities(made, consensus(made, SUB_TASKS))
     assert int(np.argmin(scores)) == 3
     assert scores[3] < 0.5 < min(score for i, score in enumerate(scores) if i != 3)
@@ -146,18 +147,20 @@ def test_demonstrations_that_agree_and_single_ones_are_perfect():
 def test_symmetric_objects_are_turned_so_that_demonstrations_agree(period):
     made = demonstrations(6)
     turned = [
-        Demonstration(d.key_poses, d.layout | {"bowl": se3.yaw_equivalents(d.layout["bowl"], period)[i % 2]})
+        Demonstration(
+            d.key_poses, d.object_poses | {"bowl": se3.yaw_equivalents(d.object_poses["bowl"], period)[i % 2]}
+        )
         for i, d in enumerate(made)
     ]
     aligned = align_symmetric(turned, {"bowl": period})
     for d, true in zip(aligned, made, strict=True):
-        assert_allclose(d.layout["bowl"], true.layout["bowl"], atol=1e-9)
-        assert_allclose(d.layout["plate"], true.layout["plate"])
+        assert_allclose(d.object_poses["bowl"], true.object_poses["bowl"], atol=1e-9)
+        assert_allclose(d.object_poses["plate"], true.object_poses["plate"])
         assert d.key_poses == true.key_poses
     # Without symmetry nothing is turned, and a body of revolution has nothing to turn.
     for periods in ({}, {"bowl": 2 * np.pi}, {"bowl": 0.0}):
         for d, same in zip(align_symmetric(turned, periods), turned, strict=True):
-            assert_allclose(d.layout["bowl"], same.layout["bowl"])
+            assert_allclose(d.object_poses["bowl"], same.object_poses["bowl"])
 
 
 def test_where_a_push_turns_says_nothing_against_a_demonstration():
@@ -179,4 +182,4 @@ def test_a_symmetric_object_is_turned_by_where_a_push_ends_and_not_by_where_it_t
     second = Demonstration((key_pose("push", other_way_round, 0), key_pose("push", end, 0)), layout)
     for made in ([first, second], [second, first]):
         aligned = align_symmetric(made, {"plate": np.pi})
-        assert_allclose(aligned[0].layout["plate"], aligned[1].layout["plate"], atol=1e-9)
+        assert_allclose(aligned[0].object_poses["plate"], aligned[1].object_poses["plate"], atol=1e-9)

@@ -16,16 +16,15 @@ from lerobot.datasets.language import language_feature_info
 from tests.memory.builders import robot
 from tests.mining.test_dataset_layers import dataset as image_dataset
 
-from lerobot_openspm.configuration_openspm import OpenSPMConfig
+from lerobot_openspm.configuration_openspm import JudgeConfig, OpenSPMConfig
 from lerobot_openspm.errors import DatasetError
+from lerobot_openspm.language.descriptions import phases_of
 from lerobot_openspm.language.instruction import parse_instruction
-from lerobot_openspm.memory.entry import PHASES
 from lerobot_openspm.mining import annotate, processor
-from lerobot_openspm.mining.annotate import sub_task_words, write_annotated
+from lerobot_openspm.mining.annotate import write_annotated
 from lerobot_openspm.mining.columns import IS_KEY_POSE, KEY_POSE, PHASE, TARGET, TYPES
 from lerobot_openspm.mining.key_poses import KeyPose
 from lerobot_openspm.mining.mined import MinedEpisode, MinedKeyPoses
-from lerobot_openspm.mining.phase_labels.annotations import phases_of
 from lerobot_openspm.mining.processor import DatasetProcessor
 from lerobot_openspm.training import dataset_processor, open_demonstrations
 
@@ -62,12 +61,8 @@ def test_reading_it_gives_what_was_mined_and_mines_nothing(
 
 
 def test_nobody_is_asked_about_phases_that_stand_there(annotated_dataset: Path):
-    judge = {
-        "phase_judge": "openai",
-        "phase_judge_model_id": "m",
-        "phase_judge_api_base": "http://nowhere.test/v1",
-    }
-    assert len(processor_of(annotated_dataset, **judge).key_poses().episodes) == 6
+    judge = JudgeConfig("openai", "http://nowhere.test/v1", "m")
+    assert len(processor_of(annotated_dataset, judge=judge).key_poses().episodes) == 6
 
 
 def test_lerobot_reads_it_with_everything_that_was_there(tiny_dataset: Path, annotated_dataset: Path):
@@ -131,17 +126,6 @@ def test_its_sub_tasks_say_the_phases_to_lerobots_tools(annotated_dataset: Path)
             said = [span["text"] for span in spans if span["start"] <= time_s][-1]
             assert not phase or phase in phases_of(said), f"{phase} is called {said!r}"
         assert sum(frames[IS_KEY_POSE]) == max(frames[KEY_POSE]) + 1
-
-
-@pytest.mark.parametrize("phase", PHASES)
-@pytest.mark.parametrize(
-    "instruction",
-    ["put the bowl in the top drawer of the cabinet", "open the top drawer", "turn on the stove"],
-)
-def test_a_sub_task_is_worded_so_that_it_is_understood_again(phase: str, instruction: str):
-    pose = KeyPose(3, np.eye(4), phase, 1.0, False, 0.0, 3, False, 0)
-    words = sub_task_words(pose, parse_instruction(instruction))
-    assert phase in phases_of(words), words
 
 
 def test_held_out_episodes_are_annotated_and_those_without_key_poses_skipped(

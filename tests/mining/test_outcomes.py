@@ -31,13 +31,13 @@ def pushed(n, error_m=0.0, turned=0.0, seed=0):
 def test_what_is_carried_ends_where_the_hand_lets_it_go():
     (shown,) = demonstrations(1)
     grasp, place = shown.key_poses
-    expected = place.T_world_ee @ se3.inverse(grasp.T_world_ee) @ shown.layout["bowl"]
+    expected = place.T_world_ee @ se3.inverse(grasp.T_world_ee) @ shown.object_poses["bowl"]
     assert_allclose(carried_to(shown, SUB_TASKS)["bowl"], expected, atol=1e-12)
 
 
 def test_what_was_not_seen_at_the_start_has_no_end():
     (shown,) = demonstrations(1)
-    unseen = Demonstration(shown.key_poses, {"plate": shown.layout["plate"]})
+    unseen = Demonstration(shown.key_poses, {"plate": shown.object_poses["plate"]})
     assert carried_to(unseen, SUB_TASKS) == {}
 
 
@@ -50,7 +50,7 @@ def test_the_outcome_is_where_the_demonstrations_leave_the_target(n):
         assert outcome.target == "plate"
         assert outcome.anchor.place == "stove"
         assert_allclose(outcome.position, [0.22, 0, 0], atol=0.01)
-        layout = {**demonstration.layout, **end}
+        layout = {**demonstration.object_poses, **end}
         assert_allclose(outcome.place_shown(layout), end["plate"][:3, 3], atol=1e-12)
         assert outcome.is_met(layout)
 
@@ -60,8 +60,8 @@ def test_axes_are_those_in_which_the_demonstrations_agree():
     assert all(outcome.anchor.axes == "stove" for (outcome,) in outcomes(shown, ended, PUSH))
     rng = np.random.default_rng(1)
     for one, end in zip(shown, ended, strict=True):
-        one.layout["stove"][:3, :3] = se3.from_yaw(np.zeros(3), rng.uniform(-1, 1))[:3, :3]
-        end["plate"][:3, 3] = one.layout["stove"][:3, 3] + [0.22, 0, 0]
+        one.object_poses["stove"][:3, :3] = se3.from_yaw(np.zeros(3), rng.uniform(-1, 1))[:3, :3]
+        end["plate"][:3, 3] = one.object_poses["stove"][:3, 3] + [0.22, 0, 0]
     assert all(outcome.anchor.axes == WORLD for (outcome,) in outcomes(shown, ended, PUSH))
 
 
@@ -69,7 +69,7 @@ def test_an_object_beside_its_place_misses_the_outcome():
     shown, ended = pushed(5)
     outcome = outcomes(shown, ended, PUSH)[0][0]
     assert outcome.tolerance_m == LEAST_TOLERANCE_M
-    layout = {**shown[0].layout, **ended[0]}
+    layout = {**shown[0].object_poses, **ended[0]}
     for off, is_met in ((0.9, True), (1.1, False)):
         place = se3.from_yaw(ended[0]["plate"][:3, 3] + [off * LEAST_TOLERANCE_M, 0, 0], 0.0)
         assert outcome.is_met({**layout, "plate": place}) is is_met
@@ -97,7 +97,7 @@ def test_what_is_let_go_may_have_fallen_but_not_risen(height, is_met):
     shown, ended = pushed(5)
     outcome = outcomes(shown, ended, PUSH)[0][0]
     place = se3.from_yaw(ended[0]["plate"][:3, 3] + [0.0, 0.0, height], 0.0)
-    assert outcome.is_met({**shown[0].layout, "plate": place}) is is_met
+    assert outcome.is_met({**shown[0].object_poses, "plate": place}) is is_met
 
 
 def test_a_landmark_that_is_carried_off_later_tells_no_outcome():

@@ -13,9 +13,8 @@ from lerobot_openspm.memory.compose import parts
 from lerobot_openspm.mining.entries import task_entries
 from lerobot_openspm.mining.key_poses import find_key_poses
 from lerobot_openspm.mining.mined import MinedEpisode
-from lerobot_openspm.mining.objects import hints
-from lerobot_openspm.mining.processor import mine_episodes
-from lerobot_openspm.mining.tasks import compare
+from lerobot_openspm.mining.objects import contact_cues
+from lerobot_openspm.mining.processor import compare, mine_episodes
 
 TASK = "open the top drawer and put the bowl inside"
 LAYOUT = {"cabinet": se3.from_yaw([0.3, 0.0, 0.0], 0.0), "bowl": se3.from_yaw([-0.1, 0.2, 0.0], 0.0)}
@@ -67,7 +66,7 @@ def test_a_task_that_the_grammar_cannot_read_is_mined_with_the_things_that_the_h
     one = pick_and_place()[0].episode(0, "pour the coffee into the cup")
     (item,), _ = mined(one)
     assert [(s.operation, s.target, s.landmark) for s in item.sub_tasks] == [("do", "coffee", "cup")]
-    touched = [(hint.name, hint.kind) for hint in hints(item)]
+    touched = [(cue.name, cue.kind) for cue in contact_cues(item)]
     assert touched == [("coffee", "grasp"), ("cup", "release")]
 
 
@@ -96,7 +95,7 @@ def test_one_demonstration_of_several_that_grasps_twice_leaves_the_others_as_the
 def test_every_thing_that_such_a_task_takes_has_a_name_of_its_own():
     (item,), _ = mined(twice().episode(0, "set the table"))
     assert [s.target for s in item.sub_tasks] == ["set table object", "set table object 2"]
-    assert [hint.name for hint in hints(item)] == ["set table object", "set table object 2"]
+    assert [cue.name for cue in contact_cues(item)] == ["set table object", "set table object 2"]
     layout = {"set table object": np.eye(4), "set table object 2": np.eye(4)}
     (task,) = compare([item], [layout], [{}], {})
     (entry,) = task_entries(task, "local/any")

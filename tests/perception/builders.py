@@ -1,4 +1,4 @@
-"""Known objects made of random numbers, for tests of what is done with them."""
+"""Known objects made of random numbers, and shorthands for learning and looking for objects."""
 
 from dataclasses import replace
 
@@ -6,13 +6,17 @@ import numpy as np
 
 from lerobot_openspm.geometry import se3
 from lerobot_openspm.geometry.camera import Camera
-from lerobot_openspm.perception.colour import N_BINS
-from lerobot_openspm.perception.objects.model import BoxModel, ObjectModel, Patch, PatchModel, Probe
+from lerobot_openspm.perception.foreground import N_BINS
+from lerobot_openspm.perception.objects.base import Lesson, Look
+from lerobot_openspm.perception.objects.box.model import BoxModel
+from lerobot_openspm.perception.objects.patches.match import Patch, Probe
+from lerobot_openspm.perception.objects.patches.model import PatchModel
+from lerobot_openspm.perception.objects.shape.model import ShapeModel
 
 
 def model(name, seed=0, yaw_period=2 * np.pi):
     rng = np.random.default_rng(seed)
-    return ObjectModel(
+    return ShapeModel(
         name, rng.normal(size=N_BINS).astype(np.float32), rng.normal(size=(9, 3)).astype(np.float32),
         0.005, 0.01, yaw_period, 0.1, 0.2, 0.9,
     )  # fmt: skip
@@ -36,3 +40,14 @@ def patch_model(name):
         for i in range(2)
     )
     return PatchModel(name, (Probe("observation.images.front", camera, T, patches, 0.001),), 1.0, 0.9)
+
+
+def localise(views, known, instances=None, hidden=None, T_expected=None):
+    """Find one object in views."""
+    found = {} if instances is None else {known.name: instances}
+    expected = {} if T_expected is None else {known.name: T_expected}
+    return known.localise(Look(views, found, hidden or {}, expected))
+
+
+def lesson(names, scenes, known=(), segmenter=None, source="demonstrations", shapes=None):
+    return Lesson(names, scenes, known, np.random.default_rng(0), segmenter, source, shapes)

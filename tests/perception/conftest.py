@@ -10,8 +10,8 @@ from safetensors.numpy import load_file, save_file
 from tests.perception.drawn_world import demonstration
 
 from lerobot_openspm.perception.objects import store
-from lerobot_openspm.perception.objects.learning import learn_objects
-from lerobot_openspm.perception.objects.model import ObjectModel
+from lerobot_openspm.perception.objects.kinds import learn_objects
+from lerobot_openspm.perception.objects.shape.model import ShapeModel
 
 
 def learn(folder: Path) -> None:
@@ -26,7 +26,7 @@ def learn(folder: Path) -> None:
 
 
 @pytest.fixture(scope="session")
-def drawn_objects(make_once: Callable[..., Path]) -> dict[str, ObjectModel]:
+def drawn_objects(make_once: Callable[..., Path]) -> dict[str, ShapeModel]:
     """Models of the drawn world's block and cup, learned from hints alone."""
     folder = make_once("drawn_objects", learn)
     read = {
@@ -35,4 +35,4 @@ def drawn_objects(make_once: Callable[..., Path]) -> dict[str, ObjectModel]:
         )
         for file in sorted(folder.glob("*.json"))
     }
-    return {name: model for name, model in read.items() if isinstance(model, ObjectModel)}
+    return {name: model for name, model in read.items() if isinstance(model, ShapeModel)}

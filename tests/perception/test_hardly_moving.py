@@ -7,9 +7,9 @@ import pytest
 from tests.perception.builders import model
 from tests.perception.drawn_world import demonstration, draw_poses
 
-from lerobot_openspm.perception.objects.learning import learn_objects
-from lerobot_openspm.perception.objects.model import PatchModel
-from lerobot_openspm.perception.objects.patches.learn import hardly_moving
+from lerobot_openspm.perception.objects.kinds import learn_objects
+from lerobot_openspm.perception.objects.patches.model import PatchModel
+from lerobot_openspm.perception.objects.patches.stillness import hardly_moving
 from lerobot_openspm.types import ContactCue, Scene
 
 # How far to either side of the middle objects stand, along both axes.

@@ -1,11 +1,11 @@
 import numpy as np
 import pytest
+from tests.perception.builders import localise
 from tests.perception.drawn_world import cameras, draw_poses, views_of
 
 from lerobot_openspm.geometry import se3
 from lerobot_openspm.geometry.camera import project
-from lerobot_openspm.perception.objects.localise import localise
-from lerobot_openspm.perception.occlusion import hand_mask
+from lerobot_openspm.perception.pipeline import hand_mask
 from lerobot_openspm.types import View
 
 DOWN = np.diag([1.0, -1.0, -1.0])

@@ -8,7 +8,7 @@ import torch
 from lerobot.envs.utils import preprocess_observation
 from tests.policy.conftest import Frame, batch_of
 
-from lerobot_openspm.control.status import Status
+from lerobot_openspm.control.state import Status
 from lerobot_openspm.envs.tabletop.env import TabletopEnv
 from lerobot_openspm.modeling_openspm import OpenSPMPolicy
 
@@ -68,7 +68,7 @@ def test_a_broken_camera_stops_the_hand_after_half_a_second_and_the_episode_afte
     # Half a second is ten steps; a frozen picture is news until the hand has moved, by 20 mm.
     limit = 15 if name == "frozen" else 10
     assert not moving[BROKEN_AT + limit :].any()
-    assert policy.episodes[0].controller.status is Status.CAMERA_FAULT
+    assert policy.episodes[0].controller.state.status is Status.CAMERA_FAULT
     assert repr(FRONT) in caplog.text
 
 
@@ -77,7 +77,7 @@ def test_a_camera_that_is_back_within_half_a_second_stops_nothing(policy: OpenSP
     actions = torch.stack(list(episode(policy, SPOILED[name], range(BROKEN_AT, BROKEN_AT + 6))))
     assert torch.isfinite(actions).all()
     assert actions[:, :6].abs().max(dim=1).values.all()
-    assert policy.episodes[0].controller.status is Status.RUNNING
+    assert policy.episodes[0].controller.state.status is Status.RUNNING
 
 
 def test_cameras_that_are_dark_from_the_start_end_the_episode_too(
@@ -86,5 +86,5 @@ def test_cameras_that_are_dark_from_the_start_end_the_episode_too(
     dark = {k: torch.zeros_like(v) if "image" in k else v for k, v in recorded[0][0].items()}
     for _ in range(60):
         assert not policy.select_action(batch_of([dark]))[..., :6].any()
-    assert policy.episodes[0].controller.status is Status.CAMERA_FAULT
+    assert policy.episodes[0].controller.state.status is Status.CAMERA_FAULT
     assert "is black" in caplog.text

@@ -8,7 +8,7 @@ import pytest
 from tests.memory.memory_files import names
 from tests.policy.lerobot_commands import call_lerobot, pretrained, train_arguments, training_options
 
-from lerobot_openspm.memory.memory import read_memory
+from lerobot_openspm.memory.io import read_memory
 
 BOWL, STOVE = "put the bowl on the plate", "turn on the stove"
 PUSH = "push the plate to the front of the stove"

@@ -1,15 +1,18 @@
+from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import draccus
 import numpy as np
 import pytest
 import torch
-from lerobot.configs import FeatureType, PolicyFeature
+from lerobot.configs import FeatureType, PolicyFeature, PreTrainedConfig
+from lerobot.policies.factory import make_policy_config
 from lerobot.utils.constants import ACTION, OBS_STATE
 from scipy.spatial.transform import Rotation
 
 from lerobot_openspm.cli.mine import MineConfig
-from lerobot_openspm.configuration_openspm import OpenSPMConfig
+from lerobot_openspm.configuration_openspm import JudgeConfig, OpenSPMConfig, SegmentationConfig
 from lerobot_openspm.errors import LayoutError
 from lerobot_openspm.perception.observation import split_batch
 
@@ -20,10 +23,7 @@ def config(**options: Any) -> OpenSPMConfig:
     return OpenSPMConfig(device="cpu", push_to_hub=False, **options)
 
 
-@pytest.mark.parametrize(
-    "name",
-    ["perception", "segmentation", "shape", "memory_update", "conditioning", "execution", "state_rotation"],
-)
+@pytest.mark.parametrize("name", ["perception", "memory_update", "conditioning", "execution", "rotation"])
 def test_an_unknown_choice_is_named_with_the_known_ones(name: str):
     with pytest.raises(ValueError, match=rf"{name} is 'telepathy', expected one of \w+, "):
         config(**{name: "telepathy"})
@@ -32,20 +32,19 @@ def test_an_unknown_choice_is_named_with_the_known_ones(name: str):
 LABELS = {"bowl": 1, "wine bottle": 4}
 
 
+def masks(**options: Any) -> dict[str, Any]:
+    return {"segmentation": SegmentationConfig(**options)}
+
+
 @pytest.mark.parametrize(
     ("options", "words"),
     [
-        ({"shape": "box"}, "shape is 'box', but without a segmenter.*segmentation=sam3"),
-        ({"sam3d_python": "python"}, "are for shape 'sam3d', got 'demonstrations'"),
-        ({"segmentation": "sam3", "perception": "oracle"}, "'sam3', but perception=oracle"),
-        ({"segmentation": "given"}, "mask_labels is None.*--policy.mask_labels='"),
-        ({"segmentation": "sam3", "mask_labels": LABELS}, "'sam3', mask_labels is {'bowl'"),
-        ({"mask_labels": LABELS}, "'demonstrations', mask_labels is {'bowl'"),
-        (
-            {"segmentation": "given", "mask_labels": {"bowl": 0}},
-            r"mask_labels\['bowl'\] is 0, expected .* 1 on",
-        ),
-        ({"segmentation": "given", "mask_labels": {"bowl": True}}, r"mask_labels\['bowl'\] is True"),
+        (masks(shape="box"), "shape is 'box', but perception 'demonstrations' has no masks.*perception=sam3"),
+        ({"perception": "oracle", **masks(shape="box")}, "'box', but perception 'oracle' has no masks"),
+        ({"perception": "given"}, "segmentation.labels is None.*--policy.segmentation.labels='"),
+        ({"perception": "sam3", **masks(labels=LABELS)}, "'sam3', segmentation.labels is {'bowl'"),
+        (masks(labels=LABELS), "'demonstrations', segmentation.labels is {'bowl'"),
+        (masks(weights=["one"]), "are for perception sam3 and grounded_sam2, got 'demonstrations'"),
     ],
 )
 def test_options_that_make_no_sense_together_are_refused(options: dict[str, Any], words: str):
@@ -53,15 +52,60 @@ def test_options_that_make_no_sense_together_are_refused(options: dict[str, Any]
         config(**options)
 
 
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({"shape": "telepathy"}, "segmentation.shape is 'telepathy', expected one of demonstrations, box"),
+        ({"sam3d_python": "python"}, "are for shape 'sam3d', got 'demonstrations'"),
+        ({"labels": {"bowl": 0}}, r"segmentation.labels\['bowl'\] is 0, expected .* 1 on"),
+        ({"labels": {"bowl": True}}, r"segmentation.labels\['bowl'\] is True"),
+    ],
+)
+def test_options_of_a_segmenter_are_checked(options: dict[str, Any], words: str):
+    with pytest.raises(ValueError, match=words):
+        SegmentationConfig(**options)
+
+
 @pytest.mark.parametrize("shape", ["demonstrations", "box"])
 def test_a_segmenter_goes_with_either_shape(shape: str):
-    assert config(segmentation="given", mask_labels=LABELS, shape=shape).mask_labels == LABELS
-    assert config(segmentation="grounded_sam2", shape=shape).shape == shape
+    assert config(perception="given", **masks(labels=LABELS, shape=shape)).segmentation.shape == shape
+    assert config(perception="grounded_sam2", **masks(shape=shape)).segmentation.shape == shape
 
 
-def test_labels_are_read_from_a_command_line():
-    options = ["--policy.segmentation=given", '--policy.mask_labels={"bowl": 1, "wine bottle": 4}']
-    assert draccus.parse(MineConfig, args=options).policy.mask_labels == LABELS
+def test_nested_options_are_read_from_a_command_line(capsys: pytest.CaptureFixture[str]):
+    options = [
+        "--policy.perception=given",
+        '--policy.segmentation.labels={"bowl": 1, "wine bottle": 4}',
+        "--policy.judge.type=openai",
+        "--policy.judge.model_id=tiny-vl",
+    ]
+    policy = draccus.parse(MineConfig, args=options).policy
+    assert policy.segmentation == SegmentationConfig(labels=LABELS)
+    assert policy.judge == JudgeConfig("openai", model_id="tiny-vl")
+    with pytest.raises(SystemExit):
+        draccus.parse(MineConfig, args=["--policy.judge.type=telepathy"])
+    assert "judge.type: invalid choice: 'telepathy' (choose from 'none', 'openai'" in capsys.readouterr().err
+
+
+def test_a_configuration_is_saved_and_read_as_it_is(tmp_path: Path):
+    """Through LeRobot's config.json, and its command line on top, with options that are not given."""
+    saved = config(
+        perception="given", **masks(labels=LABELS, shape="box"), memory_episodes=[0, 2],
+        judge=JudgeConfig("openai", "http://localhost:8000/v1", "tiny-vl"), state_layout=["x", "y", "z"],
+    )  # fmt: skip
+    saved.save_pretrained(tmp_path)
+    assert PreTrainedConfig.from_pretrained(tmp_path) == saved
+    options = ["--judge.confidence=0.9", "--segmentation.labels=null", "--perception=sam3"]
+    changed = PreTrainedConfig.from_pretrained(tmp_path, cli_overrides=options)
+    assert isinstance(changed, OpenSPMConfig)
+    assert changed.judge == replace(saved.judge, confidence=0.9)
+    assert (changed.perception, changed.segmentation) == ("sam3", SegmentationConfig(shape="box"))
+    assert changed.memory_episodes == [0, 2]
+
+
+def test_lerobots_factory_makes_it_by_name():
+    made = make_policy_config("openspm", device="cpu", execution="open_loop", push_to_hub=False)
+    assert made == config(execution="open_loop")
 
 
 @pytest.mark.parametrize("steps", [0, -1, 6])
@@ -70,19 +114,14 @@ def test_no_more_actions_are_executed_than_a_chunk_has(steps: int):
         config(n_action_steps=steps)
 
 
-@pytest.mark.parametrize(
-    "name",
-    ["hidden_dim", "num_inference_steps", "samples_per_frame", "residual_m", "passing_rad", "max_jump_m"],
-)
-@pytest.mark.parametrize("value", [0, -1])
-def test_what_must_be_positive_is(name: str, value: int):
+@pytest.mark.parametrize("name", ["num_inference_steps", "samples_per_frame", "hand_radius_m", "control_hz"])
+@pytest.mark.parametrize("value", [0, -1, float("nan")])
+def test_what_must_be_positive_is(name: str, value: float):
     with pytest.raises(ValueError, match=f"{name} is {value}, expected more than 0"):
         config(**{name: value})
 
 
-@pytest.mark.parametrize(
-    "name", ["perturbation_m", "max_corrections", "max_attempts", "reach_margin_m", "weight_geometric"]
-)
+@pytest.mark.parametrize("name", ["noise_seed", "reach_margin_m", "min_clearance_m"])
 def test_what_must_not_be_negative_is_not(name: str):
     assert getattr(config(**{name: 0}), name) == 0
     with pytest.raises(ValueError, match=f"{name} is -1, expected 0 or more"):
@@ -159,8 +198,3 @@ def test_every_way_of_writing_a_rotation_gives_the_same_hand(kind: str):
     np.testing.assert_allclose(
         np.delete(decoded, [3, 4, 5], axis=1) if kind == "none" else decoded, kept, atol=1e-9
     )
-
-
-def test_numbers_that_are_not_finite_are_refused():
-    with pytest.raises(ValueError, match="residual_m"):
-        config(residual_m=float("nan"))

@@ -12,6 +12,7 @@ from lerobot.utils.feature_utils import dataset_to_policy_features
 from tests.policy.conftest import Frame, act
 from tests.policy.lerobot_commands import CALIBRATION
 
+from lerobot_openspm import training
 from lerobot_openspm.configuration_openspm import OpenSPMConfig
 from lerobot_openspm.errors import DatasetError, MemoryFormatError
 from lerobot_openspm.flow.training_set import TrainingSet
@@ -168,8 +169,8 @@ def test_held_out_episodes_are_neither_remembered_nor_drawn(
     assert sorted(e.source for e in policy.memory.entries) == [f"{tiny_meta.repo_id}#{i}" for i in kept]
 
     # Unperturbed, every sample is known by its numbers.
-    plain = {"perturbation_m": 0.0, "perturbation_rad": 0.0}
-    samples = samples_of(tiny_meta, new_config(tiny_meta, memory_episodes=kept, **plain))
+    monkeypatch.setattr(training, "PERTURBED_COPIES", 0)
+    samples = samples_of(tiny_meta, new_config(tiny_meta, memory_episodes=kept))
     starts, ends = tiny_meta.episodes["dataset_from_index"], tiny_meta.episodes["dataset_to_index"]
     held_out, remembered = (
         torch.cat([torch.arange(starts[i], ends[i]) for i in indices]) for indices in ((2, 3), kept)
@@ -216,7 +217,7 @@ def test_fine_tuning_updates_the_memory_as_asked(
     assert torch.isfinite(loss)
     if BOWL not in expected:
         act(tuned, recorded[:1])
-        assert PUSH in tuned.episodes[0].controller.refusal
+        assert PUSH in tuned.episodes[0].controller.state.refusal
         return
     # What was known before is still found, and acts as before.
     assert torch.equal(act(tuned, recorded), act(load(), recorded))
@@ -246,10 +247,8 @@ def test_the_perceptions_are_not_mixed(load: Callable[..., OpenSPMPolicy]):
         MemoryFormatError, match=r"perception=demonstrations, got --policy\.perception=oracle"
     ):
         load(perception="oracle")
-    with pytest.raises(
-        MemoryFormatError, match=r"segmentation=demonstrations, got --policy\.segmentation=sam3"
-    ):
-        load(segmentation="sam3")
+    with pytest.raises(MemoryFormatError, match=r"perception=demonstrations, got --policy\.perception=sam3"):
+        load(perception="sam3")
 
 
 def test_a_loaded_policy_cannot_be_trained_without_a_dataset(policy: OpenSPMPolicy):

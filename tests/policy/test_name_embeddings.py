@@ -27,11 +27,11 @@ def test_a_name_that_only_embeddings_know_is_acted_on(
     batch = asked(recorded, "put the bowl on the plate", "put the zorb on the plate")
     without = load()
     without.select_action(batch)
-    assert "no memory" in without.episodes[0].controller.refusal
+    assert "no memory" in without.episodes[0].controller.state.refusal
     policy = load(name_embeddings=str(model))
     action = policy.select_action(batch)
     assert torch.isfinite(action).all()
-    assert policy.episodes[0].controller.planner.ranked[0].entry.language == "put the bowl on the plate"
+    assert policy.episodes[0].controller.state.ranked[0].entry.language == "put the bowl on the plate"
     # The folder exists on this machine alone, so that it does not travel with the checkpoint.
     policy.save_pretrained(tmp_path / "saved")
     assert OpenSPMConfig.from_pretrained(tmp_path / "saved").name_embeddings is None

@@ -6,9 +6,9 @@ import torch
 from lerobot.envs.utils import preprocess_observation
 
 from lerobot_openspm.configuration_openspm import OpenSPMConfig
-from lerobot_openspm.envs.calibration import calibration_document
 from lerobot_openspm.envs.tabletop import scene
 from lerobot_openspm.envs.tabletop.configuration import TabletopEnvConfig
+from lerobot_openspm.envs.tabletop.recording import Tabletop
 from lerobot_openspm.errors import ObservationError
 from lerobot_openspm.geometry.camera import cameras_from_dict
 from lerobot_openspm.geometry.vector_layout import parse_layout
@@ -17,7 +17,7 @@ from lerobot_openspm.perception.segmentation.given import GivenSegmenter
 from lerobot_openspm.processor_openspm import make_openspm_pre_post_processors
 
 SIZE = 128
-CAMERAS = cameras_from_dict(calibration_document(SIZE, SIZE), "tabletop")
+CAMERAS = cameras_from_dict(Tabletop().calibration(SIZE, SIZE), "tabletop")
 LAYOUT = parse_layout(
     ("x", "y", "z", "axis_angle_x", "axis_angle_y", "axis_angle_z", "finger_left", "finger_right"), "state"
 )

@@ -6,9 +6,9 @@ from pathlib import Path
 import pytest
 from tests.policy.conftest import Frame, batch_of
 
-from lerobot_openspm.control.status import Status
+from lerobot_openspm.control.state import Status
 from lerobot_openspm.errors import OpenSPMError
-from lerobot_openspm.memory.memory import read_memory
+from lerobot_openspm.memory.io import read_memory
 from lerobot_openspm.modeling_openspm import OpenSPMPolicy
 
 
@@ -21,7 +21,7 @@ def test_outcomes_change_the_entries_that_were_acted_by_and_are_saved(
     policy: OpenSPMPolicy, recorded: list[list[Frame]], tmp_path: Path
 ):
     policy.select_action(batch_of([recorded[0][0], recorded[3][0], recorded[4][0]]))
-    used = [one.controller.planner.used for one in policy.episodes]
+    used = [one.controller.state.used for one in policy.episodes]
     assert [len(entries) for entries in used] == [1, 1, 1]
     bowl, stove = used[0][0], used[1][0]
     policy.report_outcomes([False, True, None])
@@ -49,10 +49,10 @@ def test_without_a_word_from_outside_what_the_policy_saw_itself_counts(
     assert policy.outcomes == [None, None, None]
     policy.report_outcomes()
     assert trials(policy) == {}
-    seen, missed = (policy.episodes[i].controller.planner.used[0].source for i in (0, 1))
+    seen, missed = (policy.episodes[i].controller.state.used[0].source for i in (0, 1))
     for episode, verdict in zip(policy.episodes[:2], (True, False), strict=True):
         episode.controller.executor.stop(Status.DONE)
-        episode.controller._progress.verdict = verdict
+        episode.controller.state.verdict = verdict
     assert policy.outcomes == [True, False, None]
     policy.report_outcomes()
     assert trials(policy) == {seen: (1, 1), missed: (1, 0)}
@@ -64,7 +64,7 @@ def test_the_next_episodes_choose_by_what_was_learned(policy: OpenSPMPolicy, rec
     for _ in range(12):
         policy.reset()
         policy.select_action(frame)
-        chosen.append(policy.episodes[0].controller.planner.used[0].source)
+        chosen.append(policy.episodes[0].controller.state.used[0].source)
         policy.report_outcomes([False])
     # What goes on failing is left for another demonstration of the same task.
     assert len(set(chosen)) > 1
@@ -83,3 +83,15 @@ def test_outcomes_of_episodes_that_do_not_run_are_refused(
     policy.reset()
     policy.report_outcomes([])
     assert trials(policy) == {}
+
+
+def test_a_failure_counts_for_the_part_that_failed_and_not_for_the_one_that_was_seen_to_be_done(
+    policy: OpenSPMPolicy, recorded: list[list[Frame]]
+):
+    policy.select_action(batch_of([recorded[0][0], recorded[3][0]]))
+    done, failed = (policy.episodes[i].controller.state for i in (0, 1))
+    done.parts, done.used = done.parts + failed.parts, done.used + failed.used
+    done.begin_next_part()
+    done.verdicts = (True,)
+    policy.report_outcomes([False, None])
+    assert trials(policy) == {done.used[0].source: (1, 1), done.used[1].source: (1, 0)}

@@ -82,7 +82,7 @@ def config(calibration: Path, **changes: Any) -> OpenSPMConfig:
     return OpenSPMConfig(device="cpu", push_to_hub=False, cameras=str(calibration), **changes)
 
 
-PUBLIC_ROTATION = {"state_rotation": "axis_angle", "action_rotation": "axis_angle"}
+PUBLIC_ROTATION = {"rotation": "axis_angle"}
 
 
 def told(entry: MemoryEntry) -> list[tuple[Any, ...]]:

@@ -9,7 +9,7 @@ from lerobot.configs import parser
 from lerobot.configs.eval import EvalPipelineConfig
 from lerobot.configs.train import TrainPipelineConfig
 
-from lerobot_openspm.configuration_openspm import OpenSPMConfig
+from lerobot_openspm.configuration_openspm import OpenSPMConfig, SegmentationConfig
 
 CONFIGS = Path(__file__).parents[2] / "configs"
 
@@ -28,15 +28,20 @@ def read(monkeypatch: pytest.MonkeyPatch, kind: type, name: str, *options: str) 
 @pytest.mark.parametrize("robot", ["tabletop", "libero"])
 def test_training(robot: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
     name = f"openspm_{robot}_train.yaml"
-    config = read(monkeypatch, TrainPipelineConfig, name, f"--output_dir={tmp_path}/run")
+    nested = "--policy.judge.type=annotations"
+    config = read(monkeypatch, TrainPipelineConfig, name, f"--output_dir={tmp_path}/run", nested)
     assert isinstance(config.policy, OpenSPMConfig)
+    assert config.policy.judge.type == "annotations"
     assert config.policy.push_to_hub is False
     assert (CONFIGS.parent / str(config.policy.cameras)).is_file()
     assert config.policy.control_hz == (20 if robot == "libero" else None)
 
 
 def test_evaluation(monkeypatch: pytest.MonkeyPatch, checkpoint: Path):
-    config = read(monkeypatch, EvalPipelineConfig, "openspm_libero_eval.yaml", f"--policy.path={checkpoint}")
+    options = ("--policy.perception=given", '--policy.segmentation.labels={"bowl": 3}')
+    path = f"--policy.path={checkpoint}"
+    config = read(monkeypatch, EvalPipelineConfig, "openspm_libero_eval.yaml", path, *options)
     assert (config.env.type, config.env.task) == ("libero", "libero_goal")
     assert (config.eval.n_episodes, config.eval.batch_size, config.seed) == (50, 1, 1000)
     assert isinstance(config.policy, OpenSPMConfig)
+    assert config.policy.segmentation == SegmentationConfig(labels={"bowl": 3})

@@ -7,8 +7,8 @@ import pytest
 from tests.policy.lerobot_commands import REPOSITORY
 
 from lerobot_openspm.cli import pipeline
-from lerobot_openspm.cli.collect import CollectConfig, SimulatorConfig, collect
 from lerobot_openspm.configuration_openspm import OpenSPMConfig
+from lerobot_openspm.envs.collection import CollectConfig, SimulatorConfig, collect
 from lerobot_openspm.envs.seeds import TUNING_SEED_START
 
 # Something carried, and something turned. Nobody is tuned on these seeds.
@@ -31,7 +31,7 @@ def test_the_default_perception_and_a_trained_flow_model_solve_episodes(
     checkpoint, _ = pipeline.train(root, tmp_path / "train")
     config = OpenSPMConfig.from_pretrained(checkpoint)
     defaults = OpenSPMConfig()
-    assert (config.perception, config.segmentation, config.shape) == ("demonstrations",) * 3
+    assert (config.perception, config.segmentation.shape) == ("demonstrations",) * 2
     assert (config.execution, config.tracking) == (defaults.execution, defaults.tracking)
     training = json.loads((checkpoint / "train_config.json").read_text())
     assert training["steps"] == 3000

@@ -31,7 +31,7 @@ def test_a_running_policy_can_be_taught(
 ):
     running, asked = batch_of([recorded[0][0]]), batch_of([recorded[0][0] | {"task": PUSH}])
     policy.select_action(asked)
-    assert "it knows" in policy.episodes[0].controller.refusal
+    assert "it knows" in policy.episodes[0].controller.state.refusal
     policy.select_action(running)
     row, weights = policy.episodes[0].controller, {k: v.clone() for k, v in policy.state_dict().items()}
     lesson = policy.teach(push_meta, [0])
@@ -130,8 +130,8 @@ def test_any_wording_is_taught_and_acted_on(
     for said in (told, asked):
         policy.reset()
         policy.select_action(batch_of([{**frame, "task": said}, frame]))
-        assert [one.controller.status.value for one in policy.episodes] == ["running", "running"]
-        assert [one.controller.planner.ranked[0].entry.language for one in policy.episodes] == [
+        assert [one.controller.state.status.value for one in policy.episodes] == ["running", "running"]
+        assert [one.controller.state.ranked[0].entry.language for one in policy.episodes] == [
             told,
             frame["task"],
         ]

@@ -1,1 +1,1 @@
-"""Measurements behind ``openspm bench``. They see the simulator's truth; the policy they measure does not."""
+"""What users measure on their own checkpoint, dataset and machine: ``openspm bench``."""

@@ -1,4 +1,4 @@
-"""Bundle adjustment of one camera and many features (Gauss-Newton with the features eliminated)."""
+"""Bundle adjustment of one camera and many features, by SciPy's sparse least squares."""
 
 from __future__ import annotations
 
@@ -7,6 +7,8 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.optimize import least_squares
+from scipy.sparse import csr_array
 
 from lerobot_openspm.calibration.observations import Observations, sums
 from lerobot_openspm.geometry import se3
@@ -14,8 +16,9 @@ from lerobot_openspm.geometry.camera import Camera
 from lerobot_openspm.geometry.se3 import Array
 
 NEAR_M = 1e-3
-# How far a feature may be from the body's origin, as a standard deviation: keeps equations solvable, no more.
+# Standard deviation of a feature's distance from the body's origin: wide, it only keeps equations solvable.
 PRIOR_M = 10.0
+MAX_EVALUATIONS = 20
 
 
 @dataclass(frozen=True)
@@ -46,47 +49,24 @@ class Problem:
         """Feature of each place ``(m,)``."""
         return self.feature[self.observations.track]
 
+    def residuals(self, camera: Camera, points: Array) -> Array:
+        """Residuals ``(m, 2)`` in pixels of features ``(n, 3)``."""
+        seen = self.observations
+        return residuals(camera, points[self.feature_of_place], seen.T_mount_body, seen.uv)[0]
 
-@dataclass(frozen=True)
-class Normal:
-    """Normal equations with the features apart, for 6 or 7 numbers of the camera.
-
-    Attributes:
-        camera: Information ``(features, k, k)`` that each feature brings about the camera.
-        features: Information ``(features, 3, 3)`` about each feature.
-        cross: Both ``(features, k, 3)``.
-        camera_gradient: Right-hand side ``(features, k)`` that each feature brings.
-        feature_gradient: Right-hand side ``(features, 3)``.
-    """
-
-    camera: Array
-    features: Array
-    cross: Array
-    camera_gradient: Array
-    feature_gradient: Array
-
-    def reduced(self, damping: float = 0.0) -> tuple[Array, Array]:
-        """Information ``(features, k, k)`` and right-hand side about the camera, the features eliminated."""
-        eliminate = self.cross @ np.linalg.inv(damped(self.features, damping))
-        information = self.camera - eliminate @ np.swapaxes(self.cross, 1, 2)
-        gradient = self.camera_gradient - (eliminate @ self.feature_gradient[..., None])[..., 0]
-        return information, gradient
-
-
-def damped(matrices: Array, damping: float) -> Array:
-    """Matrices ``(..., k, k)`` with their diagonals enlarged."""
-    return matrices * (1 + damping * np.eye(matrices.shape[-1]))
-
-
-def points_in_camera(camera: Camera, points: Array, T_mount_body: Array) -> Array:
-    """Points ``(m, 3)`` of the body in the camera's frame, each at its own time."""
-    in_mount = (T_mount_body[:, :3, :3] @ points[..., None])[..., 0] + T_mount_body[:, :3, 3]
-    return (in_mount - camera.T_mount_cam[:3, 3]) @ camera.T_mount_cam[:3, :3]
+    def robust_weights(self, r: Array) -> Array:
+        """Weights ``(m,)`` of places with residuals ``(m, 2)``: the loss lowers those of large residuals."""
+        return self.weights[self.observations.track] / np.sqrt(1 + (r**2).sum(axis=1) / self.scale_px**2)
 
 
 def residuals(camera: Camera, points: Array, T_mount_body: Array, uv: Array) -> tuple[Array, Array]:
-    """Residuals ``(m, 2)`` in pixels of points ``(m, 3)``, and these in the camera's frame."""
-    p_cam = points_in_camera(camera, points, T_mount_body)
+    """Residuals ``(m, 2)`` in pixels of points ``(m, 3)`` of the body, each seen at its own time.
+
+    Returns:
+        The residuals, and the points in the camera's frame ``(m, 3)``.
+    """
+    in_mount = (T_mount_body[:, :3, :3] @ points[..., None])[..., 0] + T_mount_body[:, :3, 3]
+    p_cam = (in_mount - camera.T_mount_cam[:3, 3]) @ camera.T_mount_cam[:3, :3]
     depth = np.maximum(p_cam[:, 2:], NEAR_M)
     seen = p_cam[:, :2] / depth * np.array([camera.fx, camera.fy]) + np.array([camera.cx, camera.cy])
     return seen - uv, p_cam
@@ -112,10 +92,20 @@ def triangulate(camera: Camera, observations: Observations, feature: NDArray[Any
     return np.asarray(np.linalg.solve(information, sums(index, Atb, n)[..., None])[..., 0], float)
 
 
-def normal_equations(camera: Camera, points: Array, problem: Problem) -> Normal:
-    """Linearise at a camera and at features ``(n, 3)``; the camera turns and moves in its mount's axes."""
-    seen, feature = problem.observations, problem.feature_of_place
-    r, p_cam = residuals(camera, points[feature], seen.T_mount_body, seen.uv)
+def linearise(camera: Camera, points: Array, problem: Problem) -> tuple[Array, Array, Array]:
+    """Residuals and their derivatives.
+
+    Args:
+        camera: The camera.
+        points: Features ``(n, 3)``.
+        problem: What is adjusted.
+
+    Returns:
+        Residuals ``(m, 2)``; their derivatives ``(m, 2, k)`` by the camera's turn and displacement in its
+        mount's axes and, if it is free, by the focal length's logarithm; and ``(m, 2, 3)`` by the feature.
+    """
+    seen = problem.observations
+    r, p_cam = residuals(camera, points[problem.feature_of_place], seen.T_mount_body, seen.uv)
     depth, focal = np.maximum(p_cam[:, 2], NEAR_M), np.array([camera.fx, camera.fy])
     by_p_cam = np.zeros((len(r), 2, 3))
     by_p_cam[:, [0, 1], [0, 1]] = focal / depth[:, None]
@@ -123,22 +113,42 @@ def normal_equations(camera: Camera, points: Array, problem: Problem) -> Normal:
     by_mount = by_p_cam @ camera.T_mount_cam[:3, :3].T
     # A turn w of the camera moves a point at d from it by -w x d, seen from the camera.
     d = p_cam @ camera.T_mount_cam[:3, :3].T
-    parts = [np.cross(by_mount, d[:, None]), -by_mount]
+    by_camera = [np.asarray(np.cross(by_mount, d[:, None]), float), -by_mount]
     if problem.free_focal:
-        parts.append((p_cam[:, :2] / depth[:, None] * focal)[:, :, None])
-    by_camera, by_point = np.concatenate(parts, axis=2), by_mount @ seen.T_mount_body[:, :3, :3]
-    weight = problem.weights[seen.track] / np.sqrt(1 + (r**2).sum(axis=1) / problem.scale_px**2)
-    weighted_camera = np.swapaxes(weight[:, None, None] * by_camera, 1, 2)
-    weighted_point = np.swapaxes(weight[:, None, None] * by_point, 1, 2)
-    n, r = problem.n_features, r[..., None]
-    prior = (problem.scale_px / PRIOR_M) ** 2
-    return Normal(
-        camera=sums(feature, weighted_camera @ by_camera, n),
-        features=sums(feature, weighted_point @ by_point, n) + prior * np.eye(3),
-        cross=sums(feature, weighted_camera @ by_point, n),
-        camera_gradient=-sums(feature, (weighted_camera @ r)[..., 0], n),
-        feature_gradient=-sums(feature, (weighted_point @ r)[..., 0], n) - prior * points,
-    )
+        by_camera.append((p_cam[:, :2] / depth[:, None] * focal)[:, :, None])
+    return r, np.concatenate(by_camera, axis=2), by_mount @ seen.T_mount_body[:, :3, :3]
+
+
+@dataclass(frozen=True)
+class Information:
+    """The linearised problem at a camera and features, with the features eliminated (Schur complement).
+
+    Attributes:
+        residuals: Weighted residuals ``(m, 2)``.
+        by_camera: Their derivatives ``(m, 2, k)`` by the camera, given that every feature moves to where it
+            fits the moved camera best.
+        features: Information matrices ``(n, 3, 3)`` of the features for a given camera.
+    """
+
+    residuals: Array
+    by_camera: Array
+    features: Array
+
+
+def information(camera: Camera, points: Array, problem: Problem) -> Information:
+    """Linearise at a camera and features ``(n, 3)``, and eliminate the features."""
+    r, by_camera, by_point = linearise(camera, points, problem)
+    root, feature, n = np.sqrt(problem.robust_weights(r)), problem.feature_of_place, problem.n_features
+    by_camera, by_point = root[:, None, None] * by_camera, root[:, None, None] * by_point
+    to_point = np.swapaxes(by_point, 1, 2)
+    features = sums(feature, to_point @ by_point, n) + (problem.scale_px / PRIOR_M) ** 2 * np.eye(3)
+    follows = np.linalg.solve(features, sums(feature, to_point @ by_camera, n))
+    return Information(root[:, None] * r, by_camera - by_point @ follows[feature], features)
+
+
+def positive(matrix: Array) -> Array:
+    """An information matrix with a floor, so that it can be inverted where a direction is unknown."""
+    return matrix + 1e-12 * np.trace(matrix) * np.eye(len(matrix))
 
 
 def moved(camera: Camera, step: Array) -> Camera:
@@ -150,48 +160,53 @@ def moved(camera: Camera, step: Array) -> Camera:
     return replace(camera, T_mount_cam=T, fx=camera.fx * grown, fy=camera.fy * grown)
 
 
-def adjust(camera: Camera, points: Array, problem: Problem, iterations: int = 20) -> tuple[Camera, Array]:
-    """Minimise the robust sum of residuals over the camera and the features (Levenberg-Marquardt).
+def adjust(camera: Camera, points: Array, problem: Problem) -> tuple[Camera, Array]:
+    """Minimise the robust sum of residuals over the camera and the features.
 
     Args:
         camera: Where to begin.
         points: Features ``(n, 3)`` in the body to begin with.
         problem: What is adjusted to what.
-        iterations: At most so many steps.
 
     Returns:
         The camera and the features.
     """
-    damping, cost = 1e-4, _cost(camera, points, problem)
-    for _ in range(iterations):
-        normal = normal_equations(camera, points, problem)
-        for _attempt in range(10):
-            step, point_steps = _step(normal, damping)
-            trial, trial_points = moved(camera, step), points + point_steps
-            trial_cost = _cost(trial, trial_points, problem)
-            if trial_cost <= cost:
-                break
-            damping *= 8
-        else:
-            return camera, points
-        gain, camera, points, cost = cost - trial_cost, trial, trial_points, trial_cost
-        damping = max(damping / 8, 1e-9)
-        if gain < 1e-6 * cost:
-            break
-    return camera, points
+    start, scale, feature = information(camera, points, problem), problem.scale_px, problem.feature_of_place
+    # Unknowns are scaled to unit standard deviation: SciPy's iterative solver (LSMR) then needs few steps.
+    about_camera = np.einsum("mij,mik->jk", start.by_camera, start.by_camera)
+    camera_unit = scale * np.linalg.inv(np.linalg.cholesky(positive(about_camera))).T
+    point_unit = scale * np.swapaxes(np.linalg.inv(np.linalg.cholesky(start.features)), 1, 2)
+    k, m = len(camera_unit), len(feature)
+    of_camera = np.broadcast_to(np.arange(k), (m, 2, k))
+    of_point = np.broadcast_to((k + 3 * feature[:, None] + np.arange(3))[:, None], (m, 2, 3))
+    columns = np.concatenate([of_camera, of_point], axis=2).ravel()
+    ends = (k + 3) * np.arange(2 * m + 1)
 
+    def at(x: Array) -> tuple[Camera, Array]:
+        return moved(camera, camera_unit @ x[:k]), points + (point_unit @ x[k:].reshape(-1, 3, 1))[..., 0]
 
-def _step(normal: Normal, damping: float) -> tuple[Array, Array]:
-    information, gradient = normal.reduced(damping)
-    total = information.sum(axis=0) + damping * np.diag(np.diag(normal.camera.sum(axis=0)))
-    step = np.linalg.solve(total, gradient.sum(axis=0))
-    left = normal.feature_gradient - np.swapaxes(normal.cross, 1, 2) @ step
-    return step, np.linalg.solve(damped(normal.features, damping), left[..., None])[..., 0]
+    def errors(x: Array) -> Array:
+        return problem.residuals(*at(x)).ravel() / scale
 
+    def jacobian(x: Array) -> csr_array:
+        # Derivatives by a turn added to the present one, while the unknown is the turn from the start. The
+        # two differ by an invertible matrix, so the minimum is the same.
+        _, by_camera, by_point = linearise(*at(x), problem)
+        values = np.concatenate([by_camera @ camera_unit, by_point @ point_unit[feature]], axis=2)
+        return csr_array((values.ravel() / scale, columns, ends), shape=(2 * m, len(x)))
 
-def _cost(camera: Camera, points: Array, problem: Problem) -> float:
-    seen = problem.observations
-    r, _ = residuals(camera, points[problem.feature_of_place], seen.T_mount_body, seen.uv)
-    loss = 2 * problem.scale_px**2 * (np.sqrt(1 + (r**2).sum(axis=1) / problem.scale_px**2) - 1)
-    prior = (problem.scale_px * points / PRIOR_M) ** 2
-    return float((problem.weights[seen.track] * loss).sum() + prior.sum())
+    def loss(squares: Array) -> Array:
+        """Pseudo-Huber loss of the length of a place's residual, shared by its two coordinates."""
+        root = np.sqrt(1 + squares.reshape(-1, 2).sum(axis=1))
+        weight = problem.weights[problem.observations.track]
+        return np.stack([weight * (root - 1), weight / root, np.zeros(m)]).repeat(2, axis=1)
+
+    found = least_squares(
+        errors,
+        np.zeros(k + points.size),
+        jac=jacobian,  # pyright: ignore[reportArgumentType]
+        loss=loss,  # pyright: ignore[reportArgumentType]
+        ftol=1e-6,
+        max_nfev=MAX_EVALUATIONS,
+    )
+    return at(found.x)

@@ -9,7 +9,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lerobot_openspm.calibration.adjust import residuals
 from lerobot_openspm.calibration.initial import first_estimate, moving
 from lerobot_openspm.calibration.observations import Mount, observe
 from lerobot_openspm.calibration.refine import refine, refine_with_shared_features, variances
@@ -81,8 +80,7 @@ def estimate_camera(
     camera = first_estimate(tracks, T_world_ee, blank, free_focal=free_focal, mirrored=mirrored, rng=rng)
     camera, believed = refine(camera, observe(tracks, T_world_ee, mount), free_focal=free_focal)
     camera, points, problem = refine_with_shared_features(camera, believed, free_focal=free_focal)
-    r, _ = residuals(camera, points[problem.feature_of_place], believed.T_mount_body, believed.uv)
-    variance = variances(camera, points, problem)
+    r, variance = problem.residuals(camera, points), variances(camera, points, problem)
     estimate = Estimate(
         camera,
         reprojection_px=float(np.sqrt((r**2).sum(axis=1).mean())),

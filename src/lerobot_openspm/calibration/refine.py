@@ -10,15 +10,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lerobot_openspm.calibration.adjust import (
-    Normal,
     Problem,
     adjust,
-    normal_equations,
+    information,
+    positive,
     residuals,
     triangulate,
 )
 from lerobot_openspm.calibration.initial import possible
-from lerobot_openspm.calibration.observations import Observations
+from lerobot_openspm.calibration.observations import Observations, sums
 from lerobot_openspm.errors import CalibrationError
 from lerobot_openspm.geometry.camera import Camera
 from lerobot_openspm.geometry.se3 import Array
@@ -74,20 +74,16 @@ def refine(camera: Camera, observations: Observations, *, free_focal: bool) -> t
 
 def with_limited_shares(camera: Camera, points: Array, problem: Problem, limit: float) -> Problem:
     """The problem with less weight for features that would decide alone."""
-    information, _ = normal_equations(camera, points, problem).reduced()
-    weight = np.ones(len(information))
+    by_camera = information(camera, points, problem).by_camera
+    brought = sums(problem.feature_of_place, np.swapaxes(by_camera, 1, 2) @ by_camera, problem.n_features)
+    weight = np.ones(len(brought))
     for _ in range(20):
-        whiten = np.linalg.inv(np.linalg.cholesky(_positive((weight[:, None, None] * information).sum(0))))
-        share = weight * np.linalg.norm(whiten @ information @ whiten.T, ord=2, axis=(1, 2))
+        whiten = np.linalg.inv(np.linalg.cholesky(positive((weight[:, None, None] * brought).sum(0))))
+        share = weight * np.linalg.norm(whiten @ brought @ whiten.T, ord=2, axis=(1, 2))
         if share.max() <= 1.2 * limit:
             break
         weight *= np.minimum(1, limit / np.maximum(share, 1e-12))
     return replace(problem, weights=problem.weights * weight[problem.feature])
-
-
-def _positive(information: Array) -> Array:
-    """Information with a floor, so that directions of which nothing is known do not break what follows."""
-    return information + 1e-12 * np.trace(information) * np.eye(len(information))
 
 
 def refine_with_shared_features(
@@ -113,10 +109,8 @@ def refine_with_shared_features(
             points = triangulate(camera, observations, feature)
             problem = with_limited_shares(camera, points, problem, MAX_SHARED)
             camera, points = adjust(camera, points, problem)
-            r, _ = residuals(
-                camera, points[problem.feature_of_place], observations.T_mount_body, observations.uv
-            )
-            alone = observations.rms(r) > max(1.5, 500 * size_m) / 256 * camera.height
+            rms = observations.rms(problem.residuals(camera, points))
+            alone = rms > max(1.5, 500 * size_m) / 256 * camera.height
             feature = np.where(alone, feature.max() + 1 + np.arange(n), feature)
             feature = np.unique(feature, return_inverse=True)[1]
         logger.debug("features of %.0f mm: %d of %d tracks", 1e3 * size_m, len(points), n)
@@ -131,16 +125,15 @@ def shared_features(
     Tracks are taken in the order of how exactly their place is known. One joins the nearest feature if their
     distance is within what both leave open.
     """
-    own = np.arange(observations.n_tracks)
-    points = triangulate(camera, observations, own)
-    sigma_px = TRACK_ERROR * camera.height
-    problem = Problem(observations, own, np.ones(len(own)), 10 * camera.height, False)
+    n = observations.n_tracks
+    points = triangulate(camera, observations, np.arange(n))
+    problem = Problem(observations, np.arange(n), np.ones(n), 10 * camera.height, False)
     places = observations.per_track(np.ones(len(observations.track)))
-    information = normal_equations(camera, points, problem).features / sigma_px**2 / places[:, None, None]
-    information = information + 1e-2 * np.eye(3)
-    covariance = np.linalg.inv(information)
-    feature, first = np.full(len(own), -1), []
-    mean, known = np.zeros((len(own), 3)), np.zeros((len(own), 3, 3))
+    own = information(camera, points, problem).features / places[:, None, None]
+    own = own / (TRACK_ERROR * camera.height) ** 2 + 1e-2 * np.eye(3)
+    covariance = np.linalg.inv(own)
+    feature, first = np.full(n, -1), []
+    mean, known = np.zeros((n, 3)), np.zeros((n, 3, 3))
     for i in np.argsort(np.linalg.eigvalsh(covariance)[:, -1]):
         apart = points[i] - mean[: len(first)]
         near = np.linalg.norm(apart, axis=1) < MAX_APART * size_m
@@ -150,11 +143,11 @@ def shared_features(
             chi2 = (apart[near] * np.linalg.solve(spread, apart[near][..., None])[..., 0]).sum(axis=1)
             if chi2.min() < SAME_FEATURE_CHI2:
                 j = feature[i] = near[chi2.argmin()]
-                total = known[j] + information[i]
-                mean[j] = np.linalg.solve(total, known[j] @ mean[j] + information[i] @ points[i])
+                total = known[j] + own[i]
+                mean[j] = np.linalg.solve(total, known[j] @ mean[j] + own[i] @ points[i])
                 known[j] = total
                 continue
-        feature[i], mean[len(first)], known[len(first)] = len(first), points[i], information[i]
+        feature[i], mean[len(first)], known[len(first)] = len(first), points[i], own[i]
         first.append(i)
     return feature
 
@@ -166,19 +159,12 @@ def variances(camera: Camera, points: Array, problem: Problem) -> Array:
     single tracks ask for is spread, and from the residuals. The first holds whatever the errors are like, but
     knows nothing of a direction about which no track says anything.
     """
-    seen, normal = problem.observations, normal_equations(camera, points, problem)
-    inverse = np.linalg.inv(_positive(normal.reduced()[0].sum(axis=0)))
-    spread = inverse @ _gradients(camera, points, problem, normal).T
-    r, _ = residuals(camera, points[problem.feature_of_place], seen.T_mount_body, seen.uv)
+    seen = problem.observations
+    told = information(camera, points, problem)
+    to_camera = np.swapaxes(told.by_camera, 1, 2)
+    inverse = np.linalg.inv(positive((to_camera @ told.by_camera).sum(axis=0)))
+    spread = inverse @ seen.per_track((to_camera @ told.residuals[..., None])[..., 0]).T
+    r = problem.residuals(camera, points)
     alike = problem.weights * seen.per_track(np.ones(len(r)))
     from_residuals = np.diag(inverse) * np.median(r**2) / CHI2_MEDIAN * alike.mean()
     return np.maximum((spread**2).sum(axis=1), from_residuals)
-
-
-def _gradients(camera: Camera, points: Array, problem: Problem, normal: Normal) -> Array:
-    """What each track asks of the camera ``(n_tracks, k)``, its feature eliminated."""
-    seen = problem.observations
-    alone = replace(problem, feature=np.arange(seen.n_tracks))
-    single = normal_equations(camera, points[problem.feature], alone)
-    eliminate = normal.cross @ np.linalg.inv(normal.features)
-    return single.camera_gradient - (eliminate[problem.feature] @ single.feature_gradient[..., None])[..., 0]

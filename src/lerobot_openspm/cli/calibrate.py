@@ -17,12 +17,13 @@ from tqdm import tqdm
 
 from lerobot_openspm.calibration.estimate import Estimate, estimate_camera
 from lerobot_openspm.calibration.tracks import track_features
+from lerobot_openspm.cli.options import EpisodesOption
 from lerobot_openspm.configuration_openspm import OpenSPMConfig
 from lerobot_openspm.errors import CalibrationError
 from lerobot_openspm.files import write_json
 from lerobot_openspm.geometry import se3
 from lerobot_openspm.geometry.camera import Camera, cameras_to_dict, load_cameras
-from lerobot_openspm.mining.dataset import Demonstrations, dataset_metadata
+from lerobot_openspm.mining.dataset import Demonstrations
 from lerobot_openspm.mining.signals import Episode
 from lerobot_openspm.training import open_demonstrations
 
@@ -36,28 +37,24 @@ class CalibrateConfig:
     """Estimate one camera's pose from a LeRobotDataset's images and hand poses.
 
     Args:
-        repo_id: Dataset on the Hub, or the name of a local one.
-        root: Folder of the dataset; LeRobot's cache if not given.
+        dataset: The demonstrations; if no episodes are chosen ten are used, of as many tasks as possible.
         camera: Key of the camera in the dataset.
         mount: What carries the camera: "world" where it stands still, "ee" where the hand carries it.
         fov_deg: Vertical field of view in degrees; estimated if not given, which is less exact.
         mirrored: Whether images are mirrored left to right; found if not given.
-        episodes: Episodes to use; ten if not given, as many tasks as possible.
         output: Calibration file to write. Other cameras that it holds are kept.
         truth: Calibration file to compare with; the dataset's ``meta/openspm_cameras.json`` if not given and
             there.
         seed: Seed of the first estimate's random draws.
         policy: Options of the policy that say how to read the state, e.g.
-            ``--policy.state_rotation=axis_angle``.
+            ``--policy.rotation=axis_angle``.
     """
 
-    repo_id: str = "local/openspm_tabletop"
-    root: str | None = None
+    dataset: EpisodesOption = field(default_factory=EpisodesOption)
     camera: str = "observation.images.front"
     mount: str = "world"
     fov_deg: float | None = None
     mirrored: bool | None = None
-    episodes: list[int] | None = None
     output: str = "outputs/cameras.json"
     truth: str | None = None
     seed: int = 0
@@ -76,10 +73,10 @@ def main(args: list[str]) -> None:
     config = draccus.parse(CalibrateConfig, args=args)
     known = load_cameras(Path(config.output)) if Path(config.output).exists() else {}
     truth = _truth(config)
-    meta = dataset_metadata(config.repo_id, config.root)
+    meta = config.dataset.metadata()
     demonstrations = open_demonstrations(meta, config.policy)
-    episodes = demonstrations.episodes(config.episodes)
-    chosen = episodes if config.episodes is not None else choose_episodes(episodes, EPISODES)
+    episodes = demonstrations.episodes(config.dataset.episodes)
+    chosen = episodes if config.dataset.episodes is not None else choose_episodes(episodes, EPISODES)
     estimate = calibrate(demonstrations, chosen, config)
     _log(estimate)
     Path(config.output).parent.mkdir(parents=True, exist_ok=True)
@@ -135,8 +132,8 @@ def calibrate(
 
 def _truth(config: CalibrateConfig) -> Camera | None:
     """The calibration to compare with, if there is one. It enters no estimate."""
-    beside = Path(config.root or "") / "meta" / "openspm_cameras.json"
-    if config.truth is None and (config.root is None or not beside.exists()):
+    beside = Path(config.dataset.root or "") / "meta" / "openspm_cameras.json"
+    if config.truth is None and (config.dataset.root is None or not beside.exists()):
         return None
     path = beside if config.truth is None else Path(config.truth)
     camera = load_cameras(path).get(config.camera)

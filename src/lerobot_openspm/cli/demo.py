@@ -15,18 +15,14 @@ from typing import Any
 import draccus
 import numpy as np
 
-from lerobot_openspm.bench.results import ResultOption, write_result
-from lerobot_openspm.cli.pipeline import THREADS, collect_dataset, evaluate, mean_steps, rate, success, train
+from lerobot_openspm.cli.pipeline import EVALUATION_SEED, collect_dataset, evaluate, mean_steps, rate, train
 from lerobot_openspm.cli.report import write_report
-
-# lerobot-eval's own default; demonstrations are recorded from seeds far away from it.
-EVALUATION_SEED = 1000
 
 logger = logging.getLogger(__name__)
 
 
 @dataclass
-class DemoConfig(ResultOption):
+class DemoConfig:
     """Collect, train, evaluate, and write one page about it. Finished steps are kept and not done again.
 
     Args:
@@ -34,7 +30,6 @@ class DemoConfig(ResultOption):
         episodes: Evaluation episodes a task.
         output: Folder for everything.
         started_at: When the set-up began, in seconds since the epoch; counts towards ``total_s``.
-        result: JSON file for what is printed, with commit, command and machine.
     """
 
     demos: int = 10
@@ -54,7 +49,7 @@ def main(args: list[str]) -> None:
     output = Path(config.output)
     # What is kept from an earlier run is kept by what it was made of.
     run = output / f"demos_{config.demos}"
-    dataset, is_new = run / "dataset", not run.exists()
+    dataset = run / "dataset"
     collected = collect_dataset(dataset, config.demos)
     checkpoint, train_s = train(dataset, run / "train")
     evaluation = run / f"eval_{config.episodes}"
@@ -81,9 +76,4 @@ def main(args: list[str]) -> None:
         "report": str(report),
     }
     summary = {k: None if isinstance(v, float) and np.isnan(v) else v for k, v in summary.items()}
-    if config.result:
-        # A total is only told where nothing was kept from before.
-        timing = {"train_s": summary["train_s"], "total_s": summary["total_s"] if is_new else None}
-        figure = {"seed": EVALUATION_SEED, **success(episodes), **timing, "demonstrations": config.demos}
-        write_result(Path(config.result), figure, THREADS)
     print(json.dumps(summary))

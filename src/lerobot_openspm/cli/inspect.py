@@ -10,7 +10,7 @@ from pathlib import Path
 import draccus
 
 from lerobot_openspm.cli.memory_show import table
-from lerobot_openspm.memory.memory import read_memory
+from lerobot_openspm.memory.io import read_memory
 
 
 @dataclass

@@ -19,9 +19,11 @@ COMMANDS = {
     "teach": ("lerobot_openspm.cli.teach", "teach a checkpoint a task from a few demonstrations"),
     "inspect": ("lerobot_openspm.cli.inspect", "show the memory of a checkpoint"),
     "memory": ("lerobot_openspm.cli.memory", "list, show and change the entries of a memory"),
-    "bench": ("lerobot_openspm.cli.bench", "measure a checkpoint, memory or language"),
+    "bench": ("lerobot_openspm.cli.bench", "measure a checkpoint on this machine"),
     "demo": ("lerobot_openspm.cli.demo", "collect, train, evaluate and write one page about it"),
 }
+# Commands that have commands of their own.
+NESTED = ("memory", "bench")
 
 
 def main() -> None:
@@ -36,10 +38,12 @@ def main() -> None:
         print(f"openspm: unknown command {command!r}; expected one of {', '.join(COMMANDS)}", file=sys.stderr)
         sys.exit(2)
     logging.basicConfig(level=logging.INFO, format="%(levelname)s %(message)s", stream=sys.stderr)
+    subcommand = args[:1] if command in NESTED and not "".join(args[:1]).startswith("-") else []
+    sys.argv[0] = " ".join(["openspm", command, *subcommand])  # what argparse says in its usage
     try:
         importlib.import_module(COMMANDS[command][0]).main(args)
     except (OpenSPMError, ParsingError, FileExistsError, FileNotFoundError, RuntimeError) as error:
-        print(f"openspm {command}: {_reason(error)}", file=sys.stderr)
+        print(f"openspm {command}: {reason(error)}", file=sys.stderr)
         sys.exit(2)
     except KeyboardInterrupt:
         print(f"openspm {command}: interrupted; the same command again goes on from here", file=sys.stderr)
@@ -49,7 +53,7 @@ def main() -> None:
         sys.exit(error.returncode)
 
 
-def _reason(error: BaseException) -> BaseException:
+def reason(error: BaseException) -> BaseException:
     """What a configuration said of its own values, where the parser only says that it could not be made."""
     while isinstance(error, ParsingError) and error.__cause__ is not None:
         error = error.__cause__

@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 import json
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
 from typing import Any
 
 import draccus
 
-from lerobot_openspm.cli.memory_show import check_limit
+from lerobot_openspm.cli.memory import LimitOption
 from lerobot_openspm.errors import OpenSPMError
+from lerobot_openspm.language.lexicon import read_lexicon
 from lerobot_openspm.language.names import TABLE_NAMES, NameSimilarity, names_from
-from lerobot_openspm.memory.memory import read_memory
+from lerobot_openspm.memory.io import read_memory
 from lerobot_openspm.memory.retrieval import ScoreWeights
 from lerobot_openspm.search import Found, Hit, observation_of, search_memory, search_scene
 from lerobot_openspm.types import Reference, SubTask
@@ -27,25 +28,19 @@ class SceneOption:
 
 
 @dataclass
-class SearchConfig:
+class SearchConfig(LimitOption):
     """Show what an instruction finds in a memory: openspm memory search "put the bowl on the plate".
 
-    Args:
-        path: Folder of the checkpoint or of a mined memory; to look at a scene it has to be a checkpoint.
-        limit: Show at most this many entries, of an instruction in several parts for each of them.
-        dataset: The demonstrations or recordings to take the scene from.
-        episode: Number of the episode in it.
-        frame: Number of the frame in the episode.
+    To look at a scene, the path has to be a checkpoint's. Of an instruction in several parts, the limit holds
+    for each of them.
     """
 
-    path: str = "outputs/memory"
-    limit: int = 10
-    dataset: SceneOption = field(default_factory=SceneOption)
-    episode: int | None = None  # the first if not given
-    frame: int | None = None  # the first if not given
+    dataset: SceneOption = field(default_factory=SceneOption)  # to take the scene from
+    episode: int | None = None  # number of the episode in it; the first if not given
+    frame: int | None = None  # number of the frame in the episode; the first if not given
 
     def __post_init__(self) -> None:
-        check_limit(self.limit)
+        super().__post_init__()
         given = [f"--{name}" for name in ("episode", "frame") if getattr(self, name) is not None]
         if given and self.dataset.root is None and self.dataset.repo_id is None:
             raise ValueError(
@@ -72,7 +67,7 @@ def search(args: list[str]) -> None:
 def _search(instruction: str, config: SearchConfig) -> Found:
     if config.dataset.root is None and config.dataset.repo_id is None:
         entries = read_memory(Path(config.path)).entries
-        return search_memory(instruction, entries, *_scoring(config.path))
+        return search_memory(instruction, entries, ScoreWeights(), _names(config.path))
     if config.dataset.root is not None and not (Path(config.dataset.root) / "meta/info.json").is_file():
         raise FileNotFoundError(f"no dataset at --dataset.root={config.dataset.root}")
     from lerobot.datasets import LeRobotDataset
@@ -86,14 +81,14 @@ def _search(instruction: str, config: SearchConfig) -> Found:
     return search_scene(policy, observation_of(policy, dataset, episode, frame, instruction))
 
 
-def _scoring(path: str) -> tuple[ScoreWeights, NameSimilarity]:
-    """The weights and names that a checkpoint was given; a mined memory has none of its own."""
+def _names(path: str) -> NameSimilarity:
+    """The names that a checkpoint was given; a mined memory has none of its own."""
     if not (Path(path) / "config.json").is_file():
-        return ScoreWeights(), TABLE_NAMES
+        return TABLE_NAMES
     from lerobot_openspm.configuration_openspm import OpenSPMConfig
 
     config: Any = OpenSPMConfig.from_pretrained(path)
-    return config.score_weights, names_from(config.name_embeddings)
+    return names_from(config.name_embeddings, read_lexicon(config.lexicon))
 
 
 def _lines(found: Found, limit: int) -> list[str]:
@@ -128,10 +123,11 @@ def _hit(hit: Hit) -> str:
 
 def _sub_task(sub_task: SubTask) -> str:
     """A sub-task as "operation: put, target: bowl, relation: on, landmark: plate"."""
-    said = [(name, value) for name, value in vars(sub_task).items() if value]
+    said = {field.name: getattr(sub_task, field.name) for field in fields(sub_task)}
     return ", ".join(
         f"{name.replace('_', ' ')}: {_reference(value) if isinstance(value, Reference) else value}"
-        for name, value in said
+        for name, value in said.items()
+        if value
     )
 
 

@@ -1,68 +1,53 @@
-"""`openspm memory list | show`: a memory in words and numbers that a person can read."""
+"""`openspm memory list | show | export`: a memory in words and numbers that a person can read."""
 
 from __future__ import annotations
 
 import json
 from collections import defaultdict
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import islice
 from pathlib import Path
 
 import draccus
 import numpy as np
 
+from lerobot_openspm.cli.memory import LimitOption, MemoryOption
 from lerobot_openspm.errors import OpenSPMError
 from lerobot_openspm.geometry import se3
 from lerobot_openspm.memory.entry import MemoryEntry, MemoryKeyPose, Outcome
-from lerobot_openspm.memory.memory import read_memory
+from lerobot_openspm.memory.exchange import write_entries_file
+from lerobot_openspm.memory.io import read_memory, write_memory
 
 
 @dataclass
-class ListConfig:
-    """List what a memory holds.
+class ListConfig(LimitOption):
+    """List what a memory holds."""
 
-    Args:
-        path: Folder of the checkpoint or of a mined memory.
-        instruction: List only entries whose instruction contains this.
-        tasks: List tasks, with the number and mean quality of their entries, instead of entries.
-        all: List superseded entries too: those that were replaced, merged or removed.
-        limit: List at most this many.
-    """
-
-    path: str = "outputs/memory"
-    instruction: str = ""
-    tasks: bool = False
-    all: bool = False
-    limit: int = 50
-
-    def __post_init__(self) -> None:
-        check_limit(self.limit)
+    instruction: str = ""  # list only entries whose instruction contains this
+    tasks: bool = False  # list tasks, with the number and mean quality of their entries, instead of entries
+    all: bool = False  # list superseded entries too: those that were replaced, merged or removed
+    limit: int = 50  # list at most this many
 
 
 @dataclass
-class ShowConfig:
-    """Show entries of a memory with all their numbers.
+class ShowConfig(LimitOption):
+    """Show entries of a memory with all their numbers."""
 
-    Args:
-        path: Folder of the checkpoint or of a mined memory.
-        source: Show only entries that come from this dataset and episode, as ``list`` names them.
-        instruction: Show only entries whose instruction contains this.
-        limit: Show at most this many entries.
+    source: str = ""  # show only entries of this dataset and episode, as ``list`` names them
+    instruction: str = ""  # show only entries whose instruction contains this
+
+
+@dataclass
+class ExportConfig(MemoryOption):
+    """Export entries of a memory; ``openspm memory add --other=OUTPUT`` takes them again.
+
+    An output that ends in ``.json`` is one file to read and edit, for memories that know the same objects.
+    Any other is a folder with a memory of these entries, objects and calibration included.
     """
 
-    path: str = "outputs/memory"
-    source: str = ""
-    instruction: str = ""
-    limit: int = 10
-
-    def __post_init__(self) -> None:
-        check_limit(self.limit)
-
-
-def check_limit(limit: int) -> None:
-    """Raise ValueError where a limit is negative."""
-    if limit < 0:
-        raise ValueError(f"limit is {limit}, expected a number of lines to show, at least 0: --limit=10")
+    output: str = "outputs/entries.json"  # the file or folder to write
+    source: str = ""  # export entries of this dataset and episode, as ``list`` names them
+    instruction: str = ""  # export entries of this very instruction
 
 
 def list_entries(args: list[str]) -> None:
@@ -111,6 +96,32 @@ def show(args: list[str]) -> None:
     for entry in shown:
         print("\n".join(table(entry)), end="\n\n")
     print(json.dumps({"entries": len(memory.entries), "shown": len(shown)}))
+
+
+def export(args: list[str]) -> None:
+    """Write the chosen entries, and print one JSON object."""
+    config = draccus.parse(ExportConfig, args=args)
+    memory = read_memory(Path(config.path))
+    entries = tuple(
+        entry
+        for entry in memory.entries
+        if config.source in ("", entry.source) and config.instruction in ("", entry.language)
+    )
+    if not entries:
+        raise OpenSPMError(
+            f"the memory at {config.path} holds no such entry; `openspm memory list --path={config.path}` "
+            "lists what it holds"
+        )
+    output = Path(config.output)
+    if output.exists():
+        raise FileExistsError(f"{output} exists already; choose another --output, or remove it")
+    output.parent.mkdir(parents=True, exist_ok=True)
+    chosen = replace(memory, entries=entries, superseded=())
+    if output.suffix == ".json":
+        write_entries_file(chosen, output)
+    else:
+        write_memory(chosen, output)
+    print(json.dumps({"entries": len(entries), "output": str(output)}))
 
 
 def _line(entry: MemoryEntry) -> str:

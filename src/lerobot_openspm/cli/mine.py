@@ -9,10 +9,10 @@ from pathlib import Path
 
 import draccus
 
+from lerobot_openspm.cli.options import DatasetOption
 from lerobot_openspm.configuration_openspm import OpenSPMConfig
-from lerobot_openspm.memory.memory import write_memory
+from lerobot_openspm.memory.io import write_memory
 from lerobot_openspm.mining.annotate import check_folder, write_annotated
-from lerobot_openspm.mining.dataset import dataset_metadata
 from lerobot_openspm.training import dataset_processor, memory_of
 
 
@@ -21,16 +21,14 @@ class MineConfig:
     """Mine the key poses of a LeRobotDataset into a memory.
 
     Args:
-        repo_id: Dataset on the Hub, or the name of a local one.
-        root: Folder of the dataset; LeRobot's cache if not given.
+        dataset: The demonstrations.
         output: Folder to write the memory to.
         annotated: Folder to write a copy of the dataset to, whose frames say which phase they belong to and
             which key pose comes next; none if not given.
         policy: Options of the policy that say how to mine, e.g. ``--policy.cameras=FILE``.
     """
 
-    repo_id: str = "local/openspm_tabletop"
-    root: str | None = None
+    dataset: DatasetOption = field(default_factory=DatasetOption)
     output: str = "outputs/memory"
     annotated: str | None = None
     policy: OpenSPMConfig = field(default_factory=lambda: OpenSPMConfig(device="cpu", push_to_hub=False))
@@ -40,7 +38,7 @@ def main(args: list[str]) -> None:
     """Mine, save, and print one JSON object."""
     config = draccus.parse(MineConfig, args=args)
     start_s = time.monotonic()
-    meta = dataset_metadata(config.repo_id, config.root)
+    meta = config.dataset.metadata()
     processor = dataset_processor(meta, config.policy)
     annotated = Path(config.annotated) if config.annotated else None
     if annotated is not None:

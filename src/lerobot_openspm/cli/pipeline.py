@@ -21,9 +21,8 @@ from scipy.stats import binomtest
 from tqdm import tqdm
 
 import lerobot_openspm
-from lerobot_openspm.cli.collect import SUMMARY_FILE, CollectConfig, SimulatorConfig, collect
+from lerobot_openspm.envs.collection import SUMMARY_FILE, CollectConfig, SimulatorConfig, collect
 from lerobot_openspm.envs.tabletop.tasks import TASK_NAMES
-from lerobot_openspm.errors import OpenSPMError
 from lerobot_openspm.files import write_beside, write_json
 
 logger = logging.getLogger(__name__)
@@ -33,18 +32,14 @@ TRAIN_CONFIG = Path("configs/openspm_tabletop_train.yaml")
 LIBERO_ASSETS = Path("scripts/libero_assets.txt")
 # Each process computes with one; several run side by side.
 THREADS = 1
+# lerobot-eval's own default; demonstrations are recorded from seeds far away from it.
+EVALUATION_SEED = 1000
 DONE, LOG = "done.json", "output.log"
+GEOMETRY = ("geometry/camera.py", "geometry/se3.py")
 # The package's files that make a simulator's demonstrations what they are.
 RECORDED_BY = {
-    "openspm_tabletop": ("cli/collect.py", "envs/*.py", "envs/tabletop/*.py"),
-    "libero": (
-        "cli/collect.py",
-        *(
-            f"envs/{name}.py"
-            for name in ("calibration", "gl_backend", "motions", "recording", "seeds", "tabletop/simulator")
-        ),
-        "envs/libero/*.py",
-    ),
+    "openspm_tabletop": ("envs/*.py", "envs/tabletop/*.py", *GEOMETRY),
+    "libero": ("envs/*.py", "envs/libero/*.py", *GEOMETRY),
 }
 
 
@@ -168,20 +163,6 @@ def discard_unless(output: Path, made_of: str) -> None:
         shutil.rmtree(output)
     output.parent.mkdir(parents=True, exist_ok=True)
     write_beside(kept, made_of.encode())
-
-
-def measured_folder(folder: Path, made_of: str) -> Path:
-    """A folder for what is measured; what it holds of something else that was measured is removed.
-
-    Raises:
-        OpenSPMError: It holds something that was not measured here.
-    """
-    ours = folder.with_name(f"{folder.name}.sha256")
-    if folder.is_dir() and any(folder.iterdir()) and not ours.is_file():
-        raise OpenSPMError(f"{folder} holds something that was not measured here; choose another --output")
-    discard_unless(folder, made_of)
-    folder.mkdir(parents=True, exist_ok=True)
-    return folder
 
 
 def _start_evaluation(

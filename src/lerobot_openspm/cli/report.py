@@ -17,7 +17,8 @@ from lerobot_openspm.cli.pipeline import REPO_ID, Episode, mean_steps, rate
 from lerobot_openspm.configuration_openspm import OpenSPMConfig
 from lerobot_openspm.envs.tabletop.tasks import TASKS
 from lerobot_openspm.memory.entry import MemoryEntry
-from lerobot_openspm.memory.memory import Memory, read_memory
+from lerobot_openspm.memory.io import read_memory
+from lerobot_openspm.memory.memory import Memory
 from lerobot_openspm.training import open_demonstrations
 
 # Rollouts shown per task: this many that succeeded, and this many that failed.

@@ -13,11 +13,11 @@ from typing import TYPE_CHECKING, Any
 
 import draccus
 
+from lerobot_openspm.cli.options import EpisodesOption, require_checkpoint
 from lerobot_openspm.errors import OpenSPMError
 from lerobot_openspm.memory.exchange import digest
-from lerobot_openspm.memory.files import changing
-from lerobot_openspm.memory.memory import MEMORY_JSON, Memory, read_memory, write_memory
-from lerobot_openspm.mining.dataset import dataset_metadata
+from lerobot_openspm.memory.io import changing, read_memory, write_memory
+from lerobot_openspm.memory.memory import Memory
 from lerobot_openspm.teaching import Lesson
 
 if TYPE_CHECKING:
@@ -25,12 +25,11 @@ if TYPE_CHECKING:
 
 
 @dataclass
-class DatasetOption:
-    """The demonstrations to teach."""
+class Sam3dOption:
+    """Where SAM 3D Objects is, for checkpoints whose shapes are its; see docs/sam3d.md."""
 
-    repo_id: str = "local/openspm_tabletop"  # name on the Hub, or of a local one
-    root: str | None = None  # its folder; LeRobot's cache if not given
-    episodes: list[int] | None = None  # e.g. [0,1,2]; all if not given
+    sam3d_python: str | None = None  # of its environment
+    sam3d_checkout: str | None = None  # folder of its repository
 
 
 @dataclass
@@ -38,8 +37,7 @@ class PolicyOption:
     """What the checkpoint does not say."""
 
     cameras: str | None = None  # calibration of the demonstrations; theirs or the checkpoint's if not given
-    sam3d_python: str | None = None  # for checkpoints whose shapes are SAM 3D's, see docs/sam3d.md
-    sam3d_checkout: str | None = None
+    segmentation: Sam3dOption = field(default_factory=Sam3dOption)
 
 
 @dataclass
@@ -48,7 +46,7 @@ class TeachConfig:
 
     into: str  # folder of the checkpoint
     output: str | None = None  # folder of a new checkpoint to write instead of changing the old one
-    dataset: DatasetOption = field(default_factory=DatasetOption)
+    dataset: EpisodesOption = field(default_factory=EpisodesOption)
     policy: PolicyOption = field(default_factory=PolicyOption)
 
 
@@ -57,8 +55,10 @@ def main(args: list[str]) -> None:
     start_s = time.monotonic()
     config = draccus.parse(TeachConfig, args=args)
     into, output = Path(config.into), Path(config.output) if config.output else None
-    _check_folders(into, output)
-    meta = dataset_metadata(config.dataset.repo_id, config.dataset.root)
+    require_checkpoint(into, "--into")
+    if output is not None and output.exists():
+        raise OpenSPMError(f"{output} exists already; choose another --output, or remove it")
+    meta = config.dataset.metadata()
     policy = _policy(config)
     known, lesson = policy.require_memory(), policy.teach(meta, config.dataset.episodes)
     if output is None:
@@ -81,23 +81,18 @@ def main(args: list[str]) -> None:
     print(json.dumps(summary))
 
 
-def _check_folders(into: Path, output: Path | None) -> None:
-    for name in ("config.json", MEMORY_JSON):
-        if not (into / name).is_file():
-            raise FileNotFoundError(
-                f"no checkpoint of this policy at {into}: it has no {name}; pass --into=FOLDER, in a "
-                "training's folder checkpoints/last/pretrained_model"
-            )
-    if output is not None and output.exists():
-        raise OpenSPMError(f"{output} exists already; choose another --output, or remove it")
-
-
 def _policy(config: TeachConfig) -> OpenSPMPolicy:
     from lerobot_openspm.modeling_openspm import OpenSPMPolicy
 
     policy = OpenSPMPolicy.from_pretrained(config.into)
-    given = {name: value for name, value in vars(config.policy).items() if value is not None}
-    policy.config = replace(policy.config, **given)
+    places, segmentation = config.policy.segmentation, policy.config.segmentation
+    segmentation = replace(
+        segmentation,
+        sam3d_python=places.sam3d_python or segmentation.sam3d_python,
+        sam3d_checkout=places.sam3d_checkout or segmentation.sam3d_checkout,
+    )
+    cameras = config.policy.cameras or policy.config.cameras
+    policy.config = replace(policy.config, cameras=cameras, segmentation=segmentation)
     return policy
 
 

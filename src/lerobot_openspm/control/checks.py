@@ -15,9 +15,9 @@ from lerobot_openspm.memory.robot import RobotModel
 
 # Phases in which an object follows the hand along a constraint.
 CONSTRAINED_PHASES = ("push", "open", "turn")
-# How much a different way through free space counts beside a different way in contact.
+# How much a different motion through free space counts beside one in contact.
 FREE_SPACE_SHARE = 0.2
-# An entry whose key poses lie this much differently to one another here counts as 1/e alike.
+# An entry whose motions differ by this much scores 1/e.
 SHAPE_SCALE_M = 0.1
 # An entry that can be executed at all scores at least this.
 MIN_USABLE_SCORE = 1e-3
@@ -29,15 +29,16 @@ class TransferLimits:
 
     Attributes:
         reach_margin_m: How far outside the box that the demonstrations covered the hand may go.
-        max_jump_m: Longest way between consecutive key poses.
-        max_jump_rad: Largest turn between consecutive key poses.
         min_clearance_m: How far below the lowest demonstrated hand position the hand may go.
+        max_jump_m: Longest way between consecutive key poses. The default is the reach of a table-top arm.
+        max_jump_rad: Largest turn between consecutive key poses. The default is just short of half a turn,
+            whose direction is open.
     """
 
     reach_margin_m: float = 0.10
+    min_clearance_m: float = 0.01
     max_jump_m: float = 0.8
     max_jump_rad: float = 2.8
-    min_clearance_m: float = 0.01
 
 
 def check_transfer(
@@ -72,7 +73,7 @@ def check_transfer(
 
 def geometric_score(
     entry: MemoryEntry,
-    layout: Mapping[str, Array],
+    object_poses: Mapping[str, Array],
     yaw_periods: Mapping[str, float],
     T_world_ee: Array,
     robot: RobotModel,
@@ -80,21 +81,13 @@ def geometric_score(
 ) -> float:
     """``S_geo`` in 0..1: whether an entry can be executed here, and how like its demonstration it would be.
 
-    0 where an object of its key poses was not found or the transferred key poses fail the checks. Else what
-    :func:`shape_deviation` makes of the arrangement: where the objects lie to one another as in the entry's
-    own layout, wherever that is, it is 1. Objects that no key pose is relative to make no difference.
-
-    Args:
-        entry: The entry.
-        layout: Present poses ``T_world_obj`` ``(4, 4)`` of the objects that were found.
-        yaw_periods: Angle by object that turns it into itself, radians; 0 for a body of revolution.
-        T_world_ee: Present hand pose ``(4, 4)``.
-        robot: The robot.
-        limits: Bounds of the checks.
+    It is 0 where an object of its key poses was not found or the transferred key poses fail the checks. It is
+    1 where the objects lie to one another as in the demonstration, wherever that is. The arguments are those
+    of :func:`transfer` and :func:`check_transfer`.
     """
-    if any(name not in layout for name in entry.objects):
+    if any(name not in object_poses for name in entry.objects):
         return 0.0
-    targets = transfer(entry, layout, yaw_periods, T_world_ee)
+    targets = transfer(entry, object_poses, yaw_periods, T_world_ee)
     if check_transfer(targets, T_world_ee, robot, limits):
         return 0.0
     return max(float(np.exp(-shape_deviation(entry, targets) / SHAPE_SCALE_M)), MIN_USABLE_SCORE)
@@ -103,9 +96,9 @@ def geometric_score(
 def shape_deviation(entry: MemoryEntry, targets: Sequence[Target]) -> float:
     """How differently the hand has to move here from how the demonstration moved, in metres.
 
-    Compared are the ways between consecutive key poses, seen from the later one. Between key poses of one
-    anchor nothing differs. Where the hand pushes, pulls or turns something, a different way does different
-    things to the object, so those count in full; in free space it hardly matters.
+    The motions between consecutive key poses are compared in the frame of the later one; between key poses of
+    one anchor they are equal. Where the hand pushes, pulls or turns something, a different motion does
+    something else to the object, so those count in full. In free space a difference hardly matters.
     """
     shown = [pose.anchor.frame(entry.layout) @ pose.T_obj_ee for pose in entry.key_poses]
     now = [target.T_world_ee for target in targets]

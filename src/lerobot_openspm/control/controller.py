@@ -1,7 +1,7 @@
 """One episode from instruction to actions: look, retrieve, transfer, follow, look again.
 
-An instruction that no demonstration shows as a whole is carried out part by part: each is planned when it is
-reached, from a fresh look, because what the parts before it moved is elsewhere now.
+An instruction that no demonstration shows as a whole is carried out part by part. Each part is planned when
+it is reached, from a fresh look, because the parts before it have moved things.
 """
 
 from __future__ import annotations
@@ -9,322 +9,340 @@ from __future__ import annotations
 import logging
 import zlib
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
-from lerobot_openspm.control.contact import Contact
 from lerobot_openspm.control.executor import Executor
-from lerobot_openspm.control.outcomes import LOOKS_AT_OUTCOME, PartProgress, expected_outcomes, is_met
-from lerobot_openspm.control.planner import Planner
-from lerobot_openspm.control.planning_context import PlanningContext
-from lerobot_openspm.control.scene import GIVE_UP_S, Detect, SceneState
-from lerobot_openspm.control.status import Status
-from lerobot_openspm.control.transfer import Target
+from lerobot_openspm.control.planning import Plan, PlanningContext, until
+from lerobot_openspm.control.scene import GIVE_UP_S, LOOK_AGAIN_S, SECOND_LOOK_S, LookRequest, SceneState
+from lerobot_openspm.control.state import LOOKS_AT_OUTCOME, EpisodeState, Status
+from lerobot_openspm.control.transfer import Target, pushed_by_landmark, rise, transfer
 from lerobot_openspm.errors import InstructionError
-from lerobot_openspm.flow.condition import Query
 from lerobot_openspm.geometry.se3 import Array
+from lerobot_openspm.memory.compose import plan_parts
 from lerobot_openspm.memory.entry import Outcome
-from lerobot_openspm.types import Hand
+from lerobot_openspm.perception.tracking.tracker import TrackStatus
+from lerobot_openspm.types import Detections, Hand
 
 logger = logging.getLogger(__name__)
 
-# A handle that has come along for less than this share of its way was not in the fingers.
-LEAST_TRAVEL = 0.05
-
 
 class EpisodeController:
-    """State of one environment, and nothing that another environment could see.
+    """Carries out one instruction in one environment; other environments never see any of this.
+
+    A control step is :meth:`advance`, then :meth:`take_in` of what each look brings for as long as one is
+    wanted, then the executor's next action.
 
     Attributes:
         instruction: What is to be done.
-        executor: Follows the plan, and holds the episode's status.
+        state: What is being done.
         scene: Where the objects are.
-        planner: What is acted by, and where.
-        refusal: Why the instruction is not acted on; "" unless the status is NOT_UNDERSTOOD.
+        executor: Follows the key poses of the plan.
     """
 
     def __init__(self, context: PlanningContext, instruction: str, fingerprint: int, noise_seed: int):
         self._context = context
         self.instruction = instruction
-        self.executor = Executor(context.settings, context.robot)
+        self.state = EpisodeState()
         self.scene = SceneState(context)
-        self._contact = Contact(self.executor, self.scene)
-        self.planner = Planner(context, self.scene, instruction)
-        self.refusal = ""
-        self._progress = PartProgress()
-        self._earlier_parts_known = True  # whether all parts before the present one were seen to be done
-        # Told by what the episode shows first, so that it does not matter in which batch or row it runs.
+        self.executor = Executor(context.settings, context.robot, self.state)
+        # Told by the first observation, so it does not matter in which batch or row the episode runs.
         self._noise_key = (noise_seed, zlib.crc32(instruction.encode()), fingerprint)
-
-    # What others may ask.
-
-    @property
-    def status(self) -> Status:
-        """What the episode is up to."""
-        return self.executor.status
-
-    @property
-    def succeeded(self) -> bool | None:
-        """Whether what was to be done is seen to be done; None before the end and where it is not seen."""
-        if self.status is Status.NO_PROGRESS:
-            return False
-        return self._progress.verdict if self.status is Status.DONE and self._earlier_parts_known else None
-
-    # One control step: observe, then act.
-
-    def observe(self, hand: Hand, detect: Detect) -> None:
-        """Take in a new observation: plan, advance, look around, go where things are now, try again.
-
-        What is not understood ends this episode alone: the hand holds still from then on, and
-        :attr:`refusal` says why.
-        """
-        self.scene.predict()
-        try:
-            match self.status:
-                case Status.WAITING | Status.OBJECT_NOT_FOUND | Status.INFEASIBLE:
-                    if self.scene.is_time_for_another_look:
-                        self._plan(hand, detect)
-                case Status.RUNNING | Status.PAUSED:
-                    self._follow_plan(hand, detect)
-                case Status.OBJECT_LOST:
-                    if self.scene.is_time_for_a_second_look:
-                        self._look_around(hand, detect)
-                case Status.DONE:
-                    if self._progress.looks_left > 0:
-                        self._check_outcomes(hand, detect)
-                case Status.NO_PROGRESS | Status.NOT_UNDERSTOOD | Status.CAMERA_FAULT:
-                    pass
-        except InstructionError as error:
-            self.refusal = str(error)
-            self.executor.stop(Status.NOT_UNDERSTOOD)
-            logger.warning("not acting: %s", error)
-
-    def next_action(self, hand: Hand) -> Array | None:
-        """The next canonical action ``(7,)``, or None when a chunk is needed."""
-        return self.executor.next_action(hand)
-
-    def query(self, hand: Hand) -> Query:
-        """The condition of the next chunk."""
-        return self.executor.query(hand)
 
     def noise(self, shape: tuple[int, ...]) -> Array:
         """Standard normal noise of the next chunk, a function of (seed, episode, chunk) alone."""
-        return np.random.default_rng([*self._noise_key, self.executor.replans]).standard_normal(shape)
+        return np.random.default_rng([*self._noise_key, self.state.replans]).standard_normal(shape)
 
-    def _follow_plan(self, hand: Hand, detect: Detect) -> None:
-        """Go on to the next key pose where one is reached; look where it is time to."""
-        index = self.executor.index
-        is_to_retry = self.status is Status.RUNNING and self.executor.advance(hand)
-        self._contact.update(self.planner.plan, index, hand)
-        if self.executor.status is Status.DONE:
-            self._check_outcomes(hand, detect)
-        elif is_to_retry:
-            self._try_again(hand, detect)
-        elif self._is_time_to_look(index):
-            self._look_around(hand, detect)
+    # One control step.
+
+    def advance(self, hand: Hand) -> LookRequest | None:
+        """Let one control step pass, and go on to the next key pose where one is reached.
+
+        An instruction that is not understood ends this episode alone: the hand holds still from then on, and
+        ``state.refusal`` says why.
+
+        Returns:
+            What has to be looked for now; None if nothing.
+        """
+        self.scene.predict()
+        match self.state.status:
+            case Status.WAITING | Status.OBJECT_NOT_FOUND | Status.INFEASIBLE:
+                return self._look_for_plan(hand) if self.scene.is_due(LOOK_AGAIN_S) else None
+            case Status.RUNNING | Status.PAUSED:
+                return self._follow_plan(hand)
+            case Status.OBJECT_LOST:
+                return self._look_around(hand) if self.scene.is_due(SECOND_LOOK_S) else None
+            case Status.DONE:
+                return self._look_at_outcome(hand) if self.state.looks_left > 0 else None
+            case Status.NO_PROGRESS | Status.NOT_UNDERSTOOD | Status.CAMERA_FAULT:
+                return None
+
+    def take_in(self, look: LookRequest, detections: Detections, hand: Hand) -> LookRequest | None:
+        """Take in what a look brought, and act on it.
+
+        Returns:
+            What has to be looked for at the same moment; None if nothing more.
+        """
+        try:
+            moved = self.scene.take_in(detections, hand)
+        except InstructionError as error:
+            return self._refuse(error)
+        self._check_cameras()
+        match self.state.status:
+            case Status.WAITING | Status.OBJECT_NOT_FOUND | Status.INFEASIBLE:
+                self._plan(hand)
+            case Status.RUNNING | Status.PAUSED | Status.OBJECT_LOST if look.back_to is not None:
+                self._follow_objects(look.names, hand)
+                self._begin(look.back_to, hand)
+            case Status.RUNNING | Status.PAUSED | Status.OBJECT_LOST:
+                self._go_on(look, moved, hand)
+            case Status.DONE:
+                return self._judge(hand)
+            case Status.NO_PROGRESS | Status.NOT_UNDERSTOOD | Status.CAMERA_FAULT:
+                pass
+        return None
+
+    def _refuse(self, error: InstructionError) -> None:
+        self.state.refusal = str(error)
+        self.executor.stop(Status.NOT_UNDERSTOOD)
+        logger.warning("not acting: %s", error)
+
+    def _check_cameras(self) -> None:
+        """Give up where a camera gave no sound picture for too long, unless all is done but to look."""
+        for camera, fault in self.scene.detections.faults.items():
+            if fault.seconds >= GIVE_UP_S and self.state.status is not Status.DONE:
+                logger.warning("%r: stopping, camera %r: %s", self.instruction, camera, fault.reason)
+                self.executor.stop(Status.CAMERA_FAULT)
 
     # Planning.
 
-    def _plan(self, hand: Hand, detect: Detect) -> None:
-        """Plan the part that is to be carried out now, once its objects are found."""
-        planner = self.planner
-        if not planner.parts:
-            planner.read(hand)
-        self._look(planner.sought(), hand, detect)
-        if self.status is Status.CAMERA_FAULT:
-            return
-        best = planner.choose(hand)
-        if missing := [name for name in best.objects if name not in planner.object_poses]:
+    def _look_for_plan(self, hand: Hand) -> LookRequest | None:
+        """Look for the objects of the present part, and of those to come, which it may hide."""
+        state, scene = self.state, self.scene
+        if not state.parts:
+            try:
+                state.parts = plan_parts(self.instruction, self._context.entries, self._context.names)
+            except InstructionError as error:
+                return self._refuse(error)
+            state.start_height = float(hand.T_world_ee[2, 3])
+            scene.ground(state.parts[0])
+        entries = [one.entry for part in state.parts[state.part :] for one in part]
+        needed = [name for entry in entries for name in (*entry.objects, *pushed_by_landmark(entry).values())]
+        names = dict.fromkeys([*needed, *scene.grounding.landmarks])
+        return scene.look([name for name in names if name not in scene.altered], hand)
+
+    def _plan(self, hand: Hand) -> None:
+        """Plan the present part, once its objects are found."""
+        state, candidates = self.state, self.state.parts[self.state.part]
+        poses = self.scene.tracker.poses(hand.T_world_ee)
+        state.ranked = self._context.rank(candidates, poses, hand.T_world_ee)
+        plan = Plan(state.ranked[0].entry, poses, hand.T_world_ee)
+        if missing := [name for name in plan.entry.objects if name not in poses]:
             logger.info("%r: cannot find %s", self.instruction, missing)
-            self.executor.go(Status.OBJECT_NOT_FOUND)
-        elif problems := planner.problems(hand):
+            state.go(Status.OBJECT_NOT_FOUND)
+        elif problems := plan.problems(self._context):
             logger.warning("%r: %s", self.instruction, "; ".join(problems))
-            self.executor.go(Status.INFEASIBLE)
+            state.go(Status.INFEASIBLE)
         else:
-            planner.note_use()
+            state.plan = plan
+            state.used = (*state.used, next(one.source for one in candidates if one.entry is plan.entry))
             self._begin(0, hand)
-            if self._is_tracking:  # else nothing is looked at any more that could end the waiting
+            if self._is_tracking:  # else no later look could end the waiting
                 self._wait_for_what_is_needed(hand)
 
     def _begin(self, index: int, hand: Hand) -> None:
         """Go to a key pose; what is grasped or pushed from there on is not in the hand any more."""
-        self.planner.T_world_ee = hand.T_world_ee
-        tracker = self.scene.tracker
-        tracker.drop(tracker.held & self.planner.plan.regrasped(index), hand.T_world_ee)
+        state, tracker = self.state, self.scene.tracker
+        state.plan = replace(state.plan, T_world_ee=hand.T_world_ee)
+        tracker.drop(tracker.held & state.plan.regrasped(index), hand.T_world_ee)
         self.executor.begin(self._targets(), hand, index)
 
     def _targets(self) -> tuple[Target, ...]:
-        return self.planner.targets(self._progress.gone, self._progress.repeated)
+        """The key poses of the plan in the scene."""
+        state, plan = self.state, self.state.plan
+        entry = plan.entry if state.repeated is None else until(plan.entry, state.repeated)
+        targets = transfer(entry, plan.object_poses, self._context.yaw_periods, plan.T_world_ee, state.gone)
+        return targets if state.is_last_part else (*targets, *rise(targets[-1], state.start_height))
 
-    # Looking.
+    # Following the plan.
 
     @property
     def _is_tracking(self) -> bool:
-        return self._context.tracking and self.executor.strategy.looks_around
+        return self._context.tracking and self.executor.strategy.measures
+
+    def _follow_plan(self, hand: Hand) -> LookRequest | None:
+        """Go on to the next key pose where one is reached; look where it is time to."""
+        state, scene, executor = self.state, self.scene, self.executor
+        before = state.index
+        is_to_retry = state.status is Status.RUNNING and executor.advance(hand)
+        for i in range(before, state.index):
+            scene.pass_key_pose(state.plan, executor.targets[i], executor.targets[i + 1], hand)
+        if (target := executor.target) is not None:
+            scene.meet(target, hand)
+        if state.status is Status.DONE:
+            scene.tracker.release(scene.tracker.held, hand.T_world_ee)
+            return self._look_at_outcome(hand)
+        if is_to_retry:
+            return self._try_again(hand)
+        return self._look_around(hand) if self._is_time_to_look(before) else None
 
     def _is_time_to_look(self, index_before: int) -> bool:
         target, scene = self.executor.target, self.scene
-        is_paused = self.status is Status.PAUSED
+        is_paused = self.state.status is Status.PAUSED
         if not self._is_tracking or target is None:
             return False
         if target.key_pose.dwell and not is_paused:
             return False  # the fingers hide what they are around
-        if scene.faults:
+        if scene.detections.faults:
             return True
         if is_paused or scene.tracker.doubtful:
-            return scene.is_time_for_a_second_look
-        return self.executor.index != index_before or scene.is_time_for_another_look
+            return scene.is_due(SECOND_LOOK_S)
+        return self.state.index != index_before or scene.is_due(LOOK_AGAIN_S)
 
-    def _look(self, names: Sequence[str], hand: Hand, detect: Detect) -> frozenset[str]:
-        """Look for objects; the names of those that are somewhere else than before."""
-        moved = self.scene.look(names, hand, detect)
-        for camera, fault in self.scene.faults.items():
-            if fault.seconds >= GIVE_UP_S and self.status is not Status.DONE:
-                logger.warning("%r: stopping, camera %r: %s", self.instruction, camera, fault.reason)
-                self.executor.stop(Status.CAMERA_FAULT)
-        return moved
+    def _look_around(self, hand: Hand) -> LookRequest:
+        """Look for what the remaining key poses need, and for what is in the hand."""
+        return self.scene.look([*self._untouched(), *self.scene.tracker.held], hand)
 
-    def _look_around(self, hand: Hand, detect: Detect) -> None:
-        """Look at what the remaining key poses need and what is in the hand; act on what has changed."""
-        tracker, plan, untouched = self.scene.tracker, self.planner.plan, self._untouched()
-        held = tracker.held
-        moved = self._look([*untouched, *(held - set(untouched))], hand, detect)
-        if self.status is Status.CAMERA_FAULT:
-            return
-        dropped = {name for name in moved & held if self._contact.is_left_behind(plan, name, hand)}
-        for name in (moved & held) - dropped:  # it goes along from where it is
-            tracker.hold(name, hand.T_world_ee)
+    def _go_on(self, look: LookRequest, moved: frozenset[str], hand: Hand) -> None:
+        """Act on what has changed: fetch what was dropped, go where things are now."""
+        scene, executor, plan = self.scene, self.executor, self.state.plan
+        target, index = executor.target, self.state.index
+        dropped = {
+            name
+            for name in moved & look.held
+            if target is None or scene.is_left_behind(name, plan, executor.targets, index, hand)
+        }
+        for name in (moved & look.held) - dropped:  # it goes along from where it is
+            scene.tracker.hold(name, hand.T_world_ee)
         if dropped:
             logger.info("%r: dropped: %s", self.instruction, ", ".join(sorted(dropped)))
             # What slips out of the hand is no fault of the plan; a push that loses its object may be.
-            if self._contact.is_pushing and not self.executor.try_again("what is pushed was left behind"):
+            is_pushing = target is not None and target.key_pose.phase == "push"
+            if is_pushing and not executor.try_again("what is pushed was left behind"):
                 return
-            index = self.executor.retry_index()
-            self.planner.update(self.planner.plan.anchors(index, self.scene.altered), hand)
+            index = executor.contact_index()
+            self._follow_objects(plan.objects(index, scene.altered), hand)
             self._begin(index, hand)
-        elif changed := self.planner.update(untouched, hand):
+        elif changed := self._follow_objects([n for n in look.names if n not in look.held], hand):
             logger.info("%r: moved: %s", self.instruction, ", ".join(sorted(changed)))
-            self._go_along(bool(moved & set(self._now_needed())), hand)
+            # From further off, if what is approached has jumped aside.
+            if executor.target is not None and moved & set(self._now_needed()):
+                self._begin(executor.way_index(), hand)
+            else:
+                executor.change(self._targets())
         self._wait_for_what_is_needed(hand)
 
-    def _go_along(self, jumped: bool, hand: Hand) -> None:
-        """Go to where the key poses are now; from further off, if what is approached has jumped aside."""
-        if jumped and self.executor.target is not None:
-            self._begin(self.executor.entry_index(), hand)
-        else:
-            self.executor.change(self._targets())
+    def _follow_objects(self, names: Sequence[str], hand: Hand) -> set[str]:
+        """Take over where objects are now, unless the hand could not follow key poses there.
+
+        Returns:
+            Those that are elsewhere than before.
+        """
+        plan = self.state.plan
+        changed = plan.moved(names, self.scene.tracker.poses(hand.T_world_ee))
+        if changed:
+            plan = replace(plan, object_poses={**plan.object_poses, **changed})
+            if problems := plan.problems(self._context):
+                logger.info("%r: not believed: %s", self.instruction, "; ".join(problems))
+                return set()
+            self.state.plan = plan
+        return set(changed)
 
     def _wait_for_what_is_needed(self, hand: Hand) -> None:
         """Hold still without sound pictures, and while what the hand is on its way to is not to be seen."""
-        needed = self._now_needed()
-        if lost := self.scene.lost(needed):
-            if self.status is not Status.OBJECT_LOST:
+        state, scene, needed = self.state, self.scene, self._now_needed()
+        if lost := scene.those(TrackStatus.LOST, needed):
+            if state.status is not Status.OBJECT_LOST:
                 logger.info("%r: lost: %s", self.instruction, ", ".join(lost))
             self.executor.stop(Status.OBJECT_LOST)
             return
-        if self.status is Status.OBJECT_LOST:
-            self._begin(self.executor.entry_index(), hand)
-        is_paused = self.scene.is_blind or self.scene.is_any_stale(needed)
-        self.executor.go(Status.PAUSED if is_paused else Status.RUNNING)
+        if state.status is Status.OBJECT_LOST:
+            self._begin(self.executor.way_index(), hand)
+        is_paused = scene.is_blind or scene.those(TrackStatus.STALE, needed)
+        state.go(Status.PAUSED if is_paused else Status.RUNNING)
 
     def _untouched(self) -> list[str]:
         """Objects of the key poses to come that still are where they were seen."""
-        plan, index = self.planner.plan, self.executor.index
-        touched = plan.touched(self.executor.plan[:index]) | self.scene.tracker.held
-        return [name for name in plan.anchors(index, self.scene.altered) if name not in touched]
+        plan, index = self.state.plan, self.state.index
+        touched = plan.touched(self.executor.targets[:index]) | self.scene.tracker.held
+        return [name for name in plan.objects(index, self.scene.altered) if name not in touched]
 
     def _now_needed(self) -> list[str]:
         """Objects that the present key pose is relative to, unless the hand has touched them."""
         untouched = self._untouched()
-        anchor = self.executor.plan[self.executor.index].key_pose.anchor
+        anchor = self.executor.present.key_pose.anchor
         return [name for name in anchor.objects if name in untouched]
 
     # Trying again.
 
-    def _try_again(self, hand: Hand, detect: Detect) -> None:
-        """Find the objects of the remaining key poses again and go back to where this contact begins."""
-        index = self._retry_index(hand)
-        self.planner.T_world_ee = hand.T_world_ee
-        if self._context.tracking:
-            # What should be in the hand is not, or what was to be met is not there: it may be anywhere.
-            attempted = self.executor.plan[index : self.executor.index + 1]
-            places = {target.key_pose.anchor.place for target in attempted}
-            self.scene.tracker.doubt(places - self.scene.altered, hand.T_world_ee)
-            ahead = self.planner.plan.anchors(index, self.scene.altered)
-            self._look(ahead, hand, detect)
-            self.planner.update(ahead, hand)
-        if self.status is Status.RUNNING:
+    def _try_again(self, hand: Hand) -> LookRequest | None:
+        """Look for the objects of the remaining key poses again, to go back to where this contact begins."""
+        state, executor, tracker = self.state, self.executor, self.scene.tracker
+        executor.note_travel(hand)
+        # With the object still in the hand only the way to its place is gone again.
+        is_carrying = bool(tracker.held) and executor.present.key_pose.phase == "place"
+        is_in_hand = is_carrying and not executor.has_lost_grip(hand)
+        index = executor.way_index() if is_in_hand else executor.contact_index()
+        state.plan = replace(state.plan, T_world_ee=hand.T_world_ee)
+        if not self._is_tracking:
             self._begin(index, hand)
-
-    def _retry_index(self, hand: Hand) -> int:
-        """Where to go back to: the approach to what is grasped or, with it in the hand, to its place."""
-        executor, gone = self.executor, self._progress.gone
-        pose = executor.present.target.key_pose
-        shown = pose.axis  # the whole way, of which the target's own axis is what is left
-        if shown is not None and executor.feels_handle(executor.index):
-            so_far, further = gone.get(pose.sub_task, 0.0), max(executor.present.travelled, 0.0)
-            # Fingers that close on nothing where a handle slipped out: it went back when they let go.
-            is_empty = executor.has_lost_grip(hand) and further < LEAST_TRAVEL * shown.amount
-            # At the end of its way too little would be left to feel whether it is held.
-            furthest = (1 - LEAST_TRAVEL) * shown.amount
-            gone[pose.sub_task] = 0.5 * so_far if is_empty else min(so_far + further, furthest)
-        is_carrying = bool(self.scene.tracker.held) and pose.phase == "place"
-        if is_carrying and not executor.has_lost_grip(hand):
-            return executor.entry_index()
-        return executor.retry_index()
+            return None
+        # What should be in the hand is not, or what was to be met is not there: it may be anywhere.
+        attempted = executor.targets[index : state.index + 1]
+        places = {target.key_pose.anchor.place for target in attempted}
+        tracker.doubt(places - self.scene.altered, hand.T_world_ee)
+        return self.scene.look(state.plan.objects(index, self.scene.altered), hand, back_to=index)
 
     # The end of a part.
 
-    def _check_outcomes(self, hand: Hand, detect: Detect) -> None:
-        """Look whether what was to be done is done: go on if so, else go back to what can mend it."""
-        progress = self._progress
-        if progress.looks_left < LOOKS_AT_OUTCOME and not self.scene.is_time_for_a_second_look:
-            return
-        missed = self._missed(hand, detect) if self._is_tracking else ()
-        if missed is None and progress.looks_left > 0:
-            return
-        progress.looks_left = 0
-        if missed:
-            self._go_back(missed[0], hand)
-        elif not self.planner.is_last_part:
-            self._begin_next_part(hand, detect)
-
-    def _missed(self, hand: Hand, detect: Detect) -> tuple[Outcome, ...] | None:
-        """Look at what was moved: the outcomes that are not met, in order; None where that is not seen."""
-        entry, progress = self.planner.plan.entry, self._progress
-        expected = expected_outcomes(entry)
-        progress.followed |= self.executor.followed_sub_tasks()
-        names = dict.fromkeys(name for one in expected for name in one.objects)
-        if not names:
-            progress.judge(entry, (), ())
-            return ()
-        progress.looks_left -= 1
-        self._look([name for name in names if name not in self.scene.altered], hand, detect)
-        poses, recognised = self.scene.tracker.poses(hand.T_world_ee), self.scene.recognised()
-        seen = [one for one in expected if one.target in recognised and poses.keys() >= set(one.objects)]
-        missed = tuple(one for one in seen if not is_met(one, poses, self._context.yaw_periods))
-        if len(seen) < len(expected) and not missed:
+    def _look_at_outcome(self, hand: Hand) -> LookRequest | None:
+        """Look whether what was to be done is done, as far as that can be seen."""
+        state, scene = self.state, self.scene
+        if state.looks_left < LOOKS_AT_OUTCOME and not scene.is_due(SECOND_LOOK_S):
             return None
-        progress.judge(entry, expected, missed)
-        return missed
+        if not self._is_tracking:
+            return self._end_part(hand)
+        state.followed |= self.executor.followed_sub_tasks()
+        names = dict.fromkeys(name for one in state.plan.outcomes for name in one.objects)
+        if not names:
+            state.judge(())
+            return self._end_part(hand)
+        state.looks_left -= 1
+        return scene.look([name for name in names if name not in scene.altered], hand)
 
-    def _go_back(self, missed: Outcome, hand: Hand) -> None:
+    def _judge(self, hand: Hand) -> LookRequest | None:
+        """Compare what is seen with the outcomes: go on if all are met, else go back to what can mend it."""
+        state, poses = self.state, self.scene.tracker.poses(hand.T_world_ee)
+        missed = state.plan.missed(poses, self.scene.recognised(), self._context.yaw_periods)
+        if missed is None:
+            return None if state.looks_left > 0 else self._end_part(hand)
+        state.judge(missed)
+        return self._mend(missed[0], hand) if missed else self._end_part(hand)
+
+    def _mend(self, missed: Outcome, hand: Hand) -> None:
         """Do one sub-task again, from where its target is now, if an attempt is left.
 
         Those after it are not done again: their handles are not where they were.
         """
+        state = self.state
+        state.looks_left = 0
         if not self.executor.try_again(f"the {missed.target} is not where it should be"):
             return
-        self._progress.look_again(missed.sub_task)
-        poses = self.planner.plan.entry.key_poses
+        state.looks_left, state.verdict, state.repeated = LOOKS_AT_OUTCOME, None, missed.sub_task
+        poses = state.plan.entry.key_poses
         index = next(i for i, pose in enumerate(poses) if pose.sub_task == missed.sub_task)
-        self.planner.update(self.planner.plan.anchors(index, self.scene.altered), hand)
+        self._follow_objects(state.plan.objects(index, self.scene.altered), hand)
         self._begin(index, hand)
 
-    def _begin_next_part(self, hand: Hand, detect: Detect) -> None:
-        """Look at what the hand has left behind, and go on from there."""
-        self.planner.begin_next_part()
-        self.executor.finish_subtask()
-        self._earlier_parts_known &= self._progress.verdict is True
-        self._progress = PartProgress()
-        self._plan(hand, detect)
+    def _end_part(self, hand: Hand) -> LookRequest | None:
+        """Go on with the next part, if there is one, from a look at what the hand has left behind."""
+        state = self.state
+        state.looks_left = 0
+        if state.is_last_part:
+            return None
+        self.executor.stop(Status.WAITING)
+        state.begin_next_part()
+        self.scene.ground(state.parts[state.part])
+        logger.info("%r: part %d of %d", self.instruction, state.part + 1, len(state.parts))
+        return self._look_for_plan(hand)

@@ -9,7 +9,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from lerobot_openspm.control.status import TRANSITIONS, Status
+from lerobot_openspm.control.state import EpisodeState, Status
 from lerobot_openspm.control.strategies import STRATEGIES, Approach, ControlSettings
 from lerobot_openspm.control.transfer import Target
 from lerobot_openspm.errors import OpenSPMError
@@ -28,106 +28,82 @@ CONTACTS = ("grasp", "release", "push", "open", "turn")
 HELD_SHARE = 0.4
 # Where the demonstration's fingers stood further apart than this share of open, they held something.
 HOLDING_SHARE = 0.03
+# A handle that has come along for less than this share of its way was not in the fingers.
+LEAST_TRAVEL = 0.05
 
 
 class Executor:
     """Follows one plan in one environment.
 
     Attributes:
-        plan: The key poses in the scene; of the present one, the target as it is approached.
-        index: The key pose that is approached.
-        approach: The way to it; None before the first plan.
+        state: What is being done; the controller's.
         strategy: How key poses are followed.
-        attempts: Attempts beyond the first at the present subtask.
-        replans: Chunks asked for so far; seeds the noise of each.
+        targets: The key poses in the scene; of the present one, the target as it is approached.
+        approach: The way to the present key pose.
     """
 
-    def __init__(self, settings: ControlSettings, robot: RobotModel):
-        self._settings, self._robot = settings, robot
+    def __init__(self, settings: ControlSettings, robot: RobotModel, state: EpisodeState):
+        self._settings, self._robot, self.state = settings, robot, state
         self.strategy = STRATEGIES[settings.execution](settings, robot)
-        self.plan: tuple[Target, ...] = ()
-        self.index = 0
-        self.approach: Approach | None = None
-        self.attempts = 0
-        self.replans = 0
-        self._status = Status.WAITING
+        self.targets: tuple[Target, ...] = ()
+        self.approach = Approach(np.eye(4))
+        self._believed = np.eye(4)  # where the hand should be, by the actions given out so far
         self._queue: deque[Array] = deque()
-
-    @property
-    def status(self) -> Status:
-        """What the episode is up to."""
-        return self._status
-
-    def go(self, status: Status) -> None:
-        """Change the status.
-
-        Raises:
-            RuntimeError: It cannot follow the present one.
-        """
-        if status is not self._status and status not in TRANSITIONS[self._status]:
-            raise RuntimeError(f"an episode cannot go from {self._status} to {status}")
-        self._status = status
-
-    def stop(self, status: Status) -> None:
-        """Hold still for a reason; what is left of the chunk is dropped."""
-        self.go(status)
-        self._queue.clear()
 
     # The plan.
 
-    def begin(self, plan: Sequence[Target], hand: Hand, index: int = 0) -> None:
-        """Start following a plan, or a better version of the same one, from a key pose on."""
-        self.plan = tuple(plan)
-        self.go(Status.RUNNING)
-        self.strategy.begin(hand)
+    def begin(self, targets: Sequence[Target], hand: Hand, index: int = 0) -> None:
+        """Start following key poses, or better versions of the same ones, from one on."""
+        self.targets = tuple(targets)
+        self.state.go(Status.RUNNING)
+        self._believed = hand.T_world_ee
         self._enter(index, hand)
 
-    def change(self, plan: Sequence[Target]) -> None:
-        """Follow a better version of the same plan from here on."""
-        present = self.plan[self.index]
-        self.plan = tuple(plan)
+    def change(self, targets: Sequence[Target]) -> None:
+        """Follow better versions of the same key poses from here on."""
+        present = self.present
+        self.targets = tuple(targets)
         # A drawer or a knob goes on from where the hand took hold of it.
-        self._approach_target(present if present.axis is not None else self.plan[self.index])
+        self._approach_target(present if present.axis is not None else self.present)
         self._queue.clear()
 
-    def finish_subtask(self) -> None:
-        """Wait for the plan of the next subtask, which gets attempts of its own."""
-        self.stop(Status.WAITING)
-        self.attempts = 0
+    def stop(self, status: Status) -> None:
+        """Hold still for a reason; what is left of the chunk is dropped."""
+        self.state.go(status)
+        self._queue.clear()
 
     @property
     def target(self) -> Target | None:
         """The key pose that is being approached, or None."""
-        return self.plan[self.index] if self.status in (Status.RUNNING, Status.PAUSED) else None
+        is_approached = self.state.status in (Status.RUNNING, Status.PAUSED)
+        return self.present if is_approached else None
 
     @property
-    def present(self) -> Approach:
-        """The way to the present key pose.
+    def present(self) -> Target:
+        """The present key pose, be it approached or not."""
+        return self.targets[self.state.index]
 
-        Raises:
-            RuntimeError: There is no plan yet.
-        """
-        if self.approach is None:
-            raise RuntimeError("there is no plan to follow yet; call begin() first")
-        return self.approach
+    def _here(self, hand: Hand) -> Array:
+        """Where the hand is taken to be, ``T_world_ee`` ``(4, 4)``."""
+        return hand.T_world_ee if self.strategy.measures else self._believed
 
     def _enter(self, index: int, hand: Hand) -> None:
         """Turn to a key pose."""
-        self.strategy.enter(self.plan[index - 1] if index > 0 else None)
-        self.index, start = index, self.strategy.here(hand)
-        target = self.plan[index]
+        if index > 0:
+            self._believed = self.targets[index - 1].T_world_ee
+        self.state.index, start = index, self._here(hand)
+        target = self.targets[index]
         if target.axis is not None:
             # What slides or turns does so from where the hand took hold of it, be that a little off.
             target = replace(target, T_world_ee=target.axis.follow(start))
-        self.approach = Approach(target, start, 0)
+        self.approach = Approach(start)
         self._approach_target(target)
         self._queue.clear()
 
     def _approach_target(self, target: Target) -> None:
         """Approach a target at the present index, from where the way began."""
-        self.plan = (*self.plan[: self.index], target, *self.plan[self.index + 1 :])
-        approach = self.present
-        approach.target = target
+        index, approach = self.state.index, self.approach
+        self.targets = (*self.targets[:index], target, *self.targets[index + 1 :])
         approach.nominal_steps = target.key_pose.n_steps
         if not target.key_pose.dwell:
             length = float(se3.distance(approach.start, target.T_world_ee))
@@ -143,91 +119,93 @@ class Executor:
             True when the objects have to be found again: a grasp missed, a held object was lost, or a key
             pose could not be met, and an attempt is left.
         """
-        while self.status is Status.RUNNING:
+        while self.state.status is Status.RUNNING:
             if self.has_lost_grip(hand):
                 return self.try_again("the fingers hold nothing")
-            approach = self.present
-            if (axis := approach.target.axis) is not None:
+            approach = self.approach
+            if (axis := self.present.axis) is not None:
                 approach.travelled = max(approach.travelled, axis.travel(approach.start, hand.T_world_ee))
             if not self._is_met(hand):
                 return self._is_given_up(hand)
-            if self.index + 1 == len(self.plan):
+            if self.state.index + 1 == len(self.targets):
                 self.stop(Status.DONE)
             else:
-                self._enter(self.index + 1, hand)
+                self._enter(self.state.index + 1, hand)
         return False
 
     def _is_met(self, hand: Hand) -> bool:
-        approach = self.present
-        if approach.target.key_pose.dwell:
-            return approach.is_time_up
-        return self.strategy.is_met(approach, hand)
+        if self.present.key_pose.dwell:
+            return self.approach.is_time_up
+        return self.strategy.is_met(self.present, self.approach, hand)
 
     def _is_given_up(self, hand: Hand) -> bool:
         """Whether the present key pose is tried again because its corrections are used up."""
-        approach = self.present
+        approach = self.approach
         is_used_up = approach.corrections > self._settings.max_corrections
-        is_passed_by = not approach.target.precise and self.index + 1 < len(self.plan)
+        is_passed_by = not self.present.precise and self.state.index + 1 < len(self.targets)
         if is_passed_by and (is_used_up or approach.is_blocked):
             # A hand that is held up short of a key pose it only passes by goes on to the next one.
-            self._enter(self.index + 1, hand)
+            self._enter(self.state.index + 1, hand)
             return False
         if not is_used_up:
             return False
-        metres, radians = se3.distances(hand.T_world_ee, approach.target.T_world_ee)
+        metres, radians = se3.distances(hand.T_world_ee, self.present.T_world_ee)
         return self.try_again(f"it stays {1000 * metres:.1f} mm and {radians:.3f} rad away")
 
     def next_action(self, hand: Hand) -> Array | None:
         """The next canonical action ``(7,)``, or None when a chunk is needed (:meth:`query`)."""
-        if self.status is not Status.RUNNING:
+        if self.state.status is not Status.RUNNING:
             return self.hold()
-        approach = self.present
-        if approach.target.key_pose.dwell:
-            action = self.strategy.toward(approach.target, hand)
+        target, approach = self.present, self.approach
+        if target.key_pose.dwell:
+            action = self.strategy.toward(target, self._here(hand))
         elif self._queue:
-            action = self.strategy.from_chunk(self._queue.popleft(), approach, hand)
-        elif (action := self.strategy.correct(approach, hand)) is None:
+            action = self.strategy.from_chunk(self._queue.popleft(), target, approach, hand)
+        elif (action := self.strategy.correct(target, approach, hand)) is None:
             return None
         approach.steps += 1
-        self.strategy.acted(action)
+        self._believed = se3.apply_increment(self._believed, action[:6] * self._robot.gains)
         return action
 
     def hold(self) -> Array:
         """The action that stays where it is, fingers as they are."""
-        closed = self.plan[self.index].key_pose.closed if self.plan else False
+        closed = self.present.key_pose.closed if self.targets else False
         return np.array([0.0] * 6 + [self._robot.command(closed)])
 
     def query(self, hand: Hand) -> Query:
         """The condition of the next chunk, which is counted."""
-        approach, here = self.present, self.strategy.here(hand)
-        target = approach.target
-        self.replans += 1
+        target, here = self.present, self._here(hand)
+        self.state.replans += 1
         return Query(
             T_world_ee=here,
             T_world_target=target.T_world_ee,
-            progress=progress(approach.start, here, target.T_world_ee),
+            progress=progress(self.approach.start, here, target.T_world_ee),
             closed=np.asarray(float(target.key_pose.closed)),
             opening=np.asarray(hand.opening / max(self._robot.open_width, 1e-9)),
             phase=np.asarray(PHASES.index(target.key_pose.phase)),
         )
 
     def push_chunk(self, actions: Array) -> None:
-        """Queue a chunk of canonical actions ``(H, 7)``; non-finite numbers never reach the robot."""
+        """Queue a chunk of canonical actions ``(H, 7)``; non-finite numbers never reach the robot.
+
+        The fingers do what the key pose says; the flow model's last number only says it less surely.
+        """
         if not np.isfinite(actions).all():
             raise OpenSPMError(
                 f"the flow model gave actions that are not finite: {actions}; its weights are "
                 "damaged, train again"
             )
-        self._queue.extend(actions)
+        fingers = self._robot.command(self.present.key_pose.closed)
+        self._queue.extend(np.append(action[:6], fingers) for action in actions)
 
     # Contact.
 
     def has_lost_grip(self, hand: Hand) -> bool:
         """Whether the fingers closed further than the demonstration's did around the object."""
-        if not self.strategy.feels_fingers or self.index == 0:
+        if not self.strategy.feels_fingers or self.state.index == 0:
             return False
-        before, now = self.plan[self.index - 1].key_pose, self.plan[self.index].key_pose
-        passed = [one.key_pose for one in self.plan[: self.index]]
+        before, now = self.targets[self.state.index - 1].key_pose, self.present.key_pose
+        passed = [one.key_pose for one in self.targets[: self.state.index]]
         grasped = next((p for p in reversed(passed) if p.phase in ("grasp", "release", "push")), None)
         if not (before.closed and now.closed) or now.phase == "push":
             return False
@@ -245,42 +223,55 @@ class Executor:
         """
         if not self.strategy.feels_fingers:
             return set()
-        ends = [i for i, target in enumerate(self.plan) if target.axis is not None]
-        return {self.plan[i].key_pose.sub_task for i in ends if self.feels_handle(i)}
+        ends = [i for i, target in enumerate(self.targets) if target.axis is not None]
+        return {self.targets[i].key_pose.sub_task for i in ends if self.feels_handle(i)}
 
     def feels_handle(self, index: int) -> bool:
         """Whether the fingers hold something before a key pose, so that a loss would show in the opening."""
         held = self._robot.open_width * HOLDING_SHARE
-        return index > 0 and self.plan[index - 1].key_pose.opening >= held
+        return index > 0 and self.targets[index - 1].key_pose.opening >= held
 
     # Trying again.
 
     def try_again(self, why: str) -> bool:
         """Count another attempt at the present key pose; without one left there is no progress."""
-        self.attempts += 1
-        phase = self.plan[self.index].key_pose.phase
-        if self.attempts > self._settings.max_attempts:
+        self.state.attempts += 1
+        phase = self.present.key_pose.phase
+        if self.state.attempts > self._settings.max_attempts:
             self.stop(Status.NO_PROGRESS)
-            logger.info("giving up at key pose %d (%s): %s", self.index, phase, why)
+            logger.info("giving up at key pose %d (%s): %s", self.state.index, phase, why)
             return False
-        logger.info("trying key pose %d (%s) again: %s", self.index, phase, why)
+        logger.info("trying key pose %d (%s) again: %s", self.state.index, phase, why)
         return True
 
-    def entry_index(self) -> int:
+    def way_index(self) -> int:
         """The first key pose of the way to the present one, at the same anchor and after the last contact."""
-        index, place = self.index, self.plan[self.index].key_pose.anchor.place
+        index, place = self.state.index, self.present.key_pose.anchor.place
         while index > 0:
-            before = self.plan[index - 1].key_pose
+            before = self.targets[index - 1].key_pose
             if before.anchor.place != place or before.phase in CONTACTS:
                 break
             index -= 1
         return index
 
-    def retry_index(self) -> int:
+    def contact_index(self) -> int:
         """The first key pose of the approach that the present one depends on."""
-        index = self.index
-        while index > 0 and self.plan[index].key_pose.phase != "approach":
+        index = self.state.index
+        while index > 0 and self.targets[index].key_pose.phase != "approach":
             index -= 1
-        while index > 0 and self.plan[index - 1].key_pose.phase == "approach":
+        while index > 0 and self.targets[index - 1].key_pose.phase == "approach":
             index -= 1
         return index
+
+    def note_travel(self, hand: Hand) -> None:
+        """Take in how far a drawer or a knob has moved that has to be taken hold of again."""
+        key_pose, gone = self.present.key_pose, self.state.gone
+        shown = key_pose.axis  # the whole way, of which the target's own axis is what is left
+        if shown is None or not self.feels_handle(self.state.index):
+            return
+        so_far, further = gone.get(key_pose.sub_task, 0.0), max(self.approach.travelled, 0.0)
+        # Fingers that close on nothing where a handle slipped out: it went back when they let go.
+        is_empty = self.has_lost_grip(hand) and further < LEAST_TRAVEL * shown.amount
+        # At the end of its way too little would be left to feel whether it is held.
+        furthest = (1 - LEAST_TRAVEL) * shown.amount
+        gone[key_pose.sub_task] = 0.5 * so_far if is_empty else min(so_far + further, furthest)

@@ -22,20 +22,14 @@ SAME_PLACE_M = 0.05
 def references(candidate: Candidate, object_meant: Callable[[str], str]) -> dict[str, Reference]:
     """By the name that an entry gives an object: where the instruction says that it is.
 
-    Args:
-        candidate: An entry, and what of the instruction it carries out.
-        object_meant: The name under which an object is known that the instruction tells others by.
+    Its landmarks go by the names under which they are known, which `object_meant` tells.
     """
-
-    def known_words(where: Reference) -> Reference:
-        return Reference(where.relation, tuple(object_meant(name) for name in where.landmarks))
-
     said: dict[str, Reference] = {}
     for asked, known in zip(candidate.asked, candidate.entry.key.sub_tasks, strict=True):
-        if asked.target_where is not None:
-            said[known.target] = known_words(asked.target_where)
-        if asked.landmark_where is not None:
-            said[known.landmark] = known_words(asked.landmark_where)
+        told = ((known.target, asked.target_where), (known.landmark, asked.landmark_where))
+        for name, where in told:
+            if where is not None:
+                said[name] = Reference(where.relation, tuple(map(object_meant, where.landmarks)))
     return said
 
 
@@ -63,28 +57,24 @@ class Grounding:
         return changed
 
     def sort_out(
-        self, estimates: Mapping[str, PoseEstimate], layout: Mapping[str, Array]
+        self, estimates: Mapping[str, PoseEstimate], object_poses: Mapping[str, Array]
     ) -> dict[str, PoseEstimate]:
-        """What was seen of the objects that are meant.
+        """What was seen of the objects that are meant, given the poses of objects seen before.
 
         An object is told from its like once, when several are first seen; from then on those that are not
         meant are known by their places. One that cannot be told is ambiguous.
-
-        Args:
-            estimates: What a look brought.
-            layout: Poses ``T_world_obj`` ``(4, 4)`` of objects seen before.
         """
         places = {name: one.T_world_obj for name, one in estimates.items() if one.status == "found"}
-        known = {**places, **layout}
+        known = {**places, **object_poses}
         return {name: self._meant(name, one, known) for name, one in estimates.items()}
 
-    def _meant(self, name: str, estimate: PoseEstimate, layout: Mapping[str, Array]) -> PoseEstimate:
+    def _meant(self, name: str, estimate: PoseEstimate, object_poses: Mapping[str, Array]) -> PoseEstimate:
         if name in self._not_meant:
             return self._unless_another(name, estimate)
         if estimate.status == "not_found" or not estimate.others:
             return estimate
         candidates = (estimate.T_world_obj, *estimate.others)
-        landmarks = {mark: T for mark, T in layout.items() if mark != name}
+        landmarks = {mark: T for mark, T in object_poses.items() if mark != name}
         index = choose(self.said[name], candidates, landmarks) if name in self.said else None
         if index is None:
             where = self.said.get(name, "nothing")

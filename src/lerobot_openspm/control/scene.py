@@ -1,25 +1,48 @@
-"""Where the objects of one episode are, as far as its pictures tell."""
+"""What one episode knows of its scene: where the objects are, and what goes along with the hand."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 
-from lerobot_openspm.control.grounding import Grounding
-from lerobot_openspm.control.planning_context import PlanningContext
+import numpy as np
+
+from lerobot_openspm.control.grounding import Grounding, references
+from lerobot_openspm.control.planning import Plan, PlanningContext
+from lerobot_openspm.control.transfer import Target
 from lerobot_openspm.geometry.se3 import Array
-from lerobot_openspm.perception.tracking.camera_health import Fault
-from lerobot_openspm.perception.tracking.tracker import Tracker, TrackStatus
+from lerobot_openspm.memory.compose import Candidate
+from lerobot_openspm.perception.tracking.tracker import Tracker, TrackerSettings, TrackStatus
 from lerobot_openspm.types import Detections, Hand
 
-# An object that is not found is looked for again after this long; while things go well, all are.
+# An object that is not found is looked for again after this time; while things go well, all objects are.
 LOOK_AGAIN_S = 0.25
-# What looks wrong is looked at again after this long.
+# What looks wrong is looked at again after this time.
 SECOND_LOOK_S = 0.15
-# Without a sound picture of every camera the hand goes on for so long, then holds still, then gives up.
+# Without a sound picture of every camera the hand goes on for BLIND_S, then holds still, then gives up.
 BLIND_S, GIVE_UP_S = 0.5, 2.0
+# A hand that has gone this far beyond where it meets what it pushes has lost it. Where that point is not
+# known: a hand that has moved this much further than the object, and this much away from it.
+LEFT_BEHIND_M, OUTRUN_M = 0.025, 0.06
 
-# Names of objects, poses T_world_obj at which some are expected, seconds since the start -> what is detected.
-Detect = Callable[[Sequence[str], Mapping[str, Array], float], Detections]
+
+@dataclass(frozen=True)
+class LookRequest:
+    """What the controller wants to be looked for.
+
+    Attributes:
+        names: The objects.
+        expected: Poses ``T_world_obj`` ``(4, 4)`` at which those that were seen before are expected.
+        time_s: Seconds since the episode began.
+        held: Those of the objects that are taken to be in the hand.
+        back_to: The key pose to go back to after the look; None unless something is tried again.
+    """
+
+    names: tuple[str, ...]
+    expected: Mapping[str, Array]
+    time_s: float
+    held: frozenset[str]
+    back_to: int | None
 
 
 class SceneState:
@@ -28,81 +51,131 @@ class SceneState:
     Attributes:
         tracker: Follows every object that was looked for.
         grounding: Which of several like objects is meant.
-        detections: What the last look brought; None before the first.
+        detections: What the last look brought.
         altered: Objects that were opened or turned: they look different now, and stand still.
     """
 
     def __init__(self, context: PlanningContext):
         self._context = context
-        self.tracker = Tracker(context.yaw_periods, context.tracker)
+        self.tracker = Tracker(context.yaw_periods, TrackerSettings())
         self.grounding = Grounding()
-        self.detections: Detections | None = None
+        self.detections = Detections({}, {})
         self.altered: set[str] = set()
         self._step = -1
-        # Both at least one step; four looks a second whatever the robot's rate.
-        self._look_again_steps = max(1, round(LOOK_AGAIN_S / context.step_s))
-        self._second_look_steps = max(1, round(SECOND_LOOK_S / context.step_s))
-        self._looked_at_step = -self._look_again_steps
+        self._looked_at_step = -self._steps(LOOK_AGAIN_S)
+
+    # Looking.
 
     def predict(self) -> None:
         """Go one control step on."""
         self._step += 1
         self.tracker.predict(self._context.step_s)
 
-    def look(self, names: Sequence[str], hand: Hand, detect: Detect) -> frozenset[str]:
-        """Look for objects; the names of those that are somewhere else than before."""
-        step_s = self._context.step_s
-        waited_s = min(self._waited_steps, self._look_again_steps) * step_s
+    def ground(self, candidates: Sequence[Candidate]) -> None:
+        """Take in which of several like objects a part of the instruction is about."""
+        meant = self._context.object_meant
+        said = {k: where for one in candidates for k, where in references(one, meant).items()}
+        others = self.grounding.hear(said)
+        self.tracker.forget(others)
+        self.altered -= others
+
+    def look(self, names: Sequence[str], hand: Hand, back_to: int | None = None) -> LookRequest:
+        """A look for some objects, now."""
         expected = {k: T for k, T in self.tracker.poses(hand.T_world_ee).items() if k in names}
-        self.detections = detect(names, expected, self._step * step_s)
+        held = self.tracker.held & frozenset(names)
+        return LookRequest(tuple(names), expected, self._step * self._context.step_s, held, back_to)
+
+    def take_in(self, detections: Detections, hand: Hand) -> frozenset[str]:
+        """Take in what a look brought; the names of the objects that are somewhere else than before.
+
+        Raises:
+            InstructionError: The instruction tells like objects apart by a relation that is not known.
+        """
+        waited_steps = min(self._step - self._looked_at_step, self._steps(LOOK_AGAIN_S))
+        waited_s = waited_steps * self._context.step_s
+        self.detections = detections
         self._looked_at_step = self._step
         known = {**self._context.surfaces, **self.tracker.poses(hand.T_world_ee)}
-        meant = self.grounding.sort_out(self.detections.estimates, known)
+        meant = self.grounding.sort_out(detections.estimates, known)
         return self.tracker.look(meant, hand.T_world_ee, waited_s)
-
-    # When to look.
 
     @property
     def has_just_looked(self) -> bool:
         """Whether the last observation was looked at."""
         return self._looked_at_step == self._step
 
-    @property
-    def is_time_for_another_look(self) -> bool:
-        """Whether what was not found may be looked for again."""
-        return self._waited_steps >= self._look_again_steps
+    def is_due(self, seconds: float) -> bool:
+        """Whether the last look is so long ago; at least one step, whatever the robot's rate."""
+        return self._step - self._looked_at_step >= self._steps(seconds)
 
-    @property
-    def is_time_for_a_second_look(self) -> bool:
-        """Whether what looked wrong may be looked at again."""
-        return self._waited_steps >= self._second_look_steps
-
-    @property
-    def _waited_steps(self) -> int:
-        return self._step - self._looked_at_step
+    def _steps(self, seconds: float) -> int:
+        return max(1, round(seconds / self._context.step_s))
 
     # What was seen.
 
     @property
-    def faults(self) -> Mapping[str, Fault]:
-        """Cameras that were no use at the last look."""
-        return {} if self.detections is None else self.detections.faults
-
-    @property
     def is_blind(self) -> bool:
         """Whether a camera gave no sound picture for long enough to hold still."""
-        return any(fault.seconds >= BLIND_S for fault in self.faults.values())
+        return any(fault.seconds >= BLIND_S for fault in self.detections.faults.values())
 
     def recognised(self) -> set[str]:
         """The objects that the last look recognised."""
-        if self.detections is None:
-            return set()
         return {name for name in self.detections.estimates if self.tracker.is_seen(name)}
 
-    def lost(self, names: Sequence[str]) -> list[str]:
-        """Those of the objects that were seen before and are gone."""
-        return [name for name in names if self.tracker.status(name) is TrackStatus.LOST]
+    def those(self, status: TrackStatus, names: Sequence[str]) -> list[str]:
+        """Those of some objects that have a status."""
+        return [name for name in names if self.tracker.status(name) is status]
 
-    def is_any_stale(self, names: Sequence[str]) -> bool:
-        """Whether one of the objects was not seen for a while."""
-        return any(self.tracker.status(name) is TrackStatus.STALE for name in names)
+    # What goes along with the hand.
+
+    def pass_key_pose(self, plan: Plan, passed: Target, after: Target, hand: Hand) -> None:
+        """Take in what the hand took hold of, pushes or let go at a key pose, by the one after it."""
+        pose, phase_after = passed.key_pose, after.key_pose.phase
+        is_carried = pose.phase == "grasp" and phase_after not in ("open", "turn")
+        # Where the path of a push is known, the target is held once the hand has met it; see meet().
+        is_pushed = phase_after == "push" != pose.phase and after.push is None
+        if is_carried:
+            self.tracker.hold(pose.anchor.place, hand.T_world_ee)
+        elif is_pushed:
+            self.tracker.hold(plan.sub_task(after.key_pose).target, hand.T_world_ee)
+        elif pose.phase == "release" or pose.phase == "push" != phase_after:
+            self.tracker.release(self.tracker.held, hand.T_world_ee)
+        elif pose.phase in ("open", "turn"):
+            self.altered.add(pose.anchor.place)
+            if pose.phase == "open" and plan.sub_task(pose).operation != "close":
+                self.tracker.cover()
+
+    def meet(self, target: Target, hand: Hand) -> None:
+        """What is pushed on the way to a key pose goes along once the hand has met it."""
+        if target.push and self._beyond(target, hand) >= 0:
+            self.tracker.hold(target.push.target, hand.T_world_ee)
+
+    def is_left_behind(
+        self, name: str, plan: Plan, targets: Sequence[Target], index: int, hand: Hand
+    ) -> bool:
+        """Whether an object that turned out not to be in the hand stays behind, on the way to a key pose."""
+        target = targets[index]
+        if target.key_pose.phase != "push":
+            return True
+        if target.push is not None:
+            return target.push.target != name or self._beyond(target, hand) > LEFT_BEHIND_M
+        first = index
+        while first > 0 and targets[first - 1].key_pose.phase == "push":
+            first -= 1
+        began = targets[first - 1].T_world_ee if first > 0 else plan.T_world_ee
+        was, place = plan.object_poses[name], self.tracker.poses(hand.T_world_ee)[name]
+        further = _apart(hand.T_world_ee, began) - _apart(place, was)
+        # On its way to the object the hand has not outrun it, however far that is.
+        return min(further, _apart(hand.T_world_ee, place) - _apart(began, was)) > OUTRUN_M
+
+    def _beyond(self, target: Target, hand: Hand) -> float:
+        """Metres by which the hand has gone beyond where it meets what it pushes."""
+        if target.push is None:
+            return -np.inf
+        place = self.tracker.poses(hand.T_world_ee)[target.push.target][:3, 3]
+        return target.push.beyond(hand.T_world_ee, target.T_world_ee, place)
+
+
+def _apart(T: Array, other: Array) -> float:
+    """Horizontal distance between the origins of two poses ``(4, 4)``, metres."""
+    return float(np.linalg.norm(T[:2, 3] - other[:2, 3]))

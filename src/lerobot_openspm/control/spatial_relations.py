@@ -1,23 +1,20 @@
 """Which of several objects of one name is meant: told from where they are, and from nothing else.
 
-Left, right, front and back are said as a person sees the table who stands opposite the robot: its left is
-that person's right. LIBERO says it that way too. Its camera ``agentview`` and the tabletop's ``front`` look
-along the world's -x at a robot that looks along +x; there left is -y, right is +y, front (near that person)
-is +x, and back is -x. A scene whose robot looks another way passes its own ``looking``.
+Left, right, front and back are said by a person who stands opposite the robot: the robot looks along the
+world's +x and the person along -x, so left is -y, right is +y, front (near the person) is +x, and back is -x.
+LIBERO says it that way too; its camera ``agentview`` and the tabletop's ``front`` look as the person does.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 
 import numpy as np
 
 from lerobot_openspm.errors import InstructionError
 from lerobot_openspm.geometry.se3 import Array
 from lerobot_openspm.types import Reference
-
-# Where a person looks who stands opposite a robot that looks along the world's x.
-OPPOSITE_THE_ROBOT = np.array([-1.0, 0.0])
 
 # The second best has to be this much worse than the best, in metres, for the best to be meant.
 MARGIN_M = 0.02
@@ -28,22 +25,14 @@ HEIGHT_ERROR_M = 0.01
 # How much a metre to the side counts beside a metre of distance, beyond half a right angle.
 SIDEWAYS_SHARE = 3.0
 
-# Costs (n,) in metres of candidates (n, 3), given landmarks (k, 3): the least is meant. Infinite: not at all,
-# not even if the candidate lay so many metres more favourably.
-_Cost = Callable[[Array, Array, float], Array]
-
+_SIDES = {"right": (0.0, 1.0), "left": (0.0, -1.0), "back": (-1.0, 0.0), "front": (1.0, 0.0)}
 _ALIASES = {
     "left of": "left", "right of": "right", "front of": "front", "in front of": "front", "behind": "back",
     "center": "middle",
 }  # fmt: skip
 
 
-def choose(
-    reference: Reference,
-    candidates: Sequence[Array],
-    landmarks: Mapping[str, Array],
-    looking: Array = OPPOSITE_THE_ROBOT,
-) -> int | None:
+def choose(reference: Reference, candidates: Sequence[Array], landmarks: Mapping[str, Array]) -> int | None:
     """Tell which of several objects a reference means.
 
     Args:
@@ -51,8 +40,6 @@ def choose(
         candidates: Poses ``T_world_obj`` ``(4, 4)`` of the objects of its name; z is up, origins at the
             middle of what they stand on.
         landmarks: Poses ``T_world_obj`` ``(4, 4)`` by name of the objects that the reference may name.
-        looking: Horizontal direction ``(2,)`` in the world in which the speaker looks; only left, right,
-            front and back depend on it.
 
     Returns:
         Index of the candidate; that of the only one whatever is said of it. None where no candidate is
@@ -62,9 +49,9 @@ def choose(
         InstructionError: The relation is none of those that can be told.
     """
     relation = _ALIASES.get(reference.relation, reference.relation)
-    cost = _costs(np.asarray(looking, float)).get((relation, len(reference.landmarks)))
+    cost = _COSTS.get((relation, len(reference.landmarks)))
     if cost is None:
-        known = sorted(f"{name} ({count} landmarks)" for name, count in _costs(OPPOSITE_THE_ROBOT))
+        known = sorted(f"{name} ({count} landmarks)" for name, count in _COSTS)
         raise InstructionError(
             f"cannot tell which object is {reference.relation!r} of {len(reference.landmarks)} landmarks; "
             f"expected one of {', '.join(known)}; say it by one of these"
@@ -83,60 +70,36 @@ def choose(
     return best if is_clear else None
 
 
-def _costs(looking: Array) -> dict[tuple[str, int], _Cost]:
-    """How to judge every relation with its number of landmarks."""
-    away = looking / np.linalg.norm(looking)
-    right = np.array([away[1], -away[0]])
-    sides = {"right": right, "left": -right, "back": away, "front": -away}
-    among: dict[tuple[str, int], _Cost] = {(name, 0): _furthest(way) for name, way in sides.items()}
-    beside: dict[tuple[str, int], _Cost] = {(name, 1): _at_side(way) for name, way in sides.items()}
-    return {
-        **among,
-        **beside,
-        ("middle", 0): _middle,
-        ("middle", 1): _near_middle,
-        ("between", 2): _between,
-        ("next to", 1): _next_to,
-        ("on", 1): _above,
-        ("in", 1): _above,
-        ("under", 1): _below,
-    }
+# Each relation gives costs (n,) in metres of candidates (n, 3), given landmarks (k, 3). The least is meant.
+# An infinite cost excludes a candidate, even if it lay more favourably by `slack` metres.
 
 
-def _furthest(way: Array) -> _Cost:
+def _furthest(places: Array, marks: Array, slack: float, way: Array) -> Array:
     """The one that is furthest in a direction ``(2,)``."""
-
-    def cost(places: Array, *_: object) -> Array:
-        return -places[:, :2] @ way
-
-    return cost
+    return -places[:, :2] @ way
 
 
-def _at_side(way: Array) -> _Cost:
+def _at_side(places: Array, marks: Array, slack: float, way: Array) -> Array:
     """The nearest one on one side of the landmark: within half a right angle of a direction ``(2,)``."""
-
-    def cost(places: Array, marks: Array, slack: float) -> Array:
-        offset = places[:, :2] - marks[0, :2]
-        along = offset @ way
-        across = np.abs(offset @ np.array([way[1], -way[0]]))
-        sideways = SIDEWAYS_SHARE * np.maximum(across - along, 0.0)
-        return np.where(along >= MARGIN_M - slack, np.linalg.norm(offset, axis=1) + sideways, np.inf)
-
-    return cost
+    offset = places[:, :2] - marks[0, :2]
+    along = offset @ way
+    across = np.abs(offset @ np.array([way[1], -way[0]]))
+    sideways = SIDEWAYS_SHARE * np.maximum(across - along, 0.0)
+    return np.where(along >= MARGIN_M - slack, np.linalg.norm(offset, axis=1) + sideways, np.inf)
 
 
-def _middle(places: Array, *_: object) -> Array:
+def _middle(places: Array, marks: Array, slack: float) -> Array:
     """The one that is nearest to all others; of two, neither."""
     apart = np.linalg.norm(places[:, None, :2] - places[None, :, :2], axis=-1)
     return apart.sum(axis=1)
 
 
-def _near_middle(places: Array, marks: Array, _: float) -> Array:
+def _near_middle(places: Array, marks: Array, slack: float) -> Array:
     """The one that is nearest to the middle of the landmark, as seen from above."""
     return np.linalg.norm(places[:, :2] - marks[0, :2], axis=1)
 
 
-def _between(places: Array, marks: Array, _: float) -> Array:
+def _between(places: Array, marks: Array, slack: float) -> Array:
     """The one that makes the way between two landmarks longer by least."""
     legs = np.linalg.norm(places[:, None, :2] - marks[None, :, :2], axis=-1).sum(axis=1)
     return legs - float(np.linalg.norm(marks[0, :2] - marks[1, :2]))
@@ -144,17 +107,31 @@ def _between(places: Array, marks: Array, _: float) -> Array:
 
 def _next_to(places: Array, marks: Array, slack: float) -> Array:
     """The nearest one that is not on or in the landmark."""
-    away = np.linalg.norm(places[:, :2] - marks[0, :2], axis=1)
+    away = _near_middle(places, marks, slack)
     return np.where(away < WITHIN_M - slack, np.inf, away)
 
 
 def _above(places: Array, marks: Array, slack: float) -> Array:
     """The nearest one, as seen from above, that is not lower than the landmark."""
-    away = np.linalg.norm(places[:, :2] - marks[0, :2], axis=1)
-    return np.where(places[:, 2] < marks[0, 2] - HEIGHT_ERROR_M - slack, np.inf, away)
+    too_low = places[:, 2] < marks[0, 2] - HEIGHT_ERROR_M - slack
+    return np.where(too_low, np.inf, _near_middle(places, marks, slack))
 
 
 def _below(places: Array, marks: Array, slack: float) -> Array:
     """The nearest one, as seen from above, that is not higher than the landmark."""
-    away = np.linalg.norm(places[:, :2] - marks[0, :2], axis=1)
-    return np.where(places[:, 2] > marks[0, 2] + HEIGHT_ERROR_M + slack, np.inf, away)
+    too_high = places[:, 2] > marks[0, 2] + HEIGHT_ERROR_M + slack
+    return np.where(too_high, np.inf, _near_middle(places, marks, slack))
+
+
+# By relation and number of landmarks.
+_COSTS: dict[tuple[str, int], Callable[[Array, Array, float], Array]] = {
+    **{(side, 0): partial(_furthest, way=np.array(way)) for side, way in _SIDES.items()},
+    **{(side, 1): partial(_at_side, way=np.array(way)) for side, way in _SIDES.items()},
+    ("middle", 0): _middle,
+    ("middle", 1): _near_middle,
+    ("between", 2): _between,
+    ("next to", 1): _next_to,
+    ("on", 1): _above,
+    ("in", 1): _above,
+    ("under", 1): _below,
+}

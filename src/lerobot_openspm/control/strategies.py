@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal, get_args
+from typing import get_args
 
 import numpy as np
 
@@ -11,22 +11,20 @@ from lerobot_openspm.control.transfer import Target
 from lerobot_openspm.geometry import se3
 from lerobot_openspm.geometry.se3 import Array
 from lerobot_openspm.memory.robot import RobotModel
-from lerobot_openspm.types import Hand
+from lerobot_openspm.types import Execution, Hand
 
-Execution = Literal["open_loop", "closed_loop", "closed_loop_trc"]
-
-# A correction that leaves this share of the residual has met something solid ...
+# A correction that leaves more than this share of the residual is blocked by something solid.
 STUCK_SHARE = 0.9
-# ... and the key pose counts as met within this multiple of the tolerance: what is touched is in the way.
+# A blocked key pose is met within this multiple of the tolerance, because what is touched is in the way.
 BLOCKED_SHARE = 3.0
-# Each step of a correction makes good this share of the residual, and this many steps are one correction.
-# Every further one pushes harder by as much: friction holds a hand that asks for millimetres.
+# Each step of a correction makes good this share of the residual, and five steps are one correction. Every
+# further correction adds the same share again, because friction stops a hand that asks for millimetres.
 CORRECTION_SHARE, CORRECTION_STEPS = 0.2, 5
 
 
 @dataclass(frozen=True)
 class ControlSettings:
-    """How key poses are followed.
+    """How key poses are followed. The numbers were set by hand on the tabletop, and serve LIBERO as well.
 
     Attributes:
         execution: ``open_loop`` plans every chunk from where the hand should be; ``closed_loop`` from where
@@ -53,7 +51,6 @@ class Approach:
     """The way to one key pose.
 
     Attributes:
-        target: The key pose.
         start: The hand's pose ``T_world_ee`` ``(4, 4)`` where the way begins.
         nominal_steps: How long the way should take, by the demonstration and by its length here.
         steps: Control steps taken so far.
@@ -64,9 +61,8 @@ class Approach:
         travelled: How far a drawer or a knob has followed the hand, metres or radians.
     """
 
-    target: Target
     start: Array
-    nominal_steps: int
+    nominal_steps: int = 0
     steps: int = 0
     corrections: int = 0
     late_steps: int = 0
@@ -81,53 +77,40 @@ class Approach:
 
 
 class ClosedLoop:
-    """Every chunk is planned from where the hand is; a key pose counts as met when its time is up."""
+    """Every chunk is planned from where the hand is; a key pose is met when it is near or its time is up."""
 
-    looks_around = True  # whether pictures are looked at once there is a plan
+    measures = True  # whether the hand and the scene are looked at once there is a plan
     feels_fingers = False  # whether a grip that was lost is noticed
 
     def __init__(self, settings: ControlSettings, robot: RobotModel):
         self._settings, self._robot = settings, robot
 
-    def begin(self, hand: Hand) -> None:
-        """A plan is begun."""
-
-    def enter(self, before: Target | None) -> None:
-        """The next key pose is approached, `before` was reached."""
-
-    def here(self, hand: Hand) -> Array:
-        """Where the hand is taken to be, ``T_world_ee`` ``(4, 4)``."""
-        return hand.T_world_ee
-
-    def is_met(self, approach: Approach, hand: Hand) -> bool:
+    def is_met(self, target: Target, approach: Approach, hand: Hand) -> bool:
         """Whether a key pose in motion is met."""
-        return approach.is_time_up or self._is_near(approach, hand)
+        return approach.is_time_up or self._is_near(target, approach, hand)
 
-    def from_chunk(self, action: Array, approach: Approach, hand: Hand) -> Array:
-        """What is done for an action ``(7,)`` of the flow model."""
+    def from_chunk(self, action: Array, target: Target, approach: Approach, hand: Hand) -> Array:
+        """The action ``(7,)`` that is taken for one of the flow model's."""
         return action
 
-    def correct(self, approach: Approach, hand: Hand) -> Array | None:
+    def correct(self, target: Target, approach: Approach, hand: Hand) -> Array | None:
         """An action ``(7,)`` instead of the next chunk's; None where a chunk is wanted."""
         return None
 
-    def acted(self, action: Array) -> None:
-        """An action ``(7,)`` was given out."""
+    def toward(self, target: Target, here: Array, share: float = CORRECTION_SHARE) -> Array:
+        """An action ``(7,)`` straight from a hand pose ``(4, 4)`` to the key pose, fingers as it says.
 
-    def toward(self, target: Target, hand: Hand, share: float = CORRECTION_SHARE) -> Array:
-        """An action ``(7,)`` straight towards the key pose, and the fingers as it says.
-
-        A hand that waits for its fingers is kept there by it: nothing in the flow model's condition says how
-        far a grasp has come, and drifting a centimetre under closing fingers loses it.
+        While the fingers open or close it keeps the hand in place. The flow model's condition does not tell
+        how far a grasp has come, and a hand that drifts by a centimetre loses the object.
         """
         gains = self._robot.gains
-        residual = se3.increment(self.here(hand), target.T_world_ee)
+        residual = se3.increment(here, target.T_world_ee)
         motion: Array = np.where(gains > 0, share * residual / np.maximum(gains, 1e-9), 0.0)
         motion = motion / max(1.0, float(np.abs(motion).max()))
         return np.append(motion, self._robot.command(target.key_pose.closed))
 
-    def _is_near(self, approach: Approach, hand: Hand) -> bool:
-        target, settings = approach.target, self._settings
+    def _is_near(self, target: Target, approach: Approach, hand: Hand) -> bool:
+        settings = self._settings
         metres, radians = se3.distances(hand.T_world_ee, target.T_world_ee)
         if target.precise:
             share = max(float(metres) / settings.residual_m, float(radians) / settings.residual_rad)
@@ -136,34 +119,13 @@ class ClosedLoop:
 
 
 class OpenLoop(ClosedLoop):
-    """Every chunk is planned from where the hand should be by the actions given out so far."""
+    """Every chunk is planned from where the hand should be; a key pose is met when its time is up."""
 
-    looks_around = False
+    measures = False
 
-    def __init__(self, settings: ControlSettings, robot: RobotModel):
-        super().__init__(settings, robot)
-        self._believed = np.eye(4)
-
-    def begin(self, hand: Hand) -> None:
-        """See :meth:`ClosedLoop.begin`."""
-        self._believed = hand.T_world_ee
-
-    def enter(self, before: Target | None) -> None:
-        """See :meth:`ClosedLoop.enter`."""
-        if before is not None:
-            self._believed = before.T_world_ee
-
-    def here(self, hand: Hand) -> Array:
-        """Where the hand should be."""
-        return self._believed
-
-    def is_met(self, approach: Approach, hand: Hand) -> bool:
-        """Whether its time is up: nothing is measured."""
+    def is_met(self, target: Target, approach: Approach, hand: Hand) -> bool:
+        """Whether the time for a key pose is up."""
         return approach.is_time_up
-
-    def acted(self, action: Array) -> None:
-        """See :meth:`ClosedLoop.acted`."""
-        self._believed = se3.apply_increment(self._believed, action[:6] * self._robot.gains)
 
 
 class ClosedLoopTRC(ClosedLoop):
@@ -174,34 +136,34 @@ class ClosedLoopTRC(ClosedLoop):
 
     feels_fingers = True
 
-    def is_met(self, approach: Approach, hand: Hand) -> bool:
+    def is_met(self, target: Target, approach: Approach, hand: Hand) -> bool:
         """Whether the hand is within the key pose's tolerance."""
-        return self._is_near(approach, hand)
+        return self._is_near(target, approach, hand)
 
-    def from_chunk(self, action: Array, approach: Approach, hand: Hand) -> Array:
-        """The flow model's action, kept on the way of a push."""
-        return (
-            self._kept_on_way(action, approach, hand) if approach.target.key_pose.phase == "push" else action
-        )
+    def from_chunk(self, action: Array, target: Target, approach: Approach, hand: Hand) -> Array:
+        """The flow model's action, kept on the path of a push."""
+        is_pushing = target.key_pose.phase == "push"
+        return self._kept_on_way(action, target, approach, hand) if is_pushing else action
 
-    def correct(self, approach: Approach, hand: Hand) -> Array | None:
+    def correct(self, target: Target, approach: Approach, hand: Hand) -> Array | None:
         """Make good what the flow model has left of the way, once its time is up."""
         if not approach.is_time_up:
             return None
         if approach.late_steps % CORRECTION_STEPS == 0:
             approach.corrections += 1
-            left = float(se3.distance(hand.T_world_ee, approach.target.T_world_ee))
+            left = float(se3.distance(hand.T_world_ee, target.T_world_ee))
             approach.is_blocked = left > STUCK_SHARE * approach.left
             approach.left = left
         approach.late_steps += 1
-        return self.toward(approach.target, hand, min(1.0, CORRECTION_SHARE * approach.corrections))
+        share = min(1.0, CORRECTION_SHARE * approach.corrections)
+        return self.toward(target, hand.T_world_ee, share)
 
-    def _kept_on_way(self, action: Array, approach: Approach, hand: Hand) -> Array:
-        """An action whose motion across the straight way to the key pose leads back to it.
+    def _kept_on_way(self, action: Array, target: Target, approach: Approach, hand: Hand) -> Array:
+        """An action whose motion across the straight way to the key pose leads back to that way.
 
-        Nothing holds what is pushed: a hand that strays by millimetres slips over or past it.
+        Nothing holds what is pushed. A hand that strays by millimetres slips over or past it.
         """
-        here, end = hand.T_world_ee[:3, 3], approach.target.T_world_ee[:3, 3]
+        here, end = hand.T_world_ee[:3, 3], target.T_world_ee[:3, 3]
         way = end - approach.start[:3, 3]
         length = float(np.linalg.norm(way))
         if length < 1e-9 or self._robot.metres_per_action <= 0:

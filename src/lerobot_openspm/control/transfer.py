@@ -7,15 +7,65 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from lerobot_openspm.control.pushes import PushWays, push_ways
 from lerobot_openspm.geometry import se3
 from lerobot_openspm.geometry.se3 import Array
-from lerobot_openspm.memory.entry import CONTACT_PHASES, Axis, MemoryEntry, MemoryKeyPose
+from lerobot_openspm.memory.entry import CONTACT_PHASES, Axis, MemoryEntry, MemoryKeyPose, Outcome
 
 # How far the hand backs off at the end.
 RETREAT_M = 0.06
-# A hand that is this little too low need not rise.
+# A hand that is at most this much too low need not rise.
 LEVEL_M = 0.02
+# The direction of a push shorter than this is within the noise of the object's position.
+MIN_PUSH_M = 0.005
+
+
+@dataclass(frozen=True)
+class PushPath:
+    """A push in the demonstration and here, each from where the target is to where it should end.
+
+    The object moves in the direction of the hand, and ends before the hand. So the hand's position is kept
+    relative to the path: beside the target at its start, and beside the outcome at its end.
+
+    Attributes:
+        target: The object that is pushed.
+        shown: Start and end ``(2, 3)`` of the target in the demonstration, in the world.
+        now: Start and end ``(2, 3)`` of the target here.
+        is_by_landmark: Whether none of its key poses belongs to the target.
+    """
+
+    target: str
+    shown: Array
+    now: Array
+    is_by_landmark: bool = False
+
+    def position(self, pose: MemoryKeyPose, layout_shown: Mapping[str, Array]) -> Array:
+        """Where the hand goes ``(3,)`` for a key pose of the push."""
+        is_at_start = pose.anchor.place == self.target or (self.is_by_landmark and pose.phase == "approach")
+        place = 0 if is_at_start else 1
+        T_world_ee = pose.anchor.frame(layout_shown) @ pose.T_obj_ee
+        turn = _heading(self.now) - _heading(self.shown)
+        if min(_length(self.shown), _length(self.now)) < MIN_PUSH_M:
+            turn = 0.0
+        offset = T_world_ee[:3, 3] - self.shown[place]
+        position = self.now[place] + se3.apply(se3.from_yaw(np.zeros(3), turn), offset[None])[0]
+        # The path lies at one height. That of its end is known best, because the landmark stands still.
+        position[2] = self.now[1, 2] + T_world_ee[2, 3] - self.shown[1, 2]
+        return position
+
+    def beyond(self, T_world_ee: Array, T_world_end: Array, target: Array) -> float:
+        """Metres along the path by which the hand has passed the point where it meets its target.
+
+        There the hand is as far ahead of the target as at the end of the push.
+
+        Args:
+            T_world_ee: The hand ``(4, 4)``.
+            T_world_end: Where the push ends ``(4, 4)``.
+            target: Where the target is ``(3,)``.
+        """
+        path = (self.now[1] - self.now[0])[:2]
+        meeting = T_world_end[:3, 3] + target - self.now[1]
+        gone = float((T_world_ee[:3, 3] - meeting)[:2] @ path)
+        return gone / max(_length(self.now), MIN_PUSH_M)
 
 
 @dataclass(frozen=True)
@@ -27,15 +77,15 @@ class Target:
         key_pose: The key pose it was carried over from.
         precise: Whether it is met by terminal residual correction, or only passed by.
         axis: The constraint that the way here follows, its direction in the world; None in free space.
-        push: The way of what is pushed on the way here; None where it is not known or turns, or nothing is
-            pushed.
+        push: The path of what is pushed on the way here; None where nothing is pushed, or the path is not
+            known or turns.
     """
 
     T_world_ee: Array
     key_pose: MemoryKeyPose
     precise: bool
     axis: Axis | None = None
-    push: PushWays | None = None
+    push: PushPath | None = None
 
 
 def transfer_pose(T_world_obj: Array, T_obj_ee: Array) -> Array:
@@ -45,7 +95,7 @@ def transfer_pose(T_world_obj: Array, T_obj_ee: Array) -> Array:
 
 def transfer(
     entry: MemoryEntry,
-    layout: Mapping[str, Array],
+    object_poses: Mapping[str, Array],
     yaw_periods: Mapping[str, float],
     T_world_ee: Array,
     gone: Mapping[int, float] | None = None,
@@ -57,36 +107,90 @@ def transfer(
 
     Args:
         entry: The entry to execute.
-        layout: Present poses ``T_world_obj`` ``(4, 4)`` of its anchors.
+        object_poses: Present poses ``T_world_obj`` ``(4, 4)`` of its anchors.
         yaw_periods: Angle by object that turns it into itself, radians; 0 for a body of revolution.
         T_world_ee: Present hand pose ``(4, 4)``.
-        gone: How far a drawer or a knob has gone already, by sub-task, metres or radians.
+        gone: How far a drawer or a knob has moved already, by sub-task, metres or radians.
     """
     chosen: dict[str, Array] = {}
     targets: list[Target] = []
     before = T_world_ee
-    pushes = push_ways(entry, layout)
+    paths = push_paths(entry, object_poses)
     for i, pose in enumerate(entry.key_poses):
         for name in pose.anchor.objects:
             if name not in chosen:
-                chosen[name] = _nearest_equivalent(name, pose, {**layout, **chosen}, yaw_periods, before)
+                chosen[name] = _nearest_equivalent(
+                    name, pose, {**object_poses, **chosen}, yaw_periods, before
+                )
         T_world_anchor = pose.anchor.frame(chosen)
         before = transfer_pose(T_world_anchor, pose.T_obj_ee)
-        ways = pushes.get(pose.sub_task)
-        if ways is not None:
-            before = se3.transform(before[:3, :3], ways.position(pose, entry.layout))
+        path = paths.get(pose.sub_task)
+        if path is not None:
+            before = se3.transform(before[:3, :3], path.position(pose, entry.layout))
         axis = pose.axis
         if axis is not None:
             axis = replace(axis, direction=T_world_anchor[:3, :3] @ axis.direction)
-        # Where a push turns, the hand meets its target elsewhere than where the way ends.
+        # Where a push turns, the hand meets its target elsewhere than where the path ends.
         is_straight = sum(p.phase == "push" and p.sub_task == pose.sub_task for p in entry.key_poses) == 1
-        push = ways if pose.phase == "push" and is_straight else None
+        push = path if pose.phase == "push" and is_straight else None
         targets.append(Target(before, pose, _is_precise(entry, i), axis, push))
     for sub_task, amount in (gone or {}).items():
         targets = _gone_on(targets, sub_task, amount)
     if targets and entry.key.sub_tasks[-1].operation == "put":
         targets += _release(targets)
     return tuple(targets) + _retreat(targets)
+
+
+def push_paths(entry: MemoryEntry, object_poses: Mapping[str, Array]) -> dict[int, PushPath]:
+    """The paths of an entry's pushes by sub-task, of those whose outcome is known."""
+    by_landmark = pushed_by_landmark(entry)
+    paths: dict[int, PushPath] = {}
+    for outcome in _push_outcomes(entry):
+        if any(name not in poses for name in outcome.objects for poses in (entry.layout, object_poses)):
+            continue
+        shown = np.stack([entry.layout[outcome.target][:3, 3], outcome.place_shown(entry.layout)])
+        now = np.stack([object_poses[outcome.target][:3, 3], outcome.place(object_poses)])
+        is_by_landmark = outcome.sub_task in by_landmark
+        paths[outcome.sub_task] = PushPath(outcome.target, shown, now, is_by_landmark)
+    return paths
+
+
+def pushed_by_landmark(entry: MemoryEntry) -> dict[int, str]:
+    """By sub-task, the targets of an entry's pushes that none of the push's key poses belongs to."""
+    return {
+        outcome.sub_task: outcome.target
+        for outcome in _push_outcomes(entry)
+        if not any(
+            outcome.target in pose.anchor.objects
+            for pose in entry.key_poses
+            if pose.sub_task == outcome.sub_task
+        )
+    }
+
+
+def _push_outcomes(entry: MemoryEntry) -> list[Outcome]:
+    """The outcomes of an entry's pushes.
+
+    A sub-task that also grasps its target is no push: the target goes where the hand carries it.
+    """
+    pushing, grasping = (
+        {pose.sub_task for pose in entry.key_poses if pose.phase == phase} for phase in ("push", "grasp")
+    )
+    return [one for one in entry.outcomes if one.sub_task in pushing - grasping]
+
+
+def rise(last: Target, height: float) -> tuple[Target, ...]:
+    """Straight up from the last key pose to a height in metres, if that is higher.
+
+    The next part of an instruction then begins as its demonstrations did: clear of what stands around, and
+    without the hand between the cameras and the objects.
+    """
+    T_world_ee = last.T_world_ee.copy()
+    if height - T_world_ee[2, 3] < LEVEL_M:
+        return ()
+    T_world_ee[2, 3] = height
+    key_pose = replace(last.key_pose, phase="retreat", n_steps=1, dwell=False, axis=None, confidence=0.5)
+    return (Target(T_world_ee, key_pose, precise=False),)
 
 
 def _is_precise(entry: MemoryEntry, i: int) -> bool:
@@ -104,7 +208,7 @@ def _is_precise(entry: MemoryEntry, i: int) -> bool:
 
 
 def _gone_on(targets: Sequence[Target], sub_task: int, amount: float) -> list[Target]:
-    """Key poses of a sub-task whose drawer or knob has gone part of its way: take it where it is."""
+    """Key poses of a sub-task whose drawer or knob has moved part of its way: take it where it is."""
     found = ((i, one.axis) for i, one in enumerate(targets) if one.axis and one.key_pose.sub_task == sub_task)
     end, axis = next(found, (0, None))
     if axis is None:
@@ -121,7 +225,7 @@ def _gone_on(targets: Sequence[Target], sub_task: int, amount: float) -> list[Ta
 def _release(targets: Sequence[Target]) -> list[Target]:
     """Letting go at the end, for a demonstration that was cut with the object still in the hand.
 
-    A benchmark ends an episode when its goal first holds, which an object that is being lowered may do.
+    A benchmark ends an episode when its goal first holds, which can be while the object is being lowered.
     """
     last = targets[-1]
     if last.key_pose.phase != "place":
@@ -141,8 +245,8 @@ def _release(targets: Sequence[Target]) -> list[Target]:
 def _retreat(targets: Sequence[Target]) -> tuple[Target, ...]:
     """Backing off at the end, for a demonstration that was cut when its goal was reached.
 
-    The hand leaves the way it came: against the direction in which it arrived at its last contact, seen from
-    the hand.
+    The hand leaves the way it came: against the direction in which it arrived at its last contact, in the
+    hand's frame.
     """
     arrivals = [
         i
@@ -163,29 +267,23 @@ def _retreat(targets: Sequence[Target]) -> tuple[Target, ...]:
     return (Target(contact.T_world_ee @ step, key_pose, precise=False),)
 
 
-def rise(last: Target, height: float) -> tuple[Target, ...]:
-    """Straight up from the last key pose to a height in metres, if that is higher.
-
-    The next task begins from there as its demonstrations did: clear of what stands around, and without the
-    hand between the cameras and the objects.
-    """
-    T_world_ee = last.T_world_ee.copy()
-    if height - T_world_ee[2, 3] < LEVEL_M:
-        return ()
-    T_world_ee[2, 3] = height
-    key_pose = replace(last.key_pose, phase="retreat", n_steps=1, dwell=False, axis=None, confidence=0.5)
-    return (Target(T_world_ee, key_pose, precise=False),)
-
-
 def _nearest_equivalent(
     name: str,
     pose: MemoryKeyPose,
-    layout: Mapping[str, Array],
+    object_poses: Mapping[str, Array],
     yaw_periods: Mapping[str, float],
     before: Array,
 ) -> Array:
     """The pose of a symmetric object, among those that look alike, from which the hand has to turn least."""
-    choices = se3.yaw_equivalents(layout[name], yaw_periods.get(name, 2 * np.pi))
-    after = [transfer_pose(pose.anchor.frame({**layout, name: T}), pose.T_obj_ee) for T in choices]
+    choices = se3.yaw_equivalents(object_poses[name], yaw_periods.get(name, 2 * np.pi))
+    after = [transfer_pose(pose.anchor.frame({**object_poses, name: T}), pose.T_obj_ee) for T in choices]
     turns = [float(se3.distances(before, T)[1]) for T in after]
     return choices[int(np.argmin(turns))]
+
+
+def _heading(path: Array) -> float:
+    return float(np.arctan2(path[1, 1] - path[0, 1], path[1, 0] - path[0, 0]))
+
+
+def _length(path: Array) -> float:
+    return float(np.linalg.norm(path[1, :2] - path[0, :2]))

@@ -1,56 +1,58 @@
-"""Calibration of the tabletop's cameras, read from the MuJoCo model."""
+"""Calibration of MuJoCo's cameras, read from the simulator, in the camera file's format."""
 
 import math
-from typing import Any
+from collections.abc import Mapping
+from typing import Any, Literal
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
-from lerobot_openspm.envs.tabletop.scene import CAMERA_NAMES
-from lerobot_openspm.envs.tabletop.simulator import compiled_model
+from lerobot_openspm.geometry.camera import Camera, cameras_to_dict
+from lerobot_openspm.geometry.se3 import transform
 
 # MuJoCo's cameras look along -z with y up, OpenCV's along z with y down.
 MUJOCO_FROM_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
-MOUNTS = {"front": "world", "side": "world", "wrist": "ee"}
+
+# The frame that carries a camera.
+Mount = Literal["world", "ee"]
 
 
-def camera_calibration(camera: str, height: int = 256, width: int = 256) -> dict[str, Any]:
-    """Intrinsics and mounting of one camera at an image size.
+def calibration(
+    model: Any,
+    data: Any,
+    cameras: Mapping[str, str],
+    mounts: Mapping[str, Mount],
+    T_world_ee: np.ndarray,
+    size: tuple[int, int],
+    mirrored: bool = False,
+) -> dict[str, Any]:
+    """The calibration file's document, keyed by LeRobot's observation names.
 
     Pixel centres are at integer coordinates; the camera's frame is OpenCV's (x right, y down, z forward).
 
     Args:
-        camera: A name in `CAMERA_NAMES`.
-        height: Image height in pixels.
-        width: Image width in pixels.
-
-    Returns:
-        width, height, fx, fy, cx, cy (pixels), mount ("world" or "ee"), T_mount_cam (nested lists, 4 x 4).
+        model: MuJoCo's model.
+        data: MuJoCo's data, whose positions are up to date.
+        cameras: The cameras' names in the model, by the names of their images.
+        mounts: What carries each of them.
+        T_world_ee: The hand's pose in `data`, (4, 4).
+        size: Height and width of the images in pixels.
+        mirrored: Whether images are shown mirrored left to right, which makes the focal length negative.
     """
-    model = compiled_model()
-    index = model.camera(camera).id
-    focal = 0.5 * height / math.tan(math.radians(float(model.cam_fovy[index])) / 2)
-    T_mount_mujoco = np.eye(4)
-    T_mount_mujoco[:3, :3] = _matrix(model.cam_quat[index])
-    # The hand's body frame is the ee frame, so a camera on the hand is given in ee coordinates already.
-    T_mount_mujoco[:3, 3] = model.cam_pos[index]
-    return {
-        "width": width,
-        "height": height,
-        "fx": focal,
-        "fy": focal,
-        "cx": (width - 1) / 2,
-        "cy": (height - 1) / 2,
-        "mount": MOUNTS[camera],
-        "T_mount_cam": np.round(T_mount_mujoco @ MUJOCO_FROM_OPENCV, 9).tolist(),
-    }
-
-
-def calibration_document(height: int = 256, width: int = 256) -> dict[str, Any]:
-    """All cameras in the camera file's format, keyed by LeRobot's observation names."""
-    cameras = {f"observation.images.{name}": camera_calibration(name, height, width) for name in CAMERA_NAMES}
-    return {"format": "openspm-cameras", "version": 1, "cameras": cameras}
-
-
-def _matrix(quat_wxyz: np.ndarray) -> np.ndarray:
-    return Rotation.from_quat(np.roll(quat_wxyz, -1)).as_matrix()
+    (height, width), found = size, {}
+    for image, name in cameras.items():
+        index = model.camera(name).id
+        focal = 0.5 * height / math.tan(math.radians(float(model.cam_fovy[index])) / 2)
+        T_world_mujoco = transform(data.cam_xmat[index].reshape(3, 3), data.cam_xpos[index])
+        T_world_mount = np.eye(4) if mounts[image] == "world" else T_world_ee
+        T_mount_cam = np.linalg.inv(T_world_mount) @ T_world_mujoco @ MUJOCO_FROM_OPENCV
+        found[f"observation.images.{image}"] = Camera(
+            width=width,
+            height=height,
+            fx=-focal if mirrored else focal,
+            fy=focal,
+            cx=(width - 1) / 2,
+            cy=(height - 1) / 2,
+            mount=mounts[image],
+            T_mount_cam=np.round(T_mount_cam, 9),
+        )
+    return cameras_to_dict(found)

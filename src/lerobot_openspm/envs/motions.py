@@ -1,7 +1,7 @@
-"""Motion primitives of the scripted experts: proportional control by 7-D actions, imperfect like a person's.
+"""Motions of the scripted experts: proportional control by 7-D actions, imperfect like a person's.
 
-Every primitive is a generator: it yields one action, is resumed after the environment has stepped, and looks
-again.
+Every motion is a generator: it yields one action, is resumed after the environment has stepped, and looks at
+the simulator again.
 """
 
 import math
@@ -12,7 +12,7 @@ from typing import Protocol
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from lerobot_openspm.envs.tabletop.simulator import HOME_ROTATION, MAX_STEP_M, MAX_STEP_RAD
+from lerobot_openspm.geometry.se3 import transform
 
 GAIN = 0.5
 ACTION_NOISE = 0.03
@@ -20,8 +20,8 @@ PAUSE_SEGMENTS = 8
 VIA_CHANCE = 0.6
 GRASP_NOISE_M = 0.0012
 GRASP_NOISE_RAD = math.radians(1.5)
-# Fingers pointing along -x with the camera above: the hand at home, turned by 90 degrees about y.
-LEVEL_ROTATION = Rotation.from_euler("y", 90, degrees=True).as_matrix() @ HOME_ROTATION
+# R_world_ee of a hand that points down and opens its fingers along the world's y.
+DOWN = np.diag([1.0, -1.0, -1.0])
 
 Actions = Iterator[np.ndarray]
 
@@ -31,6 +31,10 @@ class HandSimulator(Protocol):
 
     def ee_pose(self) -> np.ndarray:
         """``T_world_ee``, (4, 4)."""
+        ...
+
+    def object_poses(self) -> dict[str, np.ndarray]:
+        """True ``T_world_obj``, (4, 4), by name."""
         ...
 
 
@@ -43,7 +47,7 @@ class Pace:
         step_rad: How far a rotation of 1 turns it in one step, in radians.
         closing_steps: Bounds [low, high) of the steps that closing fingers need to settle.
         opening_steps: The same for opening fingers.
-        asked_m: How far a translation of 1 asks the hand to go, which it may not cover in a step.
+        asked_m: How far a translation of 1 asks the hand to go; it may not get there in one step.
         asked_rad: How far a rotation of 1 asks it to turn.
     """
 
@@ -55,27 +59,24 @@ class Pace:
     asked_rad: float
 
 
-TABLETOP_PACE = Pace(
-    MAX_STEP_M, MAX_STEP_RAD, closing_steps=(7, 11), opening_steps=(7, 11), asked_m=MAX_STEP_M,
-    asked_rad=MAX_STEP_RAD,
-)  # fmt: skip
-
-
 def yaw_matrix(yaw: float) -> np.ndarray:
     """Rotation about the world's z, (3, 3)."""
     return Rotation.from_euler("z", yaw).as_matrix()
 
 
-def pose(position: np.ndarray, rotation: np.ndarray) -> np.ndarray:
-    """Build a (4, 4) transform."""
-    result = np.eye(4)
-    result[:3, :3], result[:3, 3] = rotation, position
-    return result
-
-
 def pointing_down(position: np.ndarray, yaw: float = 0.0) -> np.ndarray:
     """T_world_ee of a hand that points down, (4, 4); at yaw 0 the fingers open along the world's y."""
-    return pose(position, yaw_matrix(yaw) @ HOME_ROTATION)
+    return transform(yaw_matrix(yaw) @ DOWN, position)
+
+
+def raised(T_world_ee: np.ndarray, height: float) -> np.ndarray:
+    """The same pose `height` metres further up."""
+    return transform(T_world_ee[:3, :3], T_world_ee[:3, 3] + [0.0, 0.0, height])
+
+
+def in_world(T_world_obj: np.ndarray, point: np.ndarray | tuple[float, float, float]) -> np.ndarray:
+    """A point (3,) of an object's frame in the world, (3,)."""
+    return T_world_obj[:3, :3] @ np.asarray(point, float) + T_world_obj[:3, 3]
 
 
 class ScriptedHand[SimulatorT: HandSimulator]:
@@ -87,13 +88,21 @@ class ScriptedHand[SimulatorT: HandSimulator]:
         pace: How the simulator's hand follows its actions.
     """
 
-    def __init__(self, simulator: SimulatorT, rng: np.random.Generator, pace: Pace = TABLETOP_PACE) -> None:
+    def __init__(self, simulator: SimulatorT, rng: np.random.Generator, pace: Pace) -> None:
         self.simulator = simulator
         self.rng = rng
         self.pace = pace
         self.closing = False
         self._segment = 0
         self._pause_at = set(rng.integers(0, PAUSE_SEGMENTS, size=int(rng.integers(0, 4))).tolist())
+
+    def frame(self, name: str) -> np.ndarray:
+        """True T_world_obj of an object now, (4, 4)."""
+        return self.simulator.object_poses()[name]
+
+    def origin(self, name: str) -> np.ndarray:
+        """Where an object's origin truly is now, (3,) metres."""
+        return self.frame(name)[:3, 3]
 
     def grasp_noise(self) -> tuple[np.ndarray, float]:
         """Offset of a grasp or a release: (3,) metres in the horizontal plane, and a yaw in radians."""
@@ -108,9 +117,13 @@ class ScriptedHand[SimulatorT: HandSimulator]:
             direction = self.rng.normal(size=3)
             direction[2] = abs(direction[2])
             detour = direction / np.linalg.norm(direction) * self.rng.uniform(0.01, 0.04)
-            via = pose((start[:3, 3] + goal[:3, 3]) / 2 + detour, goal[:3, :3])
+            via = transform(goal[:3, :3], (start[:3, 3] + goal[:3, 3]) / 2 + detour)
             yield from self._approach(via, 0.03, math.inf)
         yield from self._approach(goal, 0.012, 0.12)
+
+    def retreat(self, height: float) -> Actions:
+        """Travel `height` metres straight up."""
+        yield from self.travel(raised(self.simulator.ee_pose(), height))
 
     def advance(self, goal: np.ndarray, slowness: float = 1.0) -> Actions:
         """Move straight to T_world_ee `goal` and arrive precisely."""
@@ -120,10 +133,8 @@ class ScriptedHand[SimulatorT: HandSimulator]:
     def grip(self, closing: bool) -> Actions:
         """Close or open the fingers and hold still until they have settled."""
         self.closing = closing
-        goal = self.simulator.ee_pose()
         steps = self.pace.closing_steps if closing else self.pace.opening_steps
-        for _ in range(int(self.rng.integers(*steps))):
-            yield self._towards(goal, 0.3)
+        yield from self.hold(int(self.rng.integers(*steps)))
 
     def hold(self, steps: int) -> Actions:
         """Stay where the hand is."""
@@ -154,9 +165,8 @@ class ScriptedHand[SimulatorT: HandSimulator]:
 
     def _errors(self, goal: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         current = self.simulator.ee_pose()
-        return goal[:3, 3] - current[:3, 3], Rotation.from_matrix(
-            goal[:3, :3] @ current[:3, :3].T
-        ).as_rotvec()
+        turn = Rotation.from_matrix(goal[:3, :3] @ current[:3, :3].T).as_rotvec()
+        return goal[:3, 3] - current[:3, 3], turn
 
     def _towards(self, goal: np.ndarray, speed: float) -> np.ndarray:
         position, turn = self._errors(goal)

@@ -1,4 +1,4 @@
-"""Expert episodes as arrays, and what a simulator has to offer so that `openspm collect` can record them."""
+"""Expert episodes as arrays, and what a suite of tasks has to offer so that they can be recorded."""
 
 from __future__ import annotations
 
@@ -8,6 +8,8 @@ from typing import Any, Protocol
 
 import numpy as np
 from scipy.spatial.transform import Rotation
+
+from lerobot_openspm.envs.motions import Actions
 
 # Not under "observation.": no policy is ever handed the true poses by accident.
 OBJECT_POSES = "simulator.object_poses"
@@ -21,15 +23,17 @@ class RecordedEpisode:
     """One attempt of an expert, `n` frames long. Observations are those before the action of their frame.
 
     Attributes:
+        task: Name of the task.
+        instruction: What was to be done.
+        seed: What the initial state and the expert's imperfections were drawn from.
+        status: How it ended: "success", or what went wrong.
         images: Per camera (n, height, width, 3) uint8.
         columns: By feature name (n, numbers) float32: observation.state, action, the true object poses.
-        status: What the environment said when it ended.
     """
 
     task: str
     instruction: str
     seed: int
-    success: bool
     status: str
     images: Mapping[str, np.ndarray]
     columns: Mapping[str, np.ndarray]
@@ -37,9 +41,62 @@ class RecordedEpisode:
     def __len__(self) -> int:
         return len(self.columns["action"])
 
+    @property
+    def success(self) -> bool:
+        """Whether the goal was reached."""
+        return self.status == "success"
 
-class Source(Protocol):
-    """A simulator with an expert for each of its tasks."""
+    def about(self) -> dict[str, Any]:
+        """What is kept of it beside the dataset."""
+        return {
+            "task": self.task,
+            "seed": self.seed,
+            "steps": len(self),
+            "success": self.success,
+            "status": self.status,
+        }
+
+
+class Scene(Protocol):
+    """One task in a simulator, with its expert."""
+
+    @property
+    def instruction(self) -> str:
+        """What is to be done."""
+        ...
+
+    @property
+    def status(self) -> str:
+        """How the episode stands: "success" once the goal is reached."""
+        ...
+
+    def reset(self, seed: int) -> None:
+        """Draw an initial state."""
+        ...
+
+    def expert(self, rng: np.random.Generator) -> Actions:
+        """Actions (7,) that do the task; each is asked for after the one before was stepped."""
+        ...
+
+    def images(self) -> Mapping[str, np.ndarray]:
+        """The cameras' images now, (height, width, 3) uint8, by the names of the suite's cameras."""
+        ...
+
+    def columns(self) -> Mapping[str, np.ndarray]:
+        """``observation.state`` and the true object poses now."""
+        ...
+
+    def step(self, action: np.ndarray) -> bool:
+        """Apply an action; whether the episode is over."""
+        ...
+
+    def close(self) -> None:
+        """Free the simulator."""
+        ...
+
+
+class Suite(Protocol):
+    """Tasks in one simulator, recorded in one layout."""
 
     @property
     def robot_type(self) -> str:
@@ -57,15 +114,15 @@ class Source(Protocol):
         ...
 
     def tasks(self, selection: str) -> list[str]:
-        """Names of the tasks that a selection ("all", or names with commas) stands for."""
+        """Names of the tasks that a selection stands for; "all" in an order that decides about their seeds.
+
+        Raises:
+            ValueError: A name is unknown, or the suite is not installed.
+        """
         ...
 
-    def all_tasks(self) -> Sequence[str]:
-        """All tasks in their fixed order, which decides who takes which seeds."""
-        ...
-
-    def record(self, task: str, seed: int, height: int, width: int) -> RecordedEpisode:
-        """Let the expert act from the initial state of `seed` until the episode ends."""
+    def scene(self, task: str, height: int, width: int) -> Scene:
+        """A task whose images have a size in pixels."""
         ...
 
     def calibration(self, height: int, width: int) -> dict[str, Any]:
@@ -73,24 +130,25 @@ class Source(Protocol):
         ...
 
 
-class Recorder:
-    """Collects the frames of one episode."""
-
-    def __init__(self) -> None:
-        self._images: dict[str, list[np.ndarray]] = {}
-        self._columns: dict[str, list[np.ndarray]] = {}
-
-    def add(self, images: Mapping[str, np.ndarray], columns: Mapping[str, np.ndarray]) -> None:
-        """Add one frame."""
-        for kept, new in ((self._images, images), (self._columns, columns)):
+def record(scene: Scene, task: str, seed: int) -> RecordedEpisode:
+    """Let the expert act from the initial state of `seed` until the episode ends."""
+    scene.reset(seed)
+    images: dict[str, list[np.ndarray]] = {}
+    columns: dict[str, list[np.ndarray]] = {}
+    for action in scene.expert(np.random.default_rng(seed)):
+        for kept, new in ((images, scene.images()), (columns, {**scene.columns(), "action": action})):
             for key, value in new.items():
                 kept.setdefault(key, []).append(value)
-
-    def episode(self, task: str, instruction: str, seed: int, success: bool, status: str) -> RecordedEpisode:
-        """What was added so far."""
-        images = {key: np.stack(frames) for key, frames in self._images.items()}
-        columns = {key: np.stack(rows).astype(np.float32) for key, rows in self._columns.items()}
-        return RecordedEpisode(task, instruction, seed, success, status, images, columns)
+        if scene.step(action):
+            break
+    return RecordedEpisode(
+        task,
+        scene.instruction,
+        seed,
+        scene.status,
+        {key: np.stack(frames) for key, frames in images.items()},
+        {key: np.stack(rows).astype(np.float32) for key, rows in columns.items()},
+    )
 
 
 def pose_vector(poses: Mapping[str, np.ndarray]) -> np.ndarray:
@@ -105,24 +163,3 @@ def pose_vector(poses: Mapping[str, np.ndarray]) -> np.ndarray:
 def pose_names(objects: Sequence[str]) -> list[str]:
     """Names of the numbers of :func:`pose_vector`."""
     return [f"{name}.{component}" for name in objects for component in POSE_COMPONENTS]
-
-
-def source(env_type: str) -> Source:
-    """The source of an environment type.
-
-    Raises:
-        ValueError: There is no such source, or it is not installed.
-    """
-    if env_type == "openspm_tabletop":
-        from lerobot_openspm.envs.tabletop.recording import TabletopSource
-
-        return TabletopSource()
-    if env_type == "libero":
-        try:
-            from lerobot_openspm.envs.libero.recording import LiberoSource
-        except ImportError as error:
-            raise ValueError(
-                f"env.type=libero needs LIBERO ({error}); install it with: pip install 'lerobot[libero]'"
-            ) from error
-        return LiberoSource()
-    raise ValueError(f"env.type is {env_type!r}, expected openspm_tabletop or libero")

@@ -10,36 +10,15 @@ DEMO_SEEDS = range(DEMO_SEED_START, TUNING_SEED_START)
 TUNING_SEEDS = range(TUNING_SEED_START, SEED_END)
 
 
-def seed_purpose(seed: int) -> str:
-    """Name what a seed is reserved for.
-
-    Args:
-        seed: Seed of an episode.
-
-    Raises:
-        ValueError: The seed belongs to none of the three ranges.
-    """
-    for name, seeds in (
-        ("evaluation", EVALUATION_SEEDS),
-        ("demonstration", DEMO_SEEDS),
-        ("tuning", TUNING_SEEDS),
-    ):
-        if seed in seeds:
-            return name
-    raise ValueError(f"seed {seed} belongs to no range; expected 0 <= seed < {SEED_END}")
-
-
-def require_demo_seeds(first: int, count: int) -> range:
-    """Return `count` seeds from `first` on, all of them reserved for demonstrations.
+def require_demo_seeds(first: int, count: int) -> None:
+    """Refuse `count` seeds from `first` on unless all of them are reserved for demonstrations.
 
     Raises:
         ValueError: A seed would be an evaluation or a tuning seed.
     """
-    seeds = range(first, first + count)
     if first not in DEMO_SEEDS or first + count > DEMO_SEEDS.stop:
         raise ValueError(
             f"demonstration seeds must lie in [{DEMO_SEEDS.start}, {DEMO_SEEDS.stop}), "
             f"got {first} to {first + count - 1}; "
             f"pass --seed={DEMO_SEED_START} or more, since lower seeds are kept for evaluation"
         )
-    return seeds

@@ -1,4 +1,4 @@
-"""What the flow model is told, and the frame in which it answers.
+"""The condition of the flow model, and the frame of its actions.
 
 ``paper``: current pose, target pose, their relative pose and the progress, all in the world; actions in the
 world. ``equivariant``: the relative pose and the progress in the frame of the target; actions in that frame.
@@ -8,7 +8,6 @@ A scene that is moved and turned as a whole looks the same to the second.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -16,12 +15,10 @@ from numpy.typing import ArrayLike, NDArray
 from lerobot_openspm.geometry import se3
 from lerobot_openspm.geometry.se3 import Array
 from lerobot_openspm.memory.entry import PHASES
+from lerobot_openspm.types import Conditioning
 
-Conditioning = Literal["paper", "equivariant"]
-CONDITIONINGS: tuple[Conditioning, ...] = ("paper", "equivariant")
-
-# Relative poses are given at several scales: the coarse one says how far, the fine ones resolve the last
-# centimetres, where a single scale would leave millimetres in the noise.
+# Relative poses are given at several scales: the coarse one covers the whole way, the fine ones resolve the
+# last centimetres, where at a single scale millimetres would be lost in the noise.
 POSITION_SCALES_M = (0.2, 0.03, 0.006)
 ROTATION_SCALES_RAD = (1.0, 0.1)
 _RELATIVE = 3 * len(POSITION_SCALES_M) + 3 * len(ROTATION_SCALES_RAD)
@@ -34,17 +31,17 @@ CONDITION_DIM: dict[Conditioning, int] = {
 
 @dataclass(frozen=True)
 class Query:
-    """Where the hand is, where it goes, how far along it is: ``c_t`` of the paper, batched over ``(...)``.
+    """Current pose, target pose and progress: ``c_t`` of the paper, batched over ``(...)``.
 
     Attributes:
         T_world_ee: Current hand pose ``(..., 4, 4)``.
         T_world_target: Target key pose ``(..., 4, 4)``.
-        progress: Share ``(...)`` of the segment that lies behind, the paper's tau, 0 to 1.
-        closed: Whether the gripper is to be closed on the way, ``(...)`` of 0 and 1.
-        opening: Gripper opening ``(...)`` as a share of the open gripper's.
-        phase: Index ``(...)`` into :data:`PHASES` of the phase that the target ends. The paper's condition
-            lacks it, but the same pair of poses is an arc through the air when something is carried and a
-            straight line along the table when it is pushed.
+        progress: Fraction ``(...)`` of the segment that is done, the paper's tau, 0 to 1.
+        closed: Whether the gripper is closed on the way, ``(...)`` of 0 and 1.
+        opening: Gripper opening ``(...)`` as a fraction of the open gripper's.
+        phase: Index ``(...)`` into :data:`PHASES` of the phase that ends at the target. The paper's condition
+            lacks it, but between the same two poses a carried object moves along an arc through the air, and
+            a pushed one along the table.
     """
 
     T_world_ee: Array
@@ -56,9 +53,9 @@ class Query:
 
 
 def progress(T_world_start: ArrayLike, T_world_ee: ArrayLike, T_world_target: ArrayLike) -> Array:
-    """Progress tau ``(...)`` along a segment, by what remains of its length.
+    """Progress tau ``(...)`` along a segment, by the fraction of its length that remains.
 
-    It is measured on the geometry and not on the clock, so that a pause or a push does not let it run ahead.
+    It depends on geometry and not on time, so that it does not run ahead during a pause.
     """
     whole = np.maximum(se3.distance(T_world_start, T_world_target), 1e-3)
     return np.clip(1 - se3.distance(T_world_ee, T_world_target) / whole, 0.0, 1.0)
@@ -77,7 +74,7 @@ def encode(query: Query, conditioning: Conditioning) -> Array:
 
 
 def to_model_frame(actions: ArrayLike, T_world_target: ArrayLike, conditioning: Conditioning) -> Array:
-    """Express world actions ``(..., 7)`` in the frame that the model answers in."""
+    """Express world actions ``(..., 7)`` in the model's frame: the target's, or the world for "paper"."""
     return _rotate(actions, np.swapaxes(np.asarray(T_world_target)[..., :3, :3], -1, -2), conditioning)
 
 

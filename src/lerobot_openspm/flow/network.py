@@ -11,6 +11,8 @@ from torch import Tensor, nn
 
 TIME_FEATURES = 16
 STEP_FEATURES = 8
+# Gives the 240 K parameters of the paper's model.
+WIDTH = 268
 
 
 class VelocityField(nn.Module):
@@ -25,7 +27,7 @@ class VelocityField(nn.Module):
 
     action_scale: Tensor
 
-    def __init__(self, condition_dim: int, chunk_size: int, action_dim: int, width: int):
+    def __init__(self, condition_dim: int, chunk_size: int, action_dim: int, width: int = WIDTH):
         super().__init__()
         self.chunk_size, self.action_dim = chunk_size, action_dim
         self.encoder = nn.Sequential(
@@ -43,8 +45,7 @@ class VelocityField(nn.Module):
     def forward(self, actions: Tensor, time: Tensor, latent: Tensor) -> Tensor:
         """Velocity of noisy chunks, both ``(b, H, action_dim)``, at flow times ``(b,)`` in [0, 1].
 
-        `latent` is ``encoder(condition)``, ``(b, width)``, computed once a chunk however many times the field
-        is evaluated.
+        `latent` is ``encoder(condition)``, ``(b, width)``, computed once per chunk for all Euler steps.
         """
         b, h = actions.shape[0], self.chunk_size
         context = torch.cat([latent, actions.flatten(1), _time_features(time)], dim=-1)

@@ -1,38 +1,42 @@
-"""Training samples: (condition, action chunk) from the segments between key poses."""
+"""Training samples: pairs of condition and action chunk from the segments between key poses."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from lerobot_openspm.errors import DatasetError
-from lerobot_openspm.flow.condition import Conditioning, Query, encode, progress, to_model_frame
+from lerobot_openspm.flow.condition import Query, encode, progress, to_model_frame
 from lerobot_openspm.geometry import se3
 from lerobot_openspm.geometry.se3 import Array
 from lerobot_openspm.memory.entry import PHASES
 from lerobot_openspm.memory.robot import RobotModel
-from lerobot_openspm.mining.key_poses import KeyPose
-from lerobot_openspm.mining.signals import Episode
+from lerobot_openspm.types import Conditioning
 
-# A hand that is further than this from its target and hardly commanded to move is pausing.
+if TYPE_CHECKING:  # acting imports no mining
+    from lerobot_openspm.mining.key_poses import KeyPose
+    from lerobot_openspm.mining.signals import Episode
+
+# The hand pauses where it is further than this from its target and its command is below this fraction of the
+# episode's median.
 PAUSE_DISTANCE_M = 0.012
 PAUSE_FRACTION = 0.15
 
 
 @dataclass(frozen=True)
 class SegmentFrames:
-    """Every frame of every segment of the demonstrations, `n` in all: what chunks are learned from.
+    """The `n` frames of all segments of the demonstrations, from which chunks are learned.
 
     Attributes:
         index: Dataset index ``(n,)`` of the frame.
         episode: Episode index ``(n,)``.
         query: Condition of the frame, batched over ``(n,)``.
         T_world_start: Where the segment began, ``(n, 4, 4)``.
-        actions: The chunk that followed, ``(n, H, 7)`` in the world; after the end of the segment the hand
-            holds still.
+        actions: The chunks that follow, ``(n, H, 7)`` in the world; zero motion after the segment's end.
     """
 
     index: NDArray[np.int64]
@@ -48,25 +52,30 @@ class SegmentFrames:
 def segment_frames(
     episodes: Sequence[Episode], key_poses: Sequence[Sequence[KeyPose]], robot: RobotModel, chunk_size: int
 ) -> SegmentFrames:
-    """Cut demonstrations into segments and take every frame of motion; pauses and waits are left out."""
-    parts = [
+    """Cut demonstrations into segments and take their frames; pauses and waits for the fingers are left out.
+
+    Raises:
+        DatasetError: There is no motion between the key poses.
+    """
+    segments = [
         _one_segment(episode, before, pose, robot, chunk_size)
         for episode, poses in zip(episodes, key_poses, strict=True)
         for before, pose in zip([0, *(p.frame for p in poses[:-1])], poses, strict=True)
         if pose.frame > before and not pose.dwell
     ]
-    parts = [part for part in parts if len(part)]
-    if not parts:
+    segments = [segment for segment in segments if len(segment)]
+    if not segments:
         raise DatasetError("the key poses of the dataset have no motion between them; record longer episodes")
     stack = {
-        name: np.concatenate([getattr(p.query, name) for p in parts]) for name in Query.__dataclass_fields__
+        name: np.concatenate([getattr(s.query, name) for s in segments])
+        for name in Query.__dataclass_fields__
     }
     return SegmentFrames(
-        index=np.concatenate([p.index for p in parts]),
-        episode=np.concatenate([p.episode for p in parts]),
+        index=np.concatenate([s.index for s in segments]),
+        episode=np.concatenate([s.episode for s in segments]),
         query=Query(**stack),
-        T_world_start=np.concatenate([p.T_world_start for p in parts]),
-        actions=np.concatenate([p.actions for p in parts]),
+        T_world_start=np.concatenate([s.T_world_start for s in segments]),
+        actions=np.concatenate([s.actions for s in segments]),
     )
 
 
@@ -102,10 +111,17 @@ def _one_segment(
 def perturbed(
     frames: SegmentFrames, robot: RobotModel, std_m: float, std_rad: float, rng: np.random.Generator
 ) -> SegmentFrames:
-    """Move each frame's hand a little and correct its chunk so that it ends where it did.
+    """Displace each frame's hand at random and correct its chunk so that it ends at the same pose.
 
-    Closed-loop execution leaves the demonstrated paths by the error of the model and of the controller.
-    These samples show the way back. The displacement grows with the distance from the target.
+    In closed loop the hand leaves the demonstrated paths by the errors of model and controller; these samples
+    show the way back. The displacement grows with the distance from the target.
+
+    Args:
+        frames: The demonstrated frames.
+        robot: Gives the gain from action to motion.
+        std_m: Standard deviation of the displacement at 7.5 cm or more from the target, metres.
+        std_rad: Likewise of the rotation, radians.
+        rng: Source of the displacements.
     """
     query, n = frames.query, len(frames)
     away = se3.distance(query.T_world_ee, query.T_world_target)
@@ -124,12 +140,12 @@ def perturbed(
 
 
 def conditions_and_chunks(frames: SegmentFrames, conditioning: Conditioning) -> tuple[Array, Array]:
-    """Network inputs ``(n, condition_dim)`` and targets ``(n, H, 7)`` in the frame the model answers in."""
+    """Conditions ``(n, condition_dim)``, and chunks ``(n, H, 7)`` in the model's frame."""
     target = frames.query.T_world_target[:, None]
     return encode(frames.query, conditioning), to_model_frame(frames.actions, target, conditioning)
 
 
 def action_scale(chunks: Array) -> Array:
-    """Spread ``(7,)`` of the actions: one for translations, one for rotations, one for the gripper."""
+    """Root mean square ``(7,)`` of the actions, common to translations, to rotations, and the gripper's."""
     groups = [chunks[..., :3], chunks[..., 3:6], chunks[..., 6:]]
     return np.concatenate([np.full(g.shape[-1], max(float(np.sqrt((g**2).mean())), 1e-3)) for g in groups])

@@ -1,4 +1,4 @@
-"""The samples that the flow model learns from, as tensors, and how they are drawn."""
+"""The training samples of the flow model as tensors, and how they are drawn."""
 
 from __future__ import annotations
 
@@ -7,19 +7,19 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from lerobot_openspm.flow.condition import Conditioning
 from lerobot_openspm.flow.samples import SegmentFrames, action_scale, conditions_and_chunks
+from lerobot_openspm.types import Conditioning
 
 
 class TrainingSet:
     """Conditions and chunks of every frame of every segment.
 
     Args:
-        frames: The demonstrated frames, each looked up by its dataset index.
-        perturbed: Further copies of them, only ever drawn at random.
-        allowed: Episodes that may be drawn from; a held-out one is only ever looked up.
+        frames: The demonstrated frames, looked up by their dataset index.
+        perturbed: Perturbed copies of them, drawn at random only.
+        allowed: Episodes to draw from at random; held-out ones can only be looked up.
         starts: Dataset index of each episode's first frame, ascending.
-        conditioning: What the model is told.
+        conditioning: How conditions and actions are expressed.
     """
 
     def __init__(
@@ -37,7 +37,7 @@ class TrainingSet:
         self._chunks = torch.as_tensor(chunks, dtype=torch.float32)
         drawable = np.isin(np.concatenate([copy.episode for copy in copies]), allowed)
         self.action_scale = torch.as_tensor(action_scale(chunks[drawable]), dtype=torch.float32)
-        # Short phases are where contact is made: they are drawn more often than their frames are many.
+        # Frames of short phases, in which contact is made, are drawn more often.
         phase = np.concatenate([copy.query.phase for copy in copies])
         counts = np.bincount(phase[drawable], minlength=int(phase.max()) + 1)
         weights = np.where(drawable, 1.0 / np.sqrt(np.maximum(counts[phase], 1)), 0.0)
@@ -49,8 +49,8 @@ class TrainingSet:
     def draw(self, index: Tensor, draws: int, training: bool) -> tuple[Tensor, Tensor]:
         """Samples for a batch of frames: `draws` for each, the first of them the frame itself.
 
-        A frame that belongs to no segment (a pause, or after the last key pose) is replaced: in training by a
-        random one, else by the last one before it in its episode that does, or the first one after it.
+        A frame outside all segments (a pause, or after the last key pose) is replaced: in training by a
+        random sample, else by the last frame of a segment before it in its episode, or the first one after.
 
         Args:
             index: Dataset index ``(b,)``.

@@ -54,11 +54,6 @@ def matrix_from_quat_xyzw(quat_xyzw: ArrayLike) -> Array:
     return Rotation.from_quat(quat_xyzw.reshape(-1, 4)).as_matrix().reshape(*quat_xyzw.shape[:-1], 3, 3)
 
 
-def from_position_rotvec(position: ArrayLike, rotvec: ArrayLike) -> Array:
-    """Transforms of positions ``(..., 3)`` and rotation vectors ``(..., 3)``."""
-    return transform(exp_so3(rotvec), position)
-
-
 def from_yaw(position: ArrayLike, yaw: ArrayLike) -> Array:
     """Transforms of positions ``(..., 3)`` turned by ``yaw`` ``(...)`` radians about the vertical axis."""
     yaw = np.asarray(yaw, float)

@@ -6,8 +6,8 @@ from collections.abc import Sequence
 from dataclasses import replace
 from itertools import permutations
 
-from lerobot_openspm.language import vocabulary as v
-from lerobot_openspm.language.names import TABLE_NAMES, NameSimilarity, canonical_name
+from lerobot_openspm.language.lexicon import ENGLISH, Lexicon
+from lerobot_openspm.language.names import TABLE_NAMES, NameSimilarity
 from lerobot_openspm.language.own_words import words_similarity
 from lerobot_openspm.types import Reference, SubTask
 
@@ -23,37 +23,37 @@ OTHER_ORDER = 0.98
 MAX_REORDERED = 4
 
 
-def canonical(sub_task: SubTask) -> SubTask:
+def canonical(sub_task: SubTask, lex: Lexicon = ENGLISH) -> SubTask:
     """The form in which all wordings of one sub-task are equal."""
-    part = "" if sub_task.part in v.SILENT_PARTS else sub_task.part
-    landmark = canonical_name(sub_task.landmark) if sub_task.landmark else ""
+    part = "" if sub_task.part in lex.silent_parts else sub_task.part
+    landmark = lex.canonical(sub_task.landmark) if sub_task.landmark else ""
     return replace(
         sub_task,
-        target=canonical_name(sub_task.target),
+        target=lex.canonical(sub_task.target),
         part=part,
-        relation=_canonical_relation(sub_task.relation, landmark, part),
+        relation=_canonical_relation(lex, sub_task.relation, landmark, part),
         landmark=landmark,
-        target_where=_canonical_where(sub_task.target_where),
-        landmark_where=_canonical_where(sub_task.landmark_where),
+        target_where=_canonical_where(lex, sub_task.target_where),
+        landmark_where=_canonical_where(lex, sub_task.landmark_where),
     )
 
 
-def same_meaning(one: Sequence[SubTask], other: Sequence[SubTask]) -> bool:
+def same_meaning(one: Sequence[SubTask], other: Sequence[SubTask], lex: Lexicon = ENGLISH) -> bool:
     """Whether two readings are equal but for other names of the same things and an order that matters not."""
-    a, b = [canonical(s) for s in one], [canonical(s) for s in other]
-    return a == b or (_may_be_reordered(a) and sorted(a, key=repr) == sorted(b, key=repr))
+    a, b = [canonical(s, lex) for s in one], [canonical(s, lex) for s in other]
+    return a == b or (_may_be_reordered(lex, a) and sorted(a, key=repr) == sorted(b, key=repr))
 
 
-def means_the_same(one: Sequence[SubTask], other: Sequence[SubTask]) -> bool:
+def means_the_same(one: Sequence[SubTask], other: Sequence[SubTask], lex: Lexicon = ENGLISH) -> bool:
     """Whether two keys are about things of the same names, one perhaps not saying which of several is meant.
 
     Unlike :func:`same_meaning` it takes two names for two things, even if they can mean the same.
     """
     if not one or not other or len(one) != len(other) or one[0].words or other[0].words:
         return bool(one and other) and one[0].words == other[0].words != ""
-    a, b = _without_wheres(one), _without_wheres(other)
+    a, b = _without_wheres(lex, one), _without_wheres(lex, other)
     orders = [(a, b)]
-    if _may_be_reordered(one) and _may_be_reordered(other):
+    if _may_be_reordered(lex, one) and _may_be_reordered(lex, other):
         orders.append((sorted(a, key=repr), sorted(b, key=repr)))
     return any(
         [x[0] for x in xs] == [y[0] for y in ys] and all(map(_no_other_where, xs, ys)) for xs, ys in orders
@@ -63,10 +63,11 @@ def means_the_same(one: Sequence[SubTask], other: Sequence[SubTask]) -> bool:
 _Wheres = tuple[Reference | None, Reference | None]
 
 
-def _without_wheres(sub_tasks: Sequence[SubTask]) -> list[tuple[SubTask, _Wheres]]:
+def _without_wheres(lex: Lexicon, sub_tasks: Sequence[SubTask]) -> list[tuple[SubTask, _Wheres]]:
     """Sub-tasks in one form but with the names they have, apart from what tells which of several is meant."""
     found: list[tuple[SubTask, _Wheres]] = []
-    for told, form in zip(sub_tasks, map(canonical, sub_tasks), strict=True):
+    for told in sub_tasks:
+        form = canonical(told, lex)
         named = replace(form, target=told.target, landmark=told.landmark)
         wheres = form.target_where, form.landmark_where
         found.append((replace(named, target_where=None, landmark_where=None), wheres))
@@ -77,20 +78,20 @@ def _no_other_where(one: tuple[SubTask, _Wheres], other: tuple[SubTask, _Wheres]
     return all(a == b or a is None or b is None for a, b in zip(one[1], other[1], strict=True))
 
 
-def _canonical_relation(relation: str, landmark: str, part: str) -> str:
+def _canonical_relation(lex: Lexicon, relation: str, landmark: str, part: str) -> str:
     """The relation that the landmark allows: "to the basket" and "on the basket" are "in" it."""
     if relation not in ("at", "on", "in") or not landmark:
         return relation
     holder = part.split()[-1] if part else landmark.split()[-1]
-    if holder in v.HOLLOW:
+    if holder in lex.hollow:
         return "in"
-    return "on" if relation == "at" or holder in v.OPEN_SUPPORTS else relation
+    return "on" if relation == "at" or holder in lex.open_supports else relation
 
 
-def _canonical_where(where: Reference | None) -> Reference | None:
-    if where is None or (where.relation == "on" and set(where.landmarks) <= v.SURFACES and where.landmarks):
+def _canonical_where(lex: Lexicon, where: Reference | None) -> Reference | None:
+    if where is None or (where.relation == "on" and set(where.landmarks) <= lex.surfaces and where.landmarks):
         return None  # everything stands on the table
-    return Reference(where.relation, tuple(sorted(canonical_name(name) for name in where.landmarks)))
+    return Reference(where.relation, tuple(sorted(lex.canonical(name) for name in where.landmarks)))
 
 
 def semantic_score(
@@ -109,7 +110,7 @@ def semantic_score(
     if len(asked) != len(known) or not asked:
         return 0.0
     best = _in_order(asked, known, names)
-    if best < OTHER_ORDER and 1 < len(asked) <= MAX_REORDERED and _may_be_reordered(asked):
+    if best < OTHER_ORDER and 1 < len(asked) <= MAX_REORDERED and _may_be_reordered(names.lexicon, asked):
         reordered = max(_in_order(order, known, names) for order in permutations(asked))
         best = max(best, OTHER_ORDER * reordered)
     return best
@@ -119,10 +120,10 @@ def _in_order(asked: Sequence[SubTask], known: Sequence[SubTask], names: NameSim
     return min(_sub_task_score(a, k, names) for a, k in zip(asked, known, strict=True))
 
 
-def _may_be_reordered(sub_tasks: Sequence[SubTask]) -> bool:
+def _may_be_reordered(lex: Lexicon, sub_tasks: Sequence[SubTask]) -> bool:
     """Whether the order does not matter: things are put somewhere, none of them on one that is put itself."""
-    targets = {canonical_name(s.target) for s in sub_tasks}
-    return all(s.operation == "put" and canonical_name(s.landmark) not in targets for s in sub_tasks)
+    targets = {lex.canonical(s.target) for s in sub_tasks}
+    return all(s.operation == "put" and lex.canonical(s.landmark) not in targets for s in sub_tasks)
 
 
 def _sub_task_score(asked: SubTask, known: SubTask, names: NameSimilarity) -> float:
@@ -131,7 +132,7 @@ def _sub_task_score(asked: SubTask, known: SubTask, names: NameSimilarity) -> fl
     score = names.similarity(asked.target, known.target) * _landmarks_agree(asked, known, names)
     if score == 0.0:
         return 0.0
-    a, k = canonical(asked), canonical(known)
+    a, k = canonical(asked, names.lexicon), canonical(known, names.lexicon)
     if a.relation != k.relation:
         score *= OTHER_RELATION
     if a.operation != k.operation:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection
-from functools import lru_cache
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -11,7 +11,7 @@ import numpy as np
 
 from lerobot_openspm.errors import InstructionError
 from lerobot_openspm.geometry.se3 import Array
-from lerobot_openspm.language import vocabulary as v
+from lerobot_openspm.language.lexicon import ENGLISH, Lexicon
 
 # Another word for it ("cup" for "mug"); fewer words ("bottle" for "wine bottle"); more that say little
 # ("small bowl") or are usual; more that may well say that another thing is meant ("soup bowl", "blue bowl").
@@ -23,25 +23,21 @@ MIN_COSINE = 0.6
 class NameSimilarity(Protocol):
     """How sure it is that a name in an instruction means a thing that the memory knows."""
 
+    @property
+    def lexicon(self) -> Lexicon:
+        """The words that instructions are read by."""
+        ...
+
     def similarity(self, asked: str, known: str) -> float:
         """0 (another thing) to 1 (the same words)."""
         ...
 
 
-@lru_cache(maxsize=16384)
-def canonical_name(name: str) -> str:
-    """The name that stands for all other names of a thing: "skillet" is the "frying pan"."""
-    name = v.kind(name)
-    words = [word for word in v.replace_ending(name, v.ALIASES).split() if word not in v.DESCRIPTIONS]
-    kept = " ".join(words) in v.ALIASES.values()
-    if len(words) > 1 and words[-1] in v.CONTAINERS and not kept:
-        words.pop()  # "ketchup bottle"
-    short = " ".join(words)
-    return v.SHORT_NAMES.get(short) or v.replace_ending(short, v.ALIASES) or name
-
-
+@dataclass(frozen=True)
 class TableNames:
-    """Names by the table of words alone."""
+    """Names by the lexicon's tables alone."""
+
+    lexicon: Lexicon = ENGLISH
 
     def similarity(self, asked: str, known: str) -> float:
         """See :class:`NameSimilarity`."""
@@ -49,35 +45,35 @@ class TableNames:
             return 1.0
         if not asked or not known:
             return 0.0
-        a, k = canonical_name(asked), canonical_name(known)
+        a, k = self.lexicon.canonical(asked), self.lexicon.canonical(known)
         if a == k:
-            return MORE_SAID if set(asked.split()) & v.DESCRIPTIONS else ALIAS
-        return max(_shared_words(asked, known), _shared_words(a, k))
+            return MORE_SAID if set(asked.split()) & self.lexicon.descriptions else ALIAS
+        return max(_shared_words(self.lexicon, asked, known), _shared_words(self.lexicon, a, k))
 
 
-def _shared_words(asked: str, known: str) -> float:
+def _shared_words(lex: Lexicon, asked: str, known: str) -> float:
     """How alike two names of one head are, one of which says more than the other: "bottle", "wine bottle"."""
     a, k = asked.split(), known.split()
-    if a[-1] != k[-1] or colours_differ(asked, known):
+    if a[-1] != k[-1] or _colours_differ(lex, asked, known):
         return 0.0
     if set(a) <= set(k):
         return LESS_SAID
     if not set(k) <= set(a):
         return 0.0
-    return MORE_SAID if asked in v.ALIASES.values() else OTHER_KIND  # "wine bottle" for "bottle"
+    return MORE_SAID if asked in lex.aliases.values() else OTHER_KIND  # "wine bottle" for "bottle"
 
 
-def _is_shorter(asked: str, known: str) -> bool:
+def _is_shorter(lex: Lexicon, asked: str, known: str) -> bool:
     """Whether one name is the other with words left out: "bowl", "black bowl"; "milk", "milk carton"."""
     a, k = asked.split(), known.split()
-    if a and k and k[-1] in v.CONTAINERS and a == k[:-1]:
+    if a and k and k[-1] in lex.containers and a == k[:-1]:
         return True
     return bool(a and k) and a[-1] == k[-1] and set(a) < set(k)
 
 
-def colours_differ(a: str, b: str) -> bool:
+def _colours_differ(lex: Lexicon, a: str, b: str) -> bool:
     """Whether both names say a colour, and not the same."""
-    colours_a, colours_b = set(a.split()) & v.COLOURS, set(b.split()) & v.COLOURS
+    colours_a, colours_b = set(a.split()) & lex.colours, set(b.split()) & lex.colours
     return bool(colours_a) and bool(colours_b) and colours_a != colours_b
 
 
@@ -99,16 +95,18 @@ class AmongKnown:
 
     def __init__(self, names: NameSimilarity, known: Collection[str]):
         self._names = names
+        self.lexicon = names.lexicon
+        self._table = TableNames(names.lexicon)
         self._known = known
         self._in_table: dict[str, bool] = {}
 
     def similarity(self, asked: str, known: str) -> float:
         """See :class:`NameSimilarity`."""
         if asked in self._known:
-            return 1.0 if asked == known else _is_shorter(asked, known) * LESS_SAID
+            return 1.0 if asked == known else _is_shorter(self.lexicon, asked, known) * LESS_SAID
         if asked not in self._in_table:
-            self._in_table[asked] = any(TABLE_NAMES.similarity(asked, name) > 0 for name in self._known)
-        names = TABLE_NAMES if self._in_table[asked] else self._names
+            self._in_table[asked] = any(self._table.similarity(asked, name) > 0 for name in self._known)
+        names = self._table if self._in_table[asked] else self._names
         return names.similarity(asked, known)
 
 
@@ -117,13 +115,14 @@ class Model2VecNames:
 
     Args:
         weights: Folder with a model2vec model, or its name on the Hub.
+        lexicon: The words that are known without it.
         min_cosine: Cosine from which on two names are taken for one thing.
 
     Raises:
         InstructionError: The package or the weights are missing.
     """
 
-    def __init__(self, weights: str, min_cosine: float = MIN_COSINE):
+    def __init__(self, weights: str, lexicon: Lexicon = ENGLISH, min_cosine: float = MIN_COSINE):
         try:
             from model2vec import StaticModel
         except ImportError as error:
@@ -145,13 +144,15 @@ class Model2VecNames:
                 "hf download minishlab/potion-base-8M --local-dir FOLDER, and pass "
                 "--policy.name_embeddings=FOLDER"
             ) from error
+        self.lexicon = lexicon
+        self._table = TableNames(lexicon)
         self._min_cosine = min_cosine
         self._embedded: dict[str, Array] = {}
 
     def similarity(self, asked: str, known: str) -> float:
         """See :class:`NameSimilarity`; a name that embeddings alone recognise counts less than any other."""
-        by_table = TABLE_NAMES.similarity(asked, known)
-        if by_table > 0 or not asked or not known or colours_differ(asked, known):
+        by_table = self._table.similarity(asked, known)
+        if by_table > 0 or not asked or not known or _colours_differ(self.lexicon, asked, known):
             return by_table
         a, k = self._embed(asked), self._embed(known)
         norms = float(np.linalg.norm(a) * np.linalg.norm(k))
@@ -168,6 +169,6 @@ class Model2VecNames:
         return self._embedded[name]
 
 
-def names_from(weights: str | None) -> NameSimilarity:
-    """The table of words, or with a model2vec model beside it. Raises InstructionError, as that one does."""
-    return TABLE_NAMES if weights is None else Model2VecNames(weights)
+def names_from(weights: str | None, lexicon: Lexicon = ENGLISH) -> NameSimilarity:
+    """The lexicon's tables, or with a model2vec model beside them. Raises InstructionError, as that does."""
+    return TableNames(lexicon) if weights is None else Model2VecNames(weights, lexicon)

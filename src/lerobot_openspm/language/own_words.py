@@ -13,9 +13,9 @@ from dataclasses import dataclass
 from functools import lru_cache
 
 from lerobot_openspm.errors import InstructionError
-from lerobot_openspm.language import vocabulary as v
+from lerobot_openspm.language.lexicon import ENGLISH, Lexicon, Words
 from lerobot_openspm.language.names import NameSimilarity
-from lerobot_openspm.language.wording import plain_words
+from lerobot_openspm.language.wording import plain_words, spelled
 from lerobot_openspm.types import OWN_WORDS, SubTask
 
 # One phrase fewer than the demonstration's instruction has: "wipe the table" for "... with the sponge".
@@ -25,32 +25,12 @@ NOT_VERBATIM = 0.99
 # A name that is made of words is cut here.
 MAX_NAME = 60
 
-_WITH, _FROM = "with", "from"
-# Prepositions by their role in a sentence; those of one role say the same.
-_ROLES: dict[tuple[str, ...], str] = {
-    **{tuple(phrase.split()): role for role, phrases in v.RELATIONS.items() for phrase in phrases},
-    **{tuple(phrase.split()): _WITH for phrase in ("with", "using", "by using", "by means of")},
-    **{tuple(phrase.split()): _FROM for phrase in ("from", "out of", "off of", "out from")},
-    **{(word,): word for word in ("of", "for", "around", "across", "along", "through", "over", "about")},
-    **{(word,): word for word in ("off", "out", "up", "down", "away", "back", "open", "apart", "together")},
-}  # fmt: skip
-_LONGEST = max(map(len, _ROLES))
+_WITH = "with"
 # Verbs whose last letter doubles before "-ing": "tapping" is of "tap", so "taping" is not.
 _DOUBLES = re.compile("[^aeiou]*[aeiou][^aeiouwxy]")
 # Where a thing ends that is put, poured or laid there.
 _GOALS = {"on": "on", "in": "in", "under": "under", "over": "on", "at": "at", "between": "between"}
-_ARTICLES = v.word_set("the an some my your our its this that these those 's , ;")
-_JOINTS = v.word_set("and then")
-# Words that name no thing, where a noun is expected.
-_NO_THINGS = (
-    v.word_set(
-        "it them itself everything something half halves quarter circle line row order place way left right "
-        "front back top bottom middle center centre side degree "
-        "time once twice again there here slowly position direction shape ready halfway partway little bit "
-        "slightly hand gripper arm finger"
-    )
-    | v.WAYS
-)
+_JOINTS = ("and", "then")
 
 
 @dataclass(frozen=True)
@@ -62,28 +42,31 @@ class _Clause:
 
 
 @lru_cache(maxsize=16384)
-def normal_words(instruction: str) -> str:
+def normal_words(instruction: str, lex: Lexicon = ENGLISH) -> str:
     """An instruction's words without case, articles, courtesies and punctuation; in any language.
 
-    "Could you please wipe the table?" and "wipe table" are the same.
+    "Could you please wipe the table?" and "wipe table" are the same. Accents and vowel signs stay, because
+    they tell words apart.
     """
-    decomposed = unicodedata.normalize("NFKD", instruction)
-    plain = "".join(c for c in decomposed if not unicodedata.combining(c))
-    words = plain_words(plain).split() if plain.isascii() else []
-    kept = [word for i, word in enumerate(words) if not _is_article(words, i)]
-    return " ".join(kept or re.findall(r"\w+", instruction.casefold()))
+    own = [word.strip(",;'") for word in spelled(lex, instruction).split()]
+    kept: list[str] = []
+    letters = unicodedata.normalize("NFKD", instruction)
+    if all(letter.isascii() for letter in letters if letter.isalpha()):  # else it has no English articles
+        words = tuple(plain_words(lex, instruction).split())
+        kept = [word for i, word in enumerate(words) if not _is_article(lex, words, i)]
+    return " ".join(kept or filter(None, own))
 
 
-def _is_article(words: Sequence[str], i: int) -> bool:
+def _is_article(lex: Lexicon, words: Words, i: int) -> bool:
     """Whether a word adds nothing; "a" does where it is a label: "put block a on block b", "the a button"."""
     if words[i] != "a":
-        return words[i] in _ARTICLES
-    if i > 0 and words[i - 1] in v.DETERMINERS:
+        return words[i] in lex.articles
+    if i > 0 and words[i - 1] in lex.determiners:
         return False
-    return i + 1 < len(words) and not _role_at(tuple(words), i + 1)[0] and words[i + 1] not in _JOINTS
+    return i + 1 < len(words) and not _role_at(lex, words, i + 1)[0] and words[i + 1] not in _JOINTS
 
 
-def unread(instruction: str) -> SubTask:
+def unread(instruction: str, lex: Lexicon = ENGLISH) -> SubTask:
     """An instruction as one thing to do, kept by its words, with the names of things that they give.
 
     What follows "with" is taken to be in the hand ("wipe the table with the sponge"), else what follows the
@@ -92,10 +75,10 @@ def unread(instruction: str) -> SubTask:
     Raises:
         InstructionError: There is not a word in it.
     """
-    words = normal_words(instruction)
+    words = normal_words(instruction, lex)
     if not words:
         raise InstructionError("says nothing, expected one like 'put the bowl on the plate'")
-    said = [(role, _thing(noun)) for clause in _clauses(words) for role, noun in clause.phrases]
+    said = [(role, _thing(lex, noun)) for clause in _clauses(lex, words) for role, noun in clause.phrases]
     phrases = [phrase for phrase in said if phrase[1]]
     tools = [phrase for phrase in phrases if phrase[0] == _WITH]
     moved = tools or [phrase for phrase in phrases if not phrase[0]] or phrases
@@ -106,15 +89,16 @@ def unread(instruction: str) -> SubTask:
     return SubTask(OWN_WORDS, target, "", _GOALS[role] if goals else "", landmark, words=words)
 
 
-def _thing(noun: str) -> str:
+def _thing(lex: Lexicon, noun: str) -> str:
     """The thing that a noun names, without words behind it that name none: "drawer halfway" is the drawer.
 
     "" where there is none, or just the table, which no hand takes hold of.
     """
     words = noun.split()
-    while words and ({words[-1], f"{words[-1]}s"} & (_NO_THINGS | v.PARTICLES) or words[-1] in v.NUMBERS):
+    no_things = lex.no_things | lex.ways | lex.particles
+    while words and ({words[-1], f"{words[-1]}s"} & no_things or lex.number(words[-1])):
         words.pop()
-    return "" if not words or words[-1] in v.SURFACES else " ".join(words)
+    return "" if not words or words[-1] in lex.surfaces else " ".join(words)
 
 
 def words_similarity(asked: str, known: str, names: NameSimilarity) -> float:
@@ -126,7 +110,7 @@ def words_similarity(asked: str, known: str, names: NameSimilarity) -> float:
     """
     if asked == known:
         return 1.0
-    a, k = _clauses(asked), _clauses(known)
+    a, k = _clauses(names.lexicon, asked), _clauses(names.lexicon, known)
     if len(a) != len(k):
         return 0.0
     # Just the same words come before words that only mean the same.
@@ -134,7 +118,7 @@ def words_similarity(asked: str, known: str, names: NameSimilarity) -> float:
 
 
 def _clause_score(asked: _Clause, known: _Clause, names: NameSimilarity) -> float:
-    is_same_verb = bool(_base_forms(asked.verb) & _base_forms(known.verb))
+    is_same_verb = bool(_base_forms(names.lexicon, asked.verb) & _base_forms(names.lexicon, known.verb))
     score = 1.0 if is_same_verb else names.similarity(asked.verb, known.verb)
     left = list(asked.phrases)
     unsaid = 0
@@ -153,14 +137,16 @@ def _clause_score(asked: _Clause, known: _Clause, names: NameSimilarity) -> floa
 
 def _same(asked: str, known: str, names: NameSimilarity) -> float:
     """How alike two nouns are; singular and plural are one, a tub and a tube are not."""
-    if [*map(v.singular, asked.split())] == [*map(v.singular, known.split())]:
+    if [*map(names.lexicon.singular, asked.split())] == [*map(names.lexicon.singular, known.split())]:
         return 1.0
+    if ("other" in asked.split()) != ("other" in known.split()):
+        return 0.0  # the other button is not the button
     return names.similarity(asked, known)
 
 
-def _base_forms(verb: str) -> set[str]:
+def _base_forms(lex: Lexicon, verb: str) -> set[str]:
     """What a verb may be a form of: "wiping" and "wipes" of "wipe"; "tap" and "tape" only of themselves."""
-    forms = {verb, v.singular(verb)}
+    forms = {verb, lex.singular(verb)}
     if verb.endswith("ing") and len(verb) > 5:
         stem = verb[:-3]
         forms.add(f"{stem}e")
@@ -172,7 +158,7 @@ def _base_forms(verb: str) -> set[str]:
 
 
 @lru_cache(maxsize=4096)
-def _clauses(words: str) -> tuple[_Clause, ...]:
+def _clauses(lex: Lexicon, words: str) -> tuple[_Clause, ...]:
     """Split :func:`normal_words` into clauses, each into a verb and its phrases."""
     pieces: list[list[str]] = [[]]
     for word in words.split():
@@ -180,15 +166,15 @@ def _clauses(words: str) -> tuple[_Clause, ...]:
             pieces[-1].append(word)
         elif pieces[-1]:
             pieces.append([])
-    return tuple(_clause(piece) for piece in pieces if piece)
+    return tuple(_clause(lex, piece) for piece in pieces if piece)
 
 
-def _clause(words: Sequence[str]) -> _Clause:
+def _clause(lex: Lexicon, words: Sequence[str]) -> _Clause:
     verb, rest = words[0], tuple(words[1:])
     phrases: list[tuple[str, list[str]]] = [("", [])]
     i = 0
     while i < len(rest):
-        role, length = _role_at(rest, i)
+        role, length = _role_at(lex, rest, i)
         if role:
             phrases.append((role, []))
         else:
@@ -197,11 +183,11 @@ def _clause(words: Sequence[str]) -> _Clause:
     if len(phrases) > 1 and not phrases[0][1] and phrases[1][0] in ("on", "off", "up", "down", "out", "open"):
         # "turn on the tap" is "turn the tap on".
         phrases[:2] = [("", phrases[1][1]), (phrases[1][0], [])]
-    named = ((role, " ".join([*nouns[:-1], *map(v.singular, nouns[-1:])])) for role, nouns in phrases)
+    named = ((role, " ".join([*nouns[:-1], *map(lex.singular, nouns[-1:])])) for role, nouns in phrases)
     return _Clause(verb, tuple((role, noun) for role, noun in named if role or noun))
 
 
-def _role_at(words: tuple[str, ...], i: int) -> tuple[str, int]:
+def _role_at(lex: Lexicon, words: Words, i: int) -> tuple[str, int]:
     """The role of the longest preposition that begins at a word and its length; "" and 0 without one."""
-    lengths = range(min(_LONGEST, len(words) - i), 0, -1)
-    return next(((_ROLES[words[i : i + n]], n) for n in lengths if words[i : i + n] in _ROLES), ("", 0))
+    phrase = max(lex.longest(words, i, lex.roles), lex.longest(words, i, lex.relations), key=len)
+    return lex.roles.get(phrase) or lex.relations.get(phrase, ""), len(phrase.split())

@@ -1,7 +1,8 @@
-"""The entries of a memory as one file: a JSON list with an entry on every line, read a line at a time.
+"""The entries of a memory as lines of one file, each read and checked when it is asked for.
 
-Where every line ends and its digest are kept beside the file, so that a memory of a million entries is loaded
-without reading them, and nothing that was changed or damaged is read without being noticed.
+Columns beside the file hold the end of each entry's line, a digest of the line, and what the entry is found
+by. So a memory of a million entries is loaded without reading them, and a changed or damaged line is noticed
+when it is read.
 """
 
 from __future__ import annotations
@@ -10,139 +11,140 @@ import hashlib
 import json
 import os
 import weakref
-from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from array import array
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, fields
 from functools import lru_cache
 from pathlib import Path
-from typing import BinaryIO, overload
+from typing import Any, BinaryIO, overload
 
 import numpy as np
 from numpy.typing import NDArray
 
 from lerobot_openspm.errors import MemoryFormatError
-from lerobot_openspm.memory.columns import Columns
 from lerobot_openspm.memory.entry import MemoryEntry
-from lerobot_openspm.memory.fields import LIMIT, MALFORMED
-from lerobot_openspm.memory.store import entry_from_fields, entry_to_fields
-from lerobot_openspm.memory.strict_json import loads
+from lerobot_openspm.memory.schema import AGAIN, entry_from_json, entry_to_json
+from lerobot_openspm.types import SubTask
 
-HEAD, BETWEEN, TAIL = b"[\n", b",\n", b"\n]\n"
+BETWEEN, TAIL = b",\n", b"\n ]\n}\n"
 DIGEST_BYTES = 16
 MAX_LINE_BYTES = 4_000_000
-# So many of the entries read last are kept in memory.
+# The entries read last stay in memory, up to this many.
 KEPT_ENTRIES = 4096
+
+Key = tuple[SubTask, ...]
+
+
+@lru_cache(KEPT_ENTRIES)
+def key_digest(key: Key) -> int:
+    """A number below ``2**64`` that tells a key from others, the same on every machine."""
+    rows = [asdict(sub_task) for sub_task in key]
+    for row in rows:
+        if not row["words"]:
+            del row["words"]
+    text = json.dumps(rows, sort_keys=True)
+    return int.from_bytes(hashlib.blake2b(text.encode(), digest_size=8).digest(), "little")
 
 
 @dataclass(frozen=True)
-class Lines:
-    """Where the lines of a file of entries are.
+class Columns:
+    """What is kept of every entry.
 
     Attributes:
-        ends: Byte ``(n,)`` after the end of every entry's text, int64.
-        digests: BLAKE2b digests ``(n, 16)`` of the texts, uint8.
+        ends: Where its line ends, bytes from the first one's start ``(n,)``, int64.
+        digests: BLAKE2b digest of its line ``(n, 16)``, uint8.
+        keys: :func:`key_digest` of its key ``(n,)``, uint64.
+        qualities: Its quality ``(n,)``, float64.
     """
 
     ends: NDArray[np.int64]
     digests: NDArray[np.uint8]
+    keys: NDArray[np.uint64]
+    qualities: NDArray[np.float64]
 
-    @property
-    def n_bytes(self) -> int:
-        """Size of the whole file."""
-        return (int(self.ends[-1]) if len(self.ends) else len(HEAD)) + len(TAIL)
+    def to_arrays(self) -> dict[str, NDArray[Any]]:
+        """The arrays by their names in a safetensors file."""
+        return {f"entries.{field.name}": getattr(self, field.name) for field in fields(self)}
 
-    def check(self, where: str) -> None:
-        """Raise MemoryFormatError unless the arrays are such as :func:`write_texts` returns."""
-        n = len(self.ends)
-        if self.ends.dtype != np.int64 or self.ends.shape != (n,):
-            raise MemoryFormatError(
-                f"{where}: array 'entries.ends' is {self.ends.dtype} of {self.ends.shape}, expected int64 of "
-                f"{(n,)}; train or pull it again"
-            )
-        if self.digests.dtype != np.uint8 or self.digests.shape != (n, DIGEST_BYTES):
-            raise MemoryFormatError(
-                f"{where}: array 'entries.digests' is {self.digests.dtype} of {self.digests.shape}, expected "
-                f"uint8 of {(n, DIGEST_BYTES)}; train or pull it again"
-            )
-        lengths = np.diff(self.ends, prepend=len(HEAD) - len(BETWEEN)) - len(BETWEEN)
+    @classmethod
+    def from_arrays(cls, arrays: Mapping[str, NDArray[Any]], where: str) -> Columns:
+        """Inverse of :meth:`to_arrays`. Raises MemoryFormatError naming file and array."""
+        n = len(arrays["entries.ends"]) if "entries.ends" in arrays else 0
+        shapes = {"ends": (np.int64, n), "digests": (np.uint8, n, DIGEST_BYTES), "keys": (np.uint64, n)}
+        for name, (dtype, *shape) in {**shapes, "qualities": (np.float64, n)}.items():
+            found = arrays.get(f"entries.{name}")
+            if found is None or found.dtype != dtype or found.shape != tuple(shape):
+                got = "missing" if found is None else f"{found.dtype} of {found.shape}"
+                raise MemoryFormatError(
+                    f"{where}: array 'entries.{name}' is {got}, expected {np.dtype(dtype)} of "
+                    f"{tuple(shape)}; {AGAIN}"
+                )
+        columns = cls(*(arrays[f"entries.{field.name}"] for field in fields(cls)))
+        lengths = np.diff(columns.ends, prepend=-len(BETWEEN)) - len(BETWEEN)
         if n and not (lengths.min() > 0 and lengths.max() <= MAX_LINE_BYTES):
             raise MemoryFormatError(
                 f"{where}: array 'entries.ends' does not count up line by line: lines of {lengths.min()} to "
-                f"{lengths.max()} bytes, expected 1 to {MAX_LINE_BYTES}; train or pull it again"
+                f"{lengths.max()} bytes, expected 1 to {MAX_LINE_BYTES}; {AGAIN}"
             )
+        return columns
 
 
-class _Opened:
-    """A file that is read here and there, and closed when nobody has it any more.
+class OpenFile:
+    """A file that is read at any place, and closed with its last user.
 
-    It is not mapped: reading a mapped file that somebody has truncated ends the process.
+    It is not mapped into memory: reading a mapped file that was truncated kills the process.
+
+    Raises:
+        OSError: It cannot be opened.
     """
 
-    def __init__(self, path: Path, n_bytes: int):
-        self._path = path
-        try:
-            self._descriptor = os.open(path, os.O_RDONLY)
-        except OSError as error:
-            raise MemoryFormatError(
-                f"no memory at {path}: {error}; not pulled; train again, or pull the whole checkpoint"
-            ) from error
+    def __init__(self, path: Path):
+        self.path = path
+        self._descriptor = os.open(path, os.O_RDONLY)
         weakref.finalize(self, os.close, self._descriptor)
-        if (size := os.fstat(self._descriptor).st_size) != n_bytes:
-            raise MemoryFormatError(
-                f"{path}: {size} bytes, expected {n_bytes}: truncated or changed; train or pull it again"
-            )
+        self.n_bytes = os.fstat(self._descriptor).st_size
 
-    def read(self, start: int, n_bytes: int, what: str) -> bytes:
-        """So many bytes from a place on. Raises MemoryFormatError where there are fewer."""
+    def read(self, start: int, n_bytes: int) -> bytes:
+        """Up to `n_bytes` bytes from `start`; fewer at the end of the file."""
         try:
-            found = os.pread(self._descriptor, n_bytes, start)
+            return os.pread(self._descriptor, n_bytes, start)
         except OSError as error:
-            raise MemoryFormatError(f"{self._path}: {what} cannot be read: {error}; try again") from error
-        if len(found) != n_bytes:
-            raise MemoryFormatError(
-                f"{self._path}: {what} has {len(found)} bytes, expected {n_bytes}: truncated since it was "
-                "opened; train or pull it again"
-            )
-        return found
+            raise MemoryFormatError(f"{self.path}: cannot be read: {error}; try again") from error
 
 
 class EntryBank(Sequence[MemoryEntry]):
     """Entries in a file, each read and checked when it is asked for.
 
-    The file is content-addressed and never changed, only removed when nobody names it any more; what is open
-    stays readable. Reading raises MemoryFormatError for a line that is not what was written.
+    What is open stays readable when a newer memory takes the file's name. Reading raises MemoryFormatError
+    for a line that is not what was written.
+
+    Args:
+        file: The file.
+        start: Where its first line starts.
+        columns: What is kept of all its entries.
+        objects: The objects that its entries have key poses at.
+        rows: Which of the entries this is about; all if not given.
+
+    Raises:
+        MemoryFormatError: The file is of another size.
     """
 
     def __init__(
         self,
-        path: Path,
-        lines: Lines,
+        file: OpenFile,
+        start: int,
         columns: Columns,
         objects: frozenset[str],
         rows: range | None = None,
-        opened: _Opened | None = None,
     ):
-        """Open a file.
-
-        Args:
-            path: The file.
-            lines: Where its lines are.
-            columns: What is kept of all its entries, to find one by.
-            objects: The objects that its entries have key poses at.
-            rows: Which of them this is about; all if not given.
-            opened: The file, where it is open already.
-
-        Raises:
-            MemoryFormatError: The file is missing, of another size, or the lines cannot be.
-        """
-        self._path, self._lines, self._columns, self.objects = path, lines, columns, objects
-        self._rows = range(len(lines.ends)) if rows is None else rows
-        lines.check(str(path))
-        _check_columns(columns, len(lines.ends), str(path))
-        self._opened = _Opened(path, lines.n_bytes) if opened is None else opened
+        self._file, self._start, self._columns, self.objects = file, start, columns, objects
+        self._rows = range(len(columns.ends)) if rows is None else rows
+        expected = start + (int(columns.ends[-1]) if len(columns.ends) else 0) + len(TAIL)
+        if file.n_bytes != expected:
+            raise MemoryFormatError(
+                f"{file.path}: {file.n_bytes} bytes, expected {expected}: truncated or changed; {AGAIN}"
+            )
         self._entry = lru_cache(KEPT_ENTRIES)(self._read)
-
-    def __reduce__(self) -> tuple[type[EntryBank], tuple[Path, Lines, Columns, frozenset[str], range]]:
-        return type(self), (self._path, self._lines, self._columns, self.objects, self._rows)
 
     def __len__(self) -> int:
         return len(self._rows)
@@ -153,52 +155,68 @@ class EntryBank(Sequence[MemoryEntry]):
     def __getitem__(self, index: slice) -> EntryBank: ...
     def __getitem__(self, index: int | slice) -> MemoryEntry | EntryBank:
         if isinstance(index, slice):
-            rows = self._rows[index]
-            return EntryBank(self._path, self._lines, self._columns, self.objects, rows, self._opened)
+            return EntryBank(self._file, self._start, self._columns, self.objects, self._rows[index])
         return self._entry(self._rows[index])
 
     def __iter__(self) -> Iterator[MemoryEntry]:
-        # Past the cache: going through all entries must neither hold them all nor push out those in use.
+        # Without the cache: a pass over all entries must not hold them all, nor push out those in use.
         return (self._read(row) for row in self._rows)
 
-    def columns(self) -> Columns:
-        """What is kept of the entries, to find one without reading all."""
-        rows = np.arange(self._rows.start, self._rows.stop, self._rows.step)
-        return Columns(self._columns.digests[rows], self._columns.qualities[rows])
+    def __deepcopy__(self, _: dict[int, Any]) -> EntryBank:
+        return self  # nothing of it ever changes
 
-    def texts(self) -> Iterator[bytes]:
-        """The entries' JSON, unread but known to be what was written."""
-        return (self._text(row) for row in self._rows)
+    def __reduce__(self) -> tuple[Any, ...]:
+        return _reopened, (self._file.path, self._start, self._columns, self.objects, self._rows)
+
+    @property
+    def keys(self) -> NDArray[np.uint64]:
+        """The digests of the entries' keys ``(n,)``."""
+        return self._columns.keys[self._numbers]
+
+    @property
+    def qualities(self) -> NDArray[np.float64]:
+        """The entries' qualities ``(n,)``."""
+        return self._columns.qualities[self._numbers]
+
+    @property
+    def _numbers(self) -> NDArray[np.int64]:
+        return np.arange(self._rows.start, self._rows.stop, self._rows.step)
+
+    def lines(self) -> Iterator[tuple[bytes, int, float]]:
+        """Each entry's JSON, checked against its digest but not parsed; its key's digest and its quality."""
+        for row in self._rows:
+            yield self._text(row), int(self._columns.keys[row]), float(self._columns.qualities[row])
 
     def _text(self, row: int) -> bytes:
-        start = int(self._lines.ends[row - 1]) + len(BETWEEN) if row else len(HEAD)
-        text = self._opened.read(start, int(self._lines.ends[row]) - start, f"entries[{row}]")
-        if _digest(text) != self._lines.digests[row].tobytes():
+        ends = self._columns.ends
+        begin, end = int(ends[row - 1]) + len(BETWEEN) if row else 0, int(ends[row])
+        text = self._file.read(self._start + begin, end - begin)
+        if _digest(text) != self._columns.digests[row].tobytes():
             raise MemoryFormatError(
-                f"{self._path}: entries[{row}] is not what its digest says: changed or damaged; train or "
-                "pull it again. To change entries, use openspm memory export and add"
+                f"{self._file.path}: entries[{row}] is not what its digest says: truncated, changed or "
+                f"damaged; {AGAIN}. To change entries, use openspm memory export and add"
             )
         return text
 
     def _read(self, row: int) -> MemoryEntry:
-        where = f"{self._path}: entries[{row}]"
+        where = f"{self._file.path}: entries[{row}]"
         entry = entry_from_json(self._text(row), where)
         if unknown := set(entry.objects) - self.objects:
             raise MemoryFormatError(
-                f"{where} has key poses at {sorted(unknown)}, which memory.json does not list"
+                f"{where} has key poses at {sorted(unknown)}, which 'anchored' does not list; {AGAIN}"
             )
-        if entry.quality != self._columns.qualities[row]:
-            raise MemoryFormatError(f"{where} has another quality than array 'entries.qualities' says")
+        kept = int(self._columns.keys[row]), float(self._columns.qualities[row])
+        if kept != (key_digest(entry.key.sub_tasks), entry.quality):
+            raise MemoryFormatError(
+                f"{where} has another key or quality than arrays 'entries.keys' and 'entries.qualities' say; "
+                f"{AGAIN}"
+            )
         return entry
 
 
-def _check_columns(columns: Columns, n: int, where: str) -> None:
-    for name, array, dtype in (("keys", columns.digests, np.uint64), ("qualities", columns.qualities, float)):
-        if array.dtype != dtype or array.shape != (n,):
-            raise MemoryFormatError(
-                f"{where}: array 'entries.{name}' is {array.dtype} of {array.shape}, expected "
-                f"{np.dtype(dtype)} of {(n,)}; train or pull it again"
-            )
+def _reopened(path: Path, *rest: Any) -> EntryBank:
+    """A bank in another process."""
+    return EntryBank(OpenFile(path), *rest)
 
 
 def anchored_objects(entries: Sequence[MemoryEntry]) -> frozenset[str]:
@@ -208,76 +226,40 @@ def anchored_objects(entries: Sequence[MemoryEntry]) -> frozenset[str]:
     return frozenset(name for entry in entries for name in entry.objects)
 
 
-def entry_from_json(text: bytes, where: str) -> MemoryEntry:
-    """Read one entry's JSON; `where` names it in errors.
+def write_entries(file: BinaryIO, groups: Sequence[Sequence[MemoryEntry]]) -> Columns:
+    """Write groups of entries, one after the other, a line each; then the end of the file.
 
     Raises:
-        MemoryFormatError: It is not JSON, or a field is missing, unknown, of another type, or out of range.
+        MemoryFormatError: An entry could not be read again.
     """
-    fields = loads(text, where)
-    try:
-        return entry_from_fields(fields)
-    except MALFORMED as error:
-        raise MemoryFormatError(f"{where} is malformed: {error!r}; train or pull it again") from error
-
-
-def entry_to_json(entry: MemoryEntry) -> bytes:
-    """One entry as JSON on one line.
-
-    Raises:
-        ValueError: A number is not finite.
-        MemoryFormatError: It has counted further than what is read again.
-    """
-    for name in ("version", "trials"):
-        if (count := getattr(entry, name)) > LIMIT:
+    ends, digests, keys, qualities = array("q"), bytearray(), array("Q"), array("d")
+    position = -len(BETWEEN)
+    for text, key, quality in (line for group in groups for line in _lines(group)):
+        if len(text) > MAX_LINE_BYTES:
             raise MemoryFormatError(
-                f"the entry of {entry.source!r} has {name!r} {count}, expected up to {LIMIT:g}: it could "
-                "never be loaded again, so nothing was saved; export it, correct the number, and add it again"
+                f"entries[{len(ends)}] has {len(text)} bytes as JSON, expected up to {MAX_LINE_BYTES}: it "
+                f"could never be loaded again, so nothing was saved. It begins with "
+                f"{text[:80].decode(errors='replace')}; shorten its texts, or leave it out"
             )
-    return json.dumps(entry_to_fields(entry), allow_nan=False, ensure_ascii=False).encode()
-
-
-def texts_of(entries: Sequence[MemoryEntry]) -> Iterator[bytes]:
-    """The JSON of every entry, a line each; what lies in a file already is taken from there as it is."""
-    return entries.texts() if isinstance(entries, EntryBank) else map(entry_to_json, entries)
-
-
-def write_texts(file: BinaryIO, texts: Iterable[bytes]) -> tuple[Lines, str]:
-    """Write entries, given as :func:`texts_of` gives them, as one JSON list.
-
-    Returns:
-        Where the lines are, and the SHA-256 of the file in hexadecimal.
-
-    Raises:
-        MemoryFormatError: An entry is longer than what is read again.
-    """
-    sha256, position = hashlib.sha256(), 0
-    ends: list[int] = []
-    digests: list[bytes] = []
-
-    def write(blob: bytes) -> int:
-        file.write(blob)
-        sha256.update(blob)
-        return position + len(blob)
-
-    position = write(HEAD)
-    for text in texts:
-        _check_length(text, len(ends))
-        position = write(BETWEEN + text if ends else text)
+        file.write(BETWEEN + text if ends else text)
+        position += len(BETWEEN) + len(text)
         ends.append(position)
-        digests.append(_digest(text))
-    write(TAIL)
-    rows = np.frombuffer(b"".join(digests), np.uint8).reshape(-1, DIGEST_BYTES)
-    return Lines(np.array(ends, np.int64), rows), sha256.hexdigest()
+        digests += _digest(text)
+        keys.append(key)
+        qualities.append(quality)
+    file.write(TAIL)
+    return Columns(
+        np.array(ends, np.int64),
+        np.frombuffer(digests, np.uint8).reshape(-1, DIGEST_BYTES),
+        np.array(keys, np.uint64),
+        np.array(qualities, np.float64),
+    )
 
 
-def _check_length(text: bytes, row: int) -> None:
-    if len(text) > MAX_LINE_BYTES:
-        raise MemoryFormatError(
-            f"entries[{row}] has {len(text)} bytes as JSON, expected up to {MAX_LINE_BYTES}: it could never "
-            f"be loaded again, so nothing was saved. It begins with {text[:80].decode(errors='replace')}; "
-            "shorten its texts, or leave it out"
-        )
+def _lines(entries: Sequence[MemoryEntry]) -> Iterator[tuple[bytes, int, float]]:
+    if isinstance(entries, EntryBank):  # their lines are copied, not parsed
+        return entries.lines()
+    return ((entry_to_json(e), key_digest(e.key.sub_tasks), e.quality) for e in entries)
 
 
 def _digest(text: bytes) -> bytes:

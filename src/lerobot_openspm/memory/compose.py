@@ -13,25 +13,19 @@ from dataclasses import dataclass, replace
 from functools import partial
 
 from lerobot_openspm.errors import InstructionError
+from lerobot_openspm.language.descriptions import phrase
 from lerobot_openspm.language.meaning import semantic_score
 from lerobot_openspm.language.names import TABLE_NAMES, NameSimilarity
 from lerobot_openspm.language.own_words import normal_words
-from lerobot_openspm.memory.entry import MemoryEntry, MemoryKeyPose, RetrievalKey
+from lerobot_openspm.memory.entry import MemoryEntry, RetrievalKey
 from lerobot_openspm.memory.indexed_entries import near
 from lerobot_openspm.memory.retrieval import candidates_for, read_instruction, why_unread
-from lerobot_openspm.types import Reference, SubTask
+from lerobot_openspm.types import SubTask
 
 # A sub-task takes hold of something and lets it go again.
 TRANSITIONS_PER_SUB_TASK = 2
 # Ways through free space; without the objects they are relative to, the hand finds another way.
 FREE_PHASES = ("approach", "lift", "pre-place", "retreat")
-# Relations that are not the preposition that one says.
-_PREPOSITIONS = {
-    "front of": "to the front of", "left of": "to the left of", "right of": "to the right of", "at": "to",
-    "front": "in front of", "back": "behind", "left": "to the left of", "right": "to the right of",
-    "center": "in the center of",
-}  # fmt: skip
-_VERBS = {"pick": "pick up"}
 # What one thing after another is said with: "wipe the table, and then open the drawer".
 _NEXT = re.compile(r"(?:\band )?\bthen\b|[;.!?\n]+", re.IGNORECASE)
 _AND = re.compile(r"\band\b", re.IGNORECASE)
@@ -72,22 +66,17 @@ def parts(entry: MemoryEntry) -> tuple[MemoryEntry, ...]:
     sub_tasks = entry.key.sub_tasks
     if len(sub_tasks) == 1 or sub_tasks[0].words:
         return (entry,)  # no words say what each part of an instruction is that cannot be read
-    serves = _sub_tasks_of(entry)
-    found: list[MemoryEntry] = []
-    for i in range(len(sub_tasks)):
-        own = [pose for pose, served in zip(entry.key_poses, serves, strict=True) if served == i]
-        part = _part(entry, i, own)
-        if part is not None:
-            found.append(part)
-    return tuple(found)
+    found = (_part(entry, i) for i in range(len(sub_tasks)))
+    return tuple(part for part in found if part is not None)
 
 
-def _part(entry: MemoryEntry, number: int, own: Sequence[MemoryKeyPose]) -> MemoryEntry | None:
+def _part(entry: MemoryEntry, number: int) -> MemoryEntry | None:
     sub_task = entry.key.sub_tasks[number]
     kept = tuple(
         replace(pose, sub_task=0)
-        for pose in own
-        if set(pose.anchor.objects) <= set(sub_task.objects) or pose.phase not in FREE_PHASES
+        for pose in entry.key_poses
+        if pose.sub_task == number
+        and (set(pose.anchor.objects) <= set(sub_task.objects) or pose.phase not in FREE_PHASES)
     )
     contacts = [pose for pose in kept if pose.phase not in FREE_PHASES]
     if not contacts or any(not set(pose.anchor.objects) <= set(sub_task.objects) for pose in contacts):
@@ -100,18 +89,6 @@ def _part(entry: MemoryEntry, number: int, own: Sequence[MemoryKeyPose]) -> Memo
         layout={name: T for name, T in entry.layout.items() if name in sub_task.objects},
         outcomes=tuple(replace(one, sub_task=0) for one in entry.outcomes if one.sub_task == number),
     )
-
-
-def _sub_tasks_of(entry: MemoryEntry) -> list[int]:
-    """The sub-task of every key pose; told by the gripper where an older memory does not say it."""
-    if any(pose.sub_task > 0 for pose in entry.key_poses):
-        return [pose.sub_task for pose in entry.key_poses]
-    served: list[int] = []
-    contact = 0
-    for pose in entry.key_poses:
-        served.append(sub_task_index(contact, pose.phase, len(entry.key.sub_tasks)))
-        contact += pose.dwell  # the fingers have closed or opened here
-    return served
 
 
 def plan_parts(
@@ -160,11 +137,14 @@ def _plan_by_words(
     try:
         return (_about(asked, instruction, [Candidate(entry, 0.0, entry) for entry in close], names),)
     except InstructionError as error:
-        splits = ([one for one in joint.split(instruction) if normal_words(one)] for joint in (_NEXT, _AND))
+        splits = (
+            [one for one in joint.split(instruction) if normal_words(one, names.lexicon)]
+            for joint in (_NEXT, _AND)
+        )
         with suppress(InstructionError):
             if sentences := next((pieces for pieces in splits if len(pieces) > 1), None):
                 return tuple(part for one in sentences for part in plan_parts(one, entries, names))
-        why = why_unread(instruction, entries)
+        why = why_unread(instruction, entries, names)
         raise InstructionError(f"{why}; and {error}" if why else str(error)) from error
 
 
@@ -196,26 +176,3 @@ def _about(
         replace(by_entry[id(e)], semantic=score, asked=e.key.sub_tasks if asked[0].words else tuple(asked))
         for e, score in found
     )
-
-
-def phrase(sub_task: SubTask) -> str:
-    """A sub-task in words, as an instruction: "put the bowl in the top drawer of the cabinet"."""
-    if sub_task.words:
-        return sub_task.words
-    verb = _VERBS.get(sub_task.operation, sub_task.operation)
-    if not sub_task.landmark:
-        return f"{verb} {_noun(sub_task.target, sub_task.part, sub_task.target_where)}"
-    preposition = _PREPOSITIONS.get(sub_task.relation, sub_task.relation)
-    target = _noun(sub_task.target, "", sub_task.target_where)
-    landmark = _noun(sub_task.landmark, sub_task.part, sub_task.landmark_where)
-    return f"{verb} {target} {preposition} {landmark}"
-
-
-def _noun(name: str, part: str, where: Reference | None) -> str:
-    told = f"the {name}"
-    if where is not None and not where.landmarks:
-        told = f"the {where.relation} {name}"
-    elif where is not None:
-        preposition = _PREPOSITIONS.get(where.relation, where.relation)
-        told = f"the {name} {preposition} {' and '.join(f'the {landmark}' for landmark in where.landmarks)}"
-    return f"the {part} of {told}" if part else told

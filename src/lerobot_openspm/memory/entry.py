@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import Literal, get_args
 
 import numpy as np
 
@@ -12,9 +12,10 @@ from lerobot_openspm.geometry import se3
 from lerobot_openspm.geometry.se3 import Array
 from lerobot_openspm.types import SubTask
 
-PHASES = (
-    "approach", "grasp", "lift", "pre-place", "place", "release", "retreat", "push", "open", "turn",
-)  # fmt: skip
+Phase = Literal[
+    "approach", "grasp", "lift", "pre-place", "place", "release", "retreat", "push", "open", "turn"
+]
+PHASES: tuple[str, ...] = get_args(Phase)
 # Phases in which the hand touches something: their key poses are met precisely, the others in passing.
 CONTACT_PHASES = ("grasp", "place", "release", "push", "open", "turn")
 

@@ -7,28 +7,47 @@ import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
+import msgspec
 import numpy as np
 
 from lerobot_openspm.errors import MemoryFormatError
 from lerobot_openspm.files import write_beside
-from lerobot_openspm.memory.bank import anchored_objects, entry_to_json
+from lerobot_openspm.memory.bank import anchored_objects
 from lerobot_openspm.memory.entry import MemoryEntry
-from lerobot_openspm.memory.fields import MALFORMED, known, text
-from lerobot_openspm.memory.files import MAX_JSON_BYTES, VERSION, Fields, read_bytes
-from lerobot_openspm.memory.header import header_from_fields, header_to_fields
-from lerobot_openspm.memory.memory import Memory, header_of, read_memory
+from lerobot_openspm.memory.io import read_memory
+from lerobot_openspm.memory.memory import Memory
 from lerobot_openspm.memory.merging import SOURCES
-from lerobot_openspm.memory.store import entry_from_fields
-from lerobot_openspm.memory.strict_json import loads
-from lerobot_openspm.perception.objects.model import KnownObject
+from lerobot_openspm.memory.schema import (
+    VERSION,
+    Name,
+    Origin,
+    checked,
+    entry_from_fields,
+    entry_to_json,
+    loads,
+    memory_from,
+    origin_of,
+    record_of,
+)
+from lerobot_openspm.perception.objects.base import KnownObject
 from lerobot_openspm.perception.objects.store import to_parts as object_to_parts
 
 FORMAT = "openspm-entries"
-NAMES = (
-    "format", "version", "perception", "segmentation", "shape", "simulator_objects", "layouts", "robot",
-    "objects", "entries",
-)  # fmt: skip
+MAX_FILE_BYTES = 512_000_000
+
+
+class EntriesFile(Origin):
+    """A file of entries.
+
+    Attributes:
+        objects: By name, :func:`digest` of the model of every object that the entries have key poses at.
+        entries: The entries, each as :func:`~lerobot_openspm.memory.schema.entry_to_json` writes it.
+    """
+
+    objects: dict[Name, str]
+    entries: list[Any]
 
 
 @dataclass(frozen=True)
@@ -58,87 +77,60 @@ def digest(model: KnownObject) -> str:
 def write_entries_file(memory: Memory, path: Path) -> None:
     """Write the entries of a memory as one JSON file, an entry on every line."""
     names = anchored_objects(memory.entries) & memory.objects.keys()
-    fields = header_to_fields(header_of(memory, []))
-    fields["format"] = FORMAT
-    fields["objects"] = {name: digest(memory.objects[name]) for name in sorted(names)}
-    head = json.dumps({name: fields[name] for name in NAMES if name != "entries"}, indent=1, allow_nan=False)
+    objects = {name: digest(memory.objects[name]) for name in sorted(names)}
+    fields = {**origin_of(memory, FORMAT), "objects": objects, "entries": []}
+    origin = msgspec.to_builtins(record_of(fields, EntriesFile, "the file"))
+    del origin["entries"]
+    head = json.dumps(origin, indent=1, ensure_ascii=False).removesuffix("\n}").encode()
     lines = b",\n".join(map(entry_to_json, memory.entries))
-    write_beside(path, head.removesuffix("\n}").encode() + b',\n "entries": [\n' + lines + b"\n ]\n}\n")
+    write_beside(path, head + b',\n "entries": [\n' + lines + b"\n ]\n}\n")
 
 
-def read_parcel(path: Path) -> EntryImport:
+def read_import(path: Path) -> EntryImport:
     """Read entries from a memory's folder or from a file that :func:`write_entries_file` wrote.
 
     Raises:
         MemoryFormatError: There is none, or it is malformed. Names file and field.
-        CalibrationError: The memory's calibration is not its own.
+        CalibrationError: The memory's calibration is malformed.
     """
     if path.is_dir():
         memory = read_memory(path)
-        digests = {name: digest(model) for name, model in memory.objects.items()}
-        return EntryImport(memory, digests, is_edited=False)
-    return _read_entries_file(path)
-
-
-def _read_entries_file(path: Path) -> EntryImport:
+        return EntryImport(memory, {name: digest(memory.objects[name]) for name in memory.objects}, False)
     if not path.is_file():
         raise MemoryFormatError(
             f"nothing at {path}; expected a checkpoint's folder, or a file that `openspm memory export` wrote"
         )
-    fields = loads(read_bytes(path, MAX_JSON_BYTES), str(path))
-    if not isinstance(fields, dict) or fields.get("format") != FORMAT or fields.get("version") != VERSION:
-        got = (
-            {name: fields.get(name) for name in ("format", "version")} if isinstance(fields, dict) else fields
-        )
+    if (size := path.stat().st_size) > MAX_FILE_BYTES:
         raise MemoryFormatError(
-            f"{path}: got {str(got)[:100]}, expected format {FORMAT!r} and version {VERSION}, as "
+            f"{path}: {size} bytes, expected up to {MAX_FILE_BYTES}; export fewer entries"
+        )
+    fields = loads(path.read_bytes(), str(path))
+    got = [fields.get(name) for name in ("format", "version")] if isinstance(fields, dict) else [fields]
+    if got != [FORMAT, VERSION]:
+        raise MemoryFormatError(
+            f"{path}: got format and version {str(got)[:100]}, expected {FORMAT!r} and {VERSION}, as "
             "`openspm memory export` writes it"
         )
-    try:
-        known(fields, NAMES, "the file")
-        objects = known(fields["objects"], fields["objects"], "'objects'")
-        digests = {name: text(objects, name) for name in objects}
-        rows = fields["entries"]
-        if not isinstance(rows, list):
-            raise ValueError("'entries' must be a list")
-    except MALFORMED as error:
-        raise MemoryFormatError(f"{path}: malformed: {error!r}") from error
-    own = {name: fields[name] for name in NAMES if name in fields and name not in ("objects", "entries")}
-    header = header_from_fields(
-        {**own, "objects": [], "n_entries": 0, "anchored": [], "files": {}}, str(path)
-    )
-    entries = tuple(_entry(row, f"{path}: entries[{i}]") for i, row in enumerate(rows))
-    memory = Memory(
-        entries, {}, header.robot, {}, header.perception, header.simulator_objects, header.segmentation,
-        header.shape, header.layouts,
-    )  # fmt: skip
-    return EntryImport(memory, digests, is_edited=True)
+    file = checked(fields, EntriesFile, str(path))
+    entries = tuple(entry_from_fields(e, f"{path}: entries[{i}]") for i, e in enumerate(file.entries))
+    memory = memory_from(file, str(path), entries=entries, objects={}, cameras={})
+    return EntryImport(memory, file.objects, is_edited=True)
 
 
-def _entry(fields: Fields, where: str) -> MemoryEntry:
-    try:
-        return entry_from_fields(fields)
-    except MALFORMED as error:
-        raise MemoryFormatError(f"{where} is malformed: {error!r}") from error
-
-
-def combined(ours: Memory, parcel: EntryImport, where: str) -> tuple[Memory, int]:
-    """A memory with the entries of a parcel that it does not hold yet.
+def combined(ours: Memory, imported: EntryImport, where: str) -> Memory:
+    """A memory with the imported entries that it does not hold yet; what they replace is superseded.
 
     Args:
-        ours: The memory.
-        parcel: What is added.
-        where: Names the parcel in errors.
-
-    Returns:
-        The memory afterwards, and how many entries are new or newer. What they replace is superseded.
+        ours: The memory. Where nothing is new, it is returned itself.
+        imported: What is added.
+        where: Names their origin in errors.
 
     Raises:
-        MemoryFormatError: The parcel comes from another robot, from another perception, or has key poses in
+        MemoryFormatError: It comes from another robot, from another perception, or has key poses in
             the frames of other models of objects. Or it is a file with two entries of one source and
             instruction, or with an edited entry that was merged into another one.
     """
-    theirs = parcel.memory
+    theirs = imported.memory
     for name in ("perception", "segmentation", "shape", "simulator_objects"):
         mine, other = getattr(ours, name), getattr(theirs, name)
         if mine != other:
@@ -146,17 +138,20 @@ def combined(ours: Memory, parcel: EntryImport, where: str) -> tuple[Memory, int
                 f"{where}: {name} is {other!r}, the memory's {mine!r}: its key poses are in other frames. "
                 "Mine its demonstrations into this memory: openspm teach, or --policy.memory_update=append"
             )
-    _check_objects(ours, parcel, where)
-    if parcel.is_edited:
+    _check_objects(ours, imported, where)
+    if imported.is_edited:
         _check_twice(theirs.entries, where)
-    new = _not_held(ours, parcel, where)
-    if parcel.is_edited:
-        return _with_edited(ours, new, theirs), len(new)
-    return ours.appended(replace(theirs, entries=new, superseded=())), len(new)
+    new = _not_held(ours, imported, where)
+    after = (
+        _with_edited(ours, new, theirs)
+        if imported.is_edited
+        else ours.appended(replace(theirs, entries=new, superseded=()))
+    )
+    return after if new else ours
 
 
-def _not_held(ours: Memory, parcel: EntryImport, where: str) -> tuple[MemoryEntry, ...]:
-    """The entries of a parcel that a memory does not hold: neither as they are, nor within merged ones.
+def _not_held(ours: Memory, imported: EntryImport, where: str) -> tuple[MemoryEntry, ...]:
+    """The imported entries that a memory does not hold: neither as they are, nor within merged ones.
 
     From another memory, nothing is taken that this one has superseded: what was replaced, merged or removed
     stays so until it is restored. A file that people edit may well bring back what an entry was before.
@@ -165,11 +160,11 @@ def _not_held(ours: Memory, parcel: EntryImport, where: str) -> tuple[MemoryEntr
     superseded = {entry_to_json(entry) for entry in ours.superseded}
     merged = {(part, e.key): e.source for e in ours.entries for part in _merged_sources(e)}
     new: list[MemoryEntry] = []
-    for i, entry in enumerate(parcel.memory.entries):
+    for i, entry in enumerate(imported.memory.entries):
         text, within = entry_to_json(entry), merged.get((entry.source, entry.key))
-        if text in held or (text in superseded and (within or not parcel.is_edited)):
+        if text in held or (text in superseded and (within or not imported.is_edited)):
             continue
-        if within and parcel.is_edited:
+        if within and imported.is_edited:
             raise MemoryFormatError(
                 f"{where}: entries[{i}] is an edited {entry.source!r}, which is part of the merged entry "
                 f"{within!r} by now; export and edit that one, or remove it and restore what it was made of"
@@ -209,9 +204,9 @@ def _with_edited(ours: Memory, new: Sequence[MemoryEntry], theirs: Memory) -> Me
     return replace(rest, superseded=(*ours.superseded, *gone))
 
 
-def _check_objects(ours: Memory, parcel: EntryImport, where: str) -> None:
+def _check_objects(ours: Memory, imported: EntryImport, where: str) -> None:
     """Every object that entries have key poses at has to be known by the same model, or to come along."""
-    theirs = parcel.memory
+    theirs = imported.memory
     for name in sorted(anchored_objects(theirs.entries)):
         model = ours.objects.get(name)
         if model is None and name not in theirs.objects and ours.perception != "oracle":
@@ -219,7 +214,7 @@ def _check_objects(ours: Memory, parcel: EntryImport, where: str) -> None:
                 f"{where}: entries have key poses at {name!r}, which the memory knows no model of; it knows "
                 f"{', '.join(sorted(ours.objects))}. Add from the checkpoint's folder, which holds the models"
             )
-        if model is not None and parcel.digests.get(name) != digest(model):
+        if model is not None and imported.digests.get(name) != digest(model):
             raise MemoryFormatError(
                 f"{where}: 'objects': {name!r} is known by another model there, so its key poses are in "
                 "another frame. Mine its demonstrations into this memory: openspm teach, or "

@@ -13,17 +13,16 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from lerobot_openspm.errors import MemoryFormatError
 from lerobot_openspm.memory.key_vector import DIMENSIONS, Vectors
 
 logger = logging.getLogger(__name__)
 
-# Up to so many vectors all are compared.
+# Up to this many vectors, a query is compared with all of them.
 EXACT_LIMIT = 200_000
-# The number of lists grows with the root of that of vectors; a query looks into so many of them. Of a million
-# vectors in 1500 lists 32,000 are compared.
+# The number of lists grows with the square root of the number of vectors; a query looks into _PROBES lists.
+# Of a million vectors in 1500 lists, 32,000 are compared.
 _LISTS_PER_ROOT, _PROBES = 1.5, 48
-# Samples and rounds that the lists' centres are found with.
+# Samples and iterations of the k-means that finds the centres of the lists.
 _SAMPLES_PER_LIST, _ROUNDS = 40, 5
 
 Indices = NDArray[np.int64]
@@ -31,10 +30,6 @@ Indices = NDArray[np.int64]
 
 class KeyIndex(Protocol):
     """Finds the nearest of a fixed set of unit vectors by cosine."""
-
-    def __len__(self) -> int:
-        """How many vectors it holds."""
-        ...
 
     def search(self, queries: Vectors, k: int) -> tuple[Vectors, Indices]:
         """The nearest vectors of every query.
@@ -44,8 +39,8 @@ class KeyIndex(Protocol):
             k: How many to find of each.
 
         Returns:
-            Cosines ``(q, m)`` and numbers of the vectors ``(q, m)``, ``m = min(k, len(self))``, the nearest
-            first. Where an index finds fewer, what is left has cosine ``-inf`` and number -1.
+            Cosines ``(q, m)`` and numbers of the vectors ``(q, m)``, the nearest first; m is k, or the number
+            of vectors if that is less. Where fewer are found, the rest has cosine ``-inf`` and number -1.
         """
         ...
 
@@ -56,13 +51,9 @@ class ExactIndex:
     def __init__(self, vectors: Vectors):
         self._vectors = np.ascontiguousarray(vectors)
 
-    def __len__(self) -> int:
-        return len(self._vectors)
-
     def search(self, queries: Vectors, k: int) -> tuple[Vectors, Indices]:
         """See :meth:`KeyIndex.search`."""
-        _check_search(queries, k)
-        m = min(k, len(self))
+        m = min(k, len(self._vectors))
         cosines, found = np.zeros((len(queries), m), np.float32), np.zeros((len(queries), m), np.int64)
         if not m:
             return cosines, found
@@ -102,13 +93,9 @@ class FaissIndex:
         index.nprobe = _PROBES
         self._index = index
 
-    def __len__(self) -> int:
-        return int(self._index.ntotal)
-
     def search(self, queries: Vectors, k: int) -> tuple[Vectors, Indices]:
         """See :meth:`KeyIndex.search`."""
-        _check_search(queries, k)
-        if not (m := min(k, len(self))):
+        if not (m := min(k, int(self._index.ntotal))):
             return np.zeros((len(queries), 0), np.float32), np.zeros((len(queries), 0), np.int64)
         cosines, found = self._index.search(np.ascontiguousarray(queries), m)
         cosines[found < 0] = -np.inf
@@ -116,23 +103,12 @@ class FaissIndex:
 
 
 def make_index(vectors: Vectors, where: str = "the memory") -> KeyIndex:
-    """The index for so many vectors: exact up to :data:`EXACT_LIMIT`, FAISS's beyond if it is installed.
+    """The index for a number of vectors: exact up to :data:`EXACT_LIMIT`, FAISS's beyond if it is installed.
 
     Args:
         vectors: Unit vectors ``(n, 64)``.
-        where: Names their file in errors.
-
-    Raises:
-        MemoryFormatError: They are not unit vectors of that size.
+        where: Names the memory in the log.
     """
-    if vectors.ndim != 2 or vectors.shape[1] != DIMENSIONS or vectors.dtype != np.float32:
-        raise MemoryFormatError(
-            f"{where}: key vectors have shape {vectors.shape} and type {vectors.dtype}, expected "
-            f"(n, {DIMENSIONS}) of float32; train or pull it again"
-        )
-    # NaN compares false, so it is found here too.
-    if not (np.abs(np.einsum("ij,ij->i", vectors, vectors) - 1) < 1e-3).all():
-        raise MemoryFormatError(f"{where}: key vectors are not finite unit vectors; train or pull it again")
     if len(vectors) <= EXACT_LIMIT:
         return ExactIndex(vectors)
     if importlib.util.find_spec("faiss") is None:
@@ -144,13 +120,3 @@ def make_index(vectors: Vectors, where: str = "the memory") -> KeyIndex:
         )
         return ExactIndex(vectors)
     return FaissIndex(vectors)
-
-
-def _check_search(queries: Vectors, k: int) -> None:
-    if queries.ndim != 2 or queries.shape[1] != DIMENSIONS or queries.dtype != np.float32:
-        raise ValueError(
-            f"queries have shape {queries.shape} and type {queries.dtype}, expected (q, {DIMENSIONS}) of "
-            "float32"
-        )
-    if k < 1:
-        raise ValueError(f"k is {k}, expected at least 1")

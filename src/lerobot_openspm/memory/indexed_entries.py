@@ -6,26 +6,23 @@ keys, they are scored exactly, and of the best keys the best entries are handed 
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import overload
 
 import numpy as np
 from numpy.typing import NDArray
 
-from lerobot_openspm.memory.columns import HasColumns, Key, key_digest
+from lerobot_openspm.memory.bank import EntryBank, Key
 from lerobot_openspm.memory.entry import MemoryEntry
 from lerobot_openspm.memory.index import make_index
 from lerobot_openspm.memory.key_vector import key_vectors
 from lerobot_openspm.types import SubTask
 
-logger = logging.getLogger(__name__)
-
-# Banks of more entries are indexed; to score fewer takes no longer than a look at the scene.
+# Banks of more entries are indexed; scoring fewer takes no longer than perception.
 INDEX_FROM = 1000
-# Keys that the index finds for each part of an instruction.
+# Keys that the index returns for each part of an instruction.
 NEAREST_KEYS = 64
-# Of the entries of one key, so many are handed on, the best by quality; and so many in all.
+# Entries that are returned per key, the best by quality first, and in total.
 ENTRIES_PER_KEY, ENTRIES_IN_ALL = 64, 256
 
 # S_sem of what is asked and what is known.
@@ -36,7 +33,7 @@ class IndexedEntries(Sequence[MemoryEntry]):
     """Entries with an index over their keys, and over the sub-tasks of keys that have several.
 
     Args:
-        entries: The bank. If it :class:`HasColumns`, one entry of every different key is read, else all.
+        entries: The bank. Of an :class:`EntryBank` one entry of every different key is read, else all.
         where: Names the bank in errors.
 
     Attributes:
@@ -48,7 +45,7 @@ class IndexedEntries(Sequence[MemoryEntry]):
 
     def __init__(self, entries: Sequence[MemoryEntry], where: str = "the memory"):
         self._entries = entries
-        keys, numbers, qualities = _numbered_keys(entries, where)
+        keys, numbers, qualities = _numbered_keys(entries)
         # Entries by key, the best of each first.
         self._order = np.lexsort((np.arange(len(entries)), -qualities, numbers))
         self._ends = np.searchsorted(numbers[self._order], np.arange(len(keys) + 1))
@@ -139,21 +136,12 @@ def near(asked: Sequence[SubTask], entries: Sequence[MemoryEntry], score: Score)
 
 
 def _numbered_keys(
-    entries: Sequence[MemoryEntry], where: str
+    entries: Sequence[MemoryEntry],
 ) -> tuple[list[Key], NDArray[np.int64], NDArray[np.float64]]:
     """The different keys, which of them each entry has ``(n,)``, and the entries' qualities ``(n,)``."""
-    kept = entries.columns() if isinstance(entries, HasColumns) else None
-    if kept is not None:
-        digests, firsts, numbers = np.unique(kept.digests, return_index=True, return_inverse=True)
-        keys = [entries[int(i)].key.sub_tasks for i in firsts]
-        if [key_digest(key) for key in keys] == digests.tolist():
-            return keys, np.asarray(numbers, np.int64), kept.qualities
-        logger.warning(
-            "%s: its digests are not those of its keys, so all %d entries are read; write it again with this "
-            "release to load it quicker",
-            where,
-            len(entries),
-        )
+    if isinstance(entries, EntryBank):
+        _, firsts, numbers = np.unique(entries.keys, return_index=True, return_inverse=True)
+        return [entries[int(i)].key.sub_tasks for i in firsts], numbers, entries.qualities
     table: dict[Key, int] = {}
     rows = [(table.setdefault(entry.key.sub_tasks, len(table)), entry.quality) for entry in entries]
     numbers, qualities = np.array(rows, float).reshape(-1, 2).T

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Hashable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,8 +21,7 @@ SOURCES = ", "
 MEAN_STEPS = 10
 
 
-@dataclass(frozen=True)
-class Merged:
+class Merged(NamedTuple):
     """What merging makes of entries.
 
     Attributes:

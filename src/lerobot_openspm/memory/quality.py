@@ -6,8 +6,8 @@ from dataclasses import replace
 
 from lerobot_openspm.memory.entry import MemoryEntry
 
-# How well a demonstration agrees with the others of its task counts as much as so many trials: one failure of
-# a good entry lets others of its task be tried first, and after five trials what happened weighs more.
+# The demonstrations' agreement weighs as much as this many trials: after one failure of a good entry, others
+# of its task are tried first; after five trials the outcomes weigh more.
 PRIOR_TRIALS = 5
 
 

@@ -19,13 +19,16 @@ from lerobot_openspm.types import SubTask
 MIN_SEMANTIC = 0.75
 # Entries about different things whose scores lie this close together leave open which is meant.
 MARGIN = 0.05
-# So many known instructions are named in an error.
+# An error names at most this many known instructions.
 MAX_NAMED = 20
 
 
 @dataclass(frozen=True)
 class ScoreWeights:
-    """The paper's lambda_s, lambda_g and lambda_r."""
+    """The paper's lambda_s, lambda_g and lambda_r.
+
+    Only entries that mean the same are compared, so scene and quality weigh alike; what is meant weighs most.
+    """
 
     semantic: float = 1.0
     geometric: float = 0.5
@@ -62,8 +65,8 @@ def read_instruction(
     """
     known = known_names(entries)
     score = partial(semantic_score, names=AmongKnown(names, known))
-    own = (unread(instruction),)
-    read, best = read_task(instruction, known), MIN_SEMANTIC
+    own = (unread(instruction, names.lexicon),)
+    read, best = read_task(instruction, known, names.lexicon), MIN_SEMANTIC
     for asked in dict.fromkeys((read, own)):
         close = near(asked, entries, score)
         scores = {key: score(asked, key) for key in {entry.key.sub_tasks for entry in close}}
@@ -71,17 +74,17 @@ def read_instruction(
         if most == 1.0:
             return asked
         for entry in close:
-            if normal_words(entry.language) == own[0].words:
+            if normal_words(entry.language, names.lexicon) == own[0].words:
                 return own if entry.key.sub_tasks[0].words else entry.key.sub_tasks
         if most > best:
             read, best = asked, most
     return read
 
 
-def why_unread(instruction: str, entries: Sequence[MemoryEntry]) -> str:
+def why_unread(instruction: str, entries: Sequence[MemoryEntry], names: NameSimilarity) -> str:
     """Why the grammar cannot read an instruction; "" where it can."""
     try:
-        parse_instruction(instruction, known_names(entries))
+        parse_instruction(instruction, known_names(entries), names.lexicon)
     except InstructionError as error:
         return str(error)
     return ""
@@ -164,6 +167,7 @@ def retrieve(
     candidates: Sequence[tuple[MemoryEntry, float]],
     geometric: Callable[[MemoryEntry], float],
     weights: ScoreWeights,
+    names: NameSimilarity = TABLE_NAMES,
 ) -> list[Scored]:
     """Rank entries, best first: those that are meant, of these the usable ones, then by the paper's score.
 
@@ -176,6 +180,7 @@ def retrieve(
         geometric: ``S_geo`` in 0..1 of an entry in the present scene; 0 if it cannot be executed there,
             because an object was not found or its key poses, carried over, fail the checks.
         weights: The three lambdas.
+        names: Says which names mean the same thing.
     """
     ranked: list[Scored] = []
     for entry, semantic in candidates:
@@ -185,7 +190,7 @@ def retrieve(
     most = max((scored.semantic for scored in ranked), default=0.0)
     meant = {scored.entry.key.sub_tasks for scored in ranked if scored.semantic == most}
     is_meant = {
-        key: any(means_the_same(one, key) for one in meant)
+        key: any(means_the_same(one, key, names.lexicon) for one in meant)
         for key in {scored.entry.key.sub_tasks for scored in ranked}
     }
     return sorted(

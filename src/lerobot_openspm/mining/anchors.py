@@ -15,14 +15,15 @@ from lerobot_openspm.memory.entry import CONTACT_PHASES, WORLD, Anchor
 from lerobot_openspm.mining.key_poses import KeyPose
 from lerobot_openspm.types import SubTask
 
-# An anchor other than the one the instruction suggests must explain the demonstrations better by this much,
-# shared among them: with one demonstration the instruction decides, with many the evidence does.
+# An anchor other than the one that the instruction suggests must explain the demonstrations better by this
+# much divided by their number: with one demonstration the instruction decides, with many the evidence does.
 PRIOR_M = 0.05
 # Likewise for axes other than the anchor's own.
 AXES_PRIOR_M = 0.03
-# Key poses at contacts decide; the deviation of a good demonstration there is of this order.
+# The deviation of a good demonstration at its contacts is of this order.
 QUALITY_SCALE_M = 0.02
 
+# Which contact a key pose belongs to, its phase, and its number among those with both the same.
 Role = tuple[int, str, int]
 
 
@@ -32,18 +33,24 @@ class Demonstration:
 
     Attributes:
         key_poses: Its key poses, in order.
-        layout: Pose ``T_world_obj`` ``(4, 4)`` of every object found in its first frame.
+        object_poses: ``T_world_obj`` ``(4, 4)`` of every object found in its first frame.
     """
 
     key_poses: tuple[KeyPose, ...]
-    layout: Mapping[str, Array]
+    object_poses: Mapping[str, Array]
+
+    def in_frame(self, anchor: Anchor, pose: KeyPose) -> Array | None:
+        """A key pose in an anchor's frame, ``T_anchor_ee`` ``(4, 4)``; None if an object was not found."""
+        if any(name not in self.object_poses for name in anchor.objects):
+            return None
+        return se3.inverse(anchor.frame(self.object_poses)) @ pose.T_world_ee
 
 
 def roles(key_poses: Sequence[KeyPose]) -> list[Role]:
-    """What each key pose is for: which contact, which phase, and which of several with both the same.
+    """The role of each key pose.
 
-    The last ones of a kind are counted first (0 is the one nearest to the contact), so that an extra corner
-    far away in one demonstration does not shift the others.
+    Numbers count backwards (0 is the key pose nearest to the contact), so that an extra corner far away in
+    one demonstration does not shift the others.
     """
     seen: Counter[tuple[int, str]] = Counter()
     backwards: list[Role] = []
@@ -54,7 +61,7 @@ def roles(key_poses: Sequence[KeyPose]) -> list[Role]:
 
 
 def _is_turn(role: Role) -> bool:
-    """Whether a push goes on there: the hand passes by, in each demonstration somewhere else."""
+    """Whether a push goes on there: the hand passes by, elsewhere in each demonstration."""
     return role[1] == "push" and role[2] > 0
 
 
@@ -69,9 +76,9 @@ def things_taken(key_poses: Sequence[KeyPose]) -> int:
 
 
 def as_shown(sub_tasks: Sequence[SubTask], count: int) -> tuple[SubTask, ...]:
-    """Sub-tasks with as many things as the hand took, where the instruction is only kept by its words.
+    """Sub-tasks with as many targets as the hand took, where the instruction is only kept by its words.
 
-    "Set the table" does not say what is moved; the demonstrations show how many things are. Each gets a name
+    "Set the table" does not say what is moved; the demonstrations show how many objects are. Each gets a name
     of its own, so that perception learns it from where the hand touched it.
     """
     told = sub_tasks[0]
@@ -92,15 +99,14 @@ def suggested_anchor(pose: KeyPose, sub_tasks: Sequence[SubTask]) -> str:
 def consensus(demonstrations: Sequence[Demonstration], sub_tasks: Sequence[SubTask]) -> dict[Role, Anchor]:
     """Choose an anchor for every role of one task.
 
-    Candidates are built of the objects that the instruction names and that were found in a demonstration; an
-    object that it does not name is never an anchor, because nothing would look for it at run time.
+    Only objects that the instruction names are candidates, because nothing looks for others when acting.
     """
     names = list(dict.fromkeys(name for sub_task in sub_tasks for name in sub_task.objects))
     candidates = [Anchor(place, axes) for place in names for axes in (place, WORLD, *names)]
-    gathered: dict[Role, list[tuple[KeyPose, Mapping[str, Array]]]] = defaultdict(list)
+    gathered: dict[Role, list[tuple[KeyPose, Demonstration]]] = defaultdict(list)
     for demonstration in demonstrations:
         for role, pose in zip(roles(demonstration.key_poses), demonstration.key_poses, strict=True):
-            gathered[role].append((pose, demonstration.layout))
+            gathered[role].append((pose, demonstration))
     anchors: dict[Role, Anchor] = {}
     for role, members in gathered.items():
         suggested = suggested_anchor(members[0][0], sub_tasks)
@@ -111,21 +117,15 @@ def consensus(demonstrations: Sequence[Demonstration], sub_tasks: Sequence[SubTa
     return anchors
 
 
-def _cost(anchor: Anchor, members: Sequence[tuple[KeyPose, Mapping[str, Array]]], suggested: str) -> float:
-    """How much key poses of one role vary in an anchor's frame, plus what speaks against it beforehand."""
-    found = [(pose, layout) for pose, layout in members if all(name in layout for name in anchor.objects)]
+def _cost(anchor: Anchor, members: Sequence[tuple[KeyPose, Demonstration]], suggested: str) -> float:
+    """How much key poses of one role vary in an anchor's frame, in metres, plus the priors against it."""
+    placed = [demonstration.in_frame(anchor, pose) for pose, demonstration in members]
+    found = [T for T in placed if T is not None]
     if not found:
         return np.inf
-    poses = np.stack([se3.inverse(anchor.frame(layout)) @ pose.T_world_ee for pose, layout in found])
-    prior = (PRIOR_M * (anchor.place != suggested) + AXES_PRIOR_M * (anchor.axes != anchor.place)) / len(
-        found
-    )
-    return spread(poses) + prior + PRIOR_M * (1 - len(found) / len(members))
-
-
-def spread(T_obj_ee: Array) -> float:
-    """Median distance in metres of poses ``(n, 4, 4)`` from their medoid; 0 for a single one."""
-    return float(np.median(deviations(T_obj_ee)))
+    prior = PRIOR_M * (anchor.place != suggested) + AXES_PRIOR_M * (anchor.axes != anchor.place)
+    spread = float(np.median(deviations(np.stack(found))))
+    return spread + prior / len(found) + PRIOR_M * (1 - len(found) / len(members))
 
 
 def deviations(T_obj_ee: Array) -> Array:
@@ -139,28 +139,28 @@ def align_symmetric(
 ) -> list[Demonstration]:
     """Turn the frames of symmetric objects so that the demonstrations agree.
 
-    Perception cannot tell such an object from itself turned by its period, so each demonstration may hold
-    any choice. All are brought to that of the first demonstration in which the object was found.
+    Perception cannot tell such an object from itself turned by its period, so the choice may differ between
+    demonstrations. All follow the first demonstration in which the object was found.
     """
     references: dict[str, Array] = {}
     aligned = []
     for demonstration in demonstrations:
-        layout = dict(demonstration.layout)
+        object_poses = dict(demonstration.object_poses)
         with_roles = zip(demonstration.key_poses, roles(demonstration.key_poses), strict=True)
         contacts = [
             p.T_world_ee for p, role in with_roles if p.phase in CONTACT_PHASES and not _is_turn(role)
         ]
-        for name, T_world_obj in layout.items():
+        for name, T_world_obj in object_poses.items():
             equivalents = se3.yaw_equivalents(T_world_obj, yaw_periods.get(name, 2 * np.pi))
             if len(equivalents) == 1 or not contacts:
                 continue
             relative = [se3.inverse(T) @ np.stack(contacts) for T in equivalents]
             reference = references.setdefault(name, relative[0])
             n = min(len(reference), len(contacts))
-            # The contact nearest to the object tells most about which way round it is.
+            # The closest match among the contacts decides.
             costs = [float(np.min(se3.distance(T_obj_ee[:n], reference[:n]))) for T_obj_ee in relative]
-            layout[name] = equivalents[int(np.argmin(costs))]
-        aligned.append(Demonstration(demonstration.key_poses, layout))
+            object_poses[name] = equivalents[int(np.argmin(costs))]
+        aligned.append(Demonstration(demonstration.key_poses, object_poses))
     return aligned
 
 
@@ -170,17 +170,14 @@ def qualities(demonstrations: Sequence[Demonstration], anchors: Mapping[Role, An
     for i, demonstration in enumerate(demonstrations):
         for role, pose in zip(roles(demonstration.key_poses), demonstration.key_poses, strict=True):
             anchor = anchors.get(role)
-            if (
-                pose.phase in CONTACT_PHASES
-                and not _is_turn(role)
-                and anchor
-                and all(n in demonstration.layout for n in anchor.objects)
-            ):
-                gathered[role].append((i, se3.inverse(anchor.frame(demonstration.layout)) @ pose.T_world_ee))
+            if anchor is None or pose.phase not in CONTACT_PHASES or _is_turn(role):
+                continue
+            if (T_obj_ee := demonstration.in_frame(anchor, pose)) is not None:
+                gathered[role].append((i, T_obj_ee))
     worst = np.zeros(len(demonstrations))
     for members in gathered.values():
         distances = deviations(np.stack([T for _, T in members]))
-        # Where all of them differ, as in where a push ends, differing says nothing against one.
+        # Where most of them deviate, such as at the end of a push, a deviation is no fault.
         if np.median(distances) > QUALITY_SCALE_M:
             continue
         for (i, _), distance in zip(members, distances, strict=True):

@@ -1,4 +1,4 @@
-"""Writing what was mined into a copy of the dataset: columns to train on, sub-tasks for LeRobot's viewers."""
+"""Writes mined key poses into a copy of the dataset: columns to train on, sub-tasks for viewers."""
 
 from __future__ import annotations
 
@@ -7,7 +7,6 @@ import os
 import shutil
 import tempfile
 from collections.abc import Sequence
-from dataclasses import replace
 from itertools import groupby
 from pathlib import Path
 from typing import Any
@@ -28,29 +27,20 @@ from lerobot.utils.constants import OBS_STATE
 
 from lerobot_openspm.errors import DatasetError
 from lerobot_openspm.files import rename
-from lerobot_openspm.memory.compose import phrase
+from lerobot_openspm.language.descriptions import phase_phrase
 from lerobot_openspm.mining.anchors import sub_task_of
 from lerobot_openspm.mining.columns import TARGET, TYPES, encode_key_poses, features
 from lerobot_openspm.mining.dataset import Demonstrations
-from lerobot_openspm.mining.key_poses import KeyPose
 from lerobot_openspm.mining.mined import MinedEpisode, MinedKeyPoses
-from lerobot_openspm.types import SubTask
 
 logger = logging.getLogger(__name__)
 
-# What the hand does in a phase; those in `GOING` say where to as well.
-VERBS = {
-    "approach": "approach", "grasp": "grasp", "lift": "lift", "pre-place": "carry", "place": "place",
-    "release": "release", "retreat": "retreat from", "push": "push", "open": "pull", "turn": "turn",
-}  # fmt: skip
-GOING = ("place", "push")
-
 
 def check_folder(demonstrations: Demonstrations, folder: Path) -> None:
-    """Say before the long work whether an annotated dataset can be written.
+    """Check before the long work whether an annotated dataset can be written.
 
     Raises:
-        DatasetError: The folder exists, or lies in the dataset, or the dataset has such columns already.
+        DatasetError: The folder exists, or lies in the dataset's, or the dataset has such columns already.
     """
     name, root = demonstrations.name, Path(demonstrations.dataset.root).resolve()
     if folder.exists():
@@ -67,10 +57,10 @@ def check_folder(demonstrations: Demonstrations, folder: Path) -> None:
 
 
 def write_annotated(demonstrations: Demonstrations, mined: MinedKeyPoses, folder: Path) -> None:
-    """Write a copy of a dataset that says of every frame what was mined.
+    """Write a copy of a dataset with the mined key poses as columns of its frames.
 
-    Its videos are links to the dataset's. It is written beside its place and then renamed: whatever
-    interrupts this leaves no half of a folder.
+    Its videos are links to the dataset's. It is written beside its place and then renamed, so that an
+    interruption leaves no half of a folder.
 
     Args:
         demonstrations: The dataset.
@@ -82,7 +72,7 @@ def write_annotated(demonstrations: Demonstrations, mined: MinedKeyPoses, folder
     """
     check_folder(demonstrations, folder)
     beside = folder.with_name(f".{folder.name}.partial")
-    if beside.exists():  # of a run that was interrupted
+    if beside.exists():  # of an interrupted run
         shutil.rmtree(beside)
     beside.parent.mkdir(parents=True, exist_ok=True)
     dataset, every = demonstrations.dataset, (*mined.episodes, *mined.held_out)
@@ -91,7 +81,7 @@ def write_annotated(demonstrations: Demonstrations, mined: MinedKeyPoses, folder
         _write_sub_tasks(dataset, every, beside)
         _link_the_rest(Path(dataset.root), beside)
         _describe(dataset, beside)
-        # What LeRobot cannot read is never put in its place.
+        # Read by LeRobot before it is put in its place.
         LeRobotDataset(dataset.repo_id, root=beside, video_backend="pyav")
         rename(beside, folder)
     except BaseException:
@@ -110,7 +100,7 @@ def _write_columns(demonstrations: Demonstrations, mined: Sequence[MinedEpisode]
     described = features(dataset.features[OBS_STATE])
     added: dict[str, Any] = {name: (values, described[name]) for name, values in columns.items()}
     left_out = [*dataset.meta.video_keys, *(key for key in LANGUAGE_COLUMNS if key in dataset.features)]
-    # LeRobot opens what it has written, and tells at length of decoders that are not here: none is needed.
+    # LeRobot opens the copy and warns of missing video decoders; none is needed here.
     decoders = logging.getLogger("lerobot.utils.import_utils")
     level = decoders.level
     decoders.setLevel(logging.ERROR)
@@ -121,7 +111,7 @@ def _write_columns(demonstrations: Demonstrations, mined: Sequence[MinedEpisode]
 
 
 def _write_sub_tasks(dataset: LeRobotDataset, mined: Sequence[MinedEpisode], root: Path) -> None:
-    """Write the phases as lerobot-annotate writes sub-tasks. What it wrote before stays."""
+    """Write the phases as lerobot-annotate writes sub-tasks. Rows that it wrote before stay."""
     by_index, records = {item.episode.index: item for item in mined}, list(iter_episodes(root))
     with tempfile.TemporaryDirectory() as folder:
         for record in records:
@@ -134,7 +124,7 @@ def _write_sub_tasks(dataset: LeRobotDataset, mined: Sequence[MinedEpisode], roo
 
 
 def _rows_before(dataset: LeRobotDataset, record: EpisodeRecord) -> list[dict[str, Any]]:
-    """The language rows that an episode of the dataset has already, each with its time."""
+    """The language rows that an episode has already, each with its time."""
     if not dataset.meta.has_language_columns:
         return []
     episodes: Any = dataset.meta.episodes
@@ -148,9 +138,9 @@ def _rows_before(dataset: LeRobotDataset, record: EpisodeRecord) -> list[dict[st
 
 
 def _sub_task_rows(item: MinedEpisode, times_s: Sequence[float]) -> list[dict[str, Any]]:
-    """A sub-task for every phase, from the frame after the key pose before it; equal neighbours are one."""
+    """A sub-task per phase, from the frame after the key pose before it; equal neighbours are merged."""
     begins = [0, *(pose.frame + 1 for pose in item.key_poses[:-1])]
-    words = [sub_task_words(pose, item.sub_tasks) for pose in item.key_poses]
+    words = [phase_phrase(pose.phase, sub_task_of(pose, item.sub_tasks)) for pose in item.key_poses]
     said = zip(begins, words, strict=True)
     return [
         {
@@ -161,20 +151,8 @@ def _sub_task_rows(item: MinedEpisode, times_s: Sequence[float]) -> list[dict[st
     ]  # fmt: skip
 
 
-def sub_task_words(pose: KeyPose, sub_tasks: Sequence[SubTask]) -> str:
-    """What is done in the phase that ends at a key pose: "grasp the bowl", "place the bowl on the plate"."""
-    verb, whole = VERBS[pose.phase], sub_task_of(pose, sub_tasks)
-    said = SubTask(verb, whole.target, "" if whole.landmark else whole.part, target_where=whole.target_where)
-    if pose.phase in GOING and whole.relation:
-        said = replace(
-            said, part=whole.part, relation=whole.relation, landmark=whole.landmark,
-            landmark_where=whole.landmark_where,
-        )  # fmt: skip
-    return phrase(said)
-
-
 def _link_the_rest(source: Path, root: Path) -> None:
-    """Take over the files that are not written anew: links to videos, copies of what may be edited."""
+    """Take over the files that were not written: links to videos, copies of files that may be edited."""
     copied = 0
     for path in sorted(source.rglob("*")):
         inside = path.relative_to(source)
@@ -192,7 +170,7 @@ def _link_the_rest(source: Path, root: Path) -> None:
 
 
 def _link(source: Path, target: Path) -> bool:
-    """Make one file stand for another; False where there can be no links, and it is a copy."""
+    """Link a file, hard or symbolic; False where the file system has neither, and it was copied."""
     for link in (os.link, os.symlink):
         try:
             link(source, target)
@@ -204,7 +182,7 @@ def _link(source: Path, target: Path) -> bool:
 
 
 def _describe(dataset: LeRobotDataset, root: Path) -> None:
-    """Say in the metadata what the dataset has: its own features and statistics, and the new columns."""
+    """Write the metadata: the dataset's own features and statistics, and the new columns."""
     source = Path(dataset.root)
     info = load_info(source)
     ours = features(dataset.features[OBS_STATE])

@@ -13,7 +13,7 @@ from lerobot_openspm.geometry.se3 import Array
 from lerobot_openspm.memory.entry import AXIS_KINDS, Anchor, Axis
 from lerobot_openspm.mining.anchors import Demonstration, Role, roles
 
-# A demonstration that moved an object less says nothing about the direction.
+# The direction of a smaller motion, in metres or radians, is noise.
 MIN_AMOUNT = {"slide": 0.02, "turn": np.deg2rad(10)}
 
 
@@ -22,8 +22,7 @@ def constrained_axes(
 ) -> list[dict[Role, Axis]]:
     """Axes of the constrained key poses of one task, per demonstration.
 
-    The direction, in the anchor's frame, is what the demonstrations have in common; how far each one went is
-    its own.
+    The direction, in the anchor's frame, is the demonstrations' median; the amount is each one's own.
     """
     motions: list[dict[Role, Array]] = [_motions(one, anchors) for one in demonstrations]
     gathered: dict[Role, list[Array]] = defaultdict(list)
@@ -46,10 +45,11 @@ def _motions(demonstration: Demonstration, anchors: Mapping[Role, Anchor]) -> di
     named = list(zip(roles(demonstration.key_poses), demonstration.key_poses, strict=True))
     for (_, before), (role, pose) in pairwise(named):
         anchor, kind = anchors.get(role), AXIS_KINDS.get(pose.phase)
-        if kind is None or anchor is None or any(n not in demonstration.layout for n in anchor.objects):
+        if kind is None or anchor is None:
             continue
-        T_anchor_world = se3.inverse(anchor.frame(demonstration.layout))
-        start, end = T_anchor_world @ before.T_world_ee, T_anchor_world @ pose.T_world_ee
+        start, end = (demonstration.in_frame(anchor, one) for one in (before, pose))
+        if start is None or end is None:
+            continue
         slide = end[:3, 3] - start[:3, 3]
         vector = slide if kind == "slide" else se3.log_so3(end[:3, :3] @ start[:3, :3].T)
         if float(np.linalg.norm(vector)) >= MIN_AMOUNT[kind]:

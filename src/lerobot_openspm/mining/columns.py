@@ -47,8 +47,8 @@ def encode_key_poses(state: Array, key_poses: Sequence[KeyPose]) -> dict[str, np
         key_poses: The episode's, in order; none for an episode that shows none.
 
     Returns:
-        By name, ``(n,)``, and the target ``(n, d)``. After the last key pose the target is that one; in an
-        episode without any it is the state itself.
+        By name, ``(n,)``, and the target ``(n, d)``. After the last key pose the target stays; in an episode
+        without key poses it is the state itself.
     """
     n = len(state)
     target = np.array(state) if not key_poses else np.repeat(state[key_poses[-1].frame][None], n, axis=0)
@@ -60,11 +60,11 @@ def encode_key_poses(state: Array, key_poses: Sequence[KeyPose]) -> dict[str, np
     ends = [-1, *(pose.frame for pose in key_poses)]
     for number, (before, pose) in enumerate(zip(ends[:-1], key_poses, strict=True)):
         way = slice(before + 1, pose.frame + 1)
-        told = {
+        values = {
             PHASE: pose.phase, KEY_POSE: number, CONFIDENCE: pose.confidence, CLOSED: pose.closed,
             N_STEPS: pose.n_steps, DWELL: pose.dwell, CONTACT: pose.contact,
         }  # fmt: skip
-        for name, value in told.items():
+        for name, value in values.items():
             columns[name][way] = value
         columns[IS_KEY_POSE][pose.frame] = True
         target[way] = state[pose.frame]
@@ -80,22 +80,22 @@ def decode_key_poses(columns: Mapping[str, Sequence[Any]], episode: Episode, whe
         where: Names the dataset in errors.
 
     Raises:
-        DatasetError: The columns contradict each other, or name a phase that there is not.
+        DatasetError: The columns contradict each other, or name an unknown phase.
     """
     frames = [frame for frame, is_key_pose in enumerate(columns[IS_KEY_POSE]) if is_key_pose]
-    wrong = f"{where}, episode {episode.index}"
+    where = f"{where}, episode {episode.index}"
     numbers = [columns[KEY_POSE][frame] for frame in frames]
     if numbers != list(range(len(frames))):
         raise DatasetError(
-            f"{wrong}: {KEY_POSE} is {numbers} in the frames where {IS_KEY_POSE} is true, expected them "
-            "counted from 0; write the columns anew with openspm mine --annotated=FOLDER"
+            f"{where}: {KEY_POSE} is {numbers} in the frames where {IS_KEY_POSE} is true, expected them "
+            "counted from 0; write the columns again with openspm mine --annotated=FOLDER"
         )
     found = []
     for frame in frames:
         phase, confidence = columns[PHASE][frame], columns[CONFIDENCE][frame]
         if phase not in PHASES or not 0 <= confidence <= 1:
             raise DatasetError(
-                f"{wrong}, frame {frame}: {PHASE} is {phase!r} with {CONFIDENCE} {confidence}, expected one "
+                f"{where}, frame {frame}: {PHASE} is {phase!r} with {CONFIDENCE} {confidence}, expected one "
                 f"of {', '.join(PHASES)} with 0 to 1"
             )
         found.append(

@@ -1,4 +1,4 @@
-"""From what was mined to memory entries: every key pose in the frame of its anchor."""
+"""Makes memory entries of a mined dataset: every key pose in the frame of its anchor."""
 
 from __future__ import annotations
 
@@ -6,7 +6,6 @@ import logging
 from collections.abc import Mapping
 
 from lerobot_openspm.errors import DatasetError
-from lerobot_openspm.geometry import se3
 from lerobot_openspm.memory.compose import sub_task_index
 from lerobot_openspm.memory.entry import (
     CONTACT_PHASES,
@@ -23,10 +22,10 @@ logger = logging.getLogger(__name__)
 
 
 def build_entries(mined: MinedDataset) -> tuple[MemoryEntry, ...]:
-    """Make a memory entry of every demonstration whose anchors were found.
+    """Make a memory entry of every demonstration in which the anchors of its contacts were found.
 
     Raises:
-        DatasetError: There is none.
+        DatasetError: There is no such demonstration.
     """
     entries = tuple(entry for task in mined.tasks for entry in task_entries(task, mined.name))
     if not entries:
@@ -41,6 +40,7 @@ def build_entries(mined: MinedDataset) -> tuple[MemoryEntry, ...]:
 def task_entries(task: MinedTask, source: str) -> tuple[MemoryEntry, ...]:
     """The memory entries of one task's demonstrations; `source` is the name of their dataset."""
     sub_tasks, entries = task.sub_tasks, list[MemoryEntry]()
+    named = {name for sub_task in sub_tasks for name in sub_task.objects}
     for item, demonstration, axes, quality, outcomes in zip(
         task.episodes, task.aligned, task.axes, task.qualities, task.outcomes, strict=True
     ):
@@ -52,14 +52,10 @@ def task_entries(task: MinedTask, source: str) -> tuple[MemoryEntry, ...]:
             continue
         key = RetrievalKey(sub_tasks, tuple(pose.phase for pose in key_poses))
         where = f"{source}#{item.episode.index}"
-        layout = {
-            name: T
-            for name, T in demonstration.layout.items()
-            if any(name in sub_task.objects for sub_task in sub_tasks)
-        }
-        known = tuple(one for one in outcomes if all(name in layout for name in one.objects))
+        poses = {name: T for name, T in demonstration.object_poses.items() if name in named}
+        known = tuple(one for one in outcomes if all(name in poses for name in one.objects))
         entries.append(
-            MemoryEntry(key, item.episode.task, key_poses, quality, 1, where, layout, outcomes=known)
+            MemoryEntry(key, item.episode.task, key_poses, quality, 1, where, poses, outcomes=known)
         )
     return tuple(entries)
 
@@ -74,23 +70,15 @@ def _remember(
     kept = []
     for role, pose in zip(roles(demonstration.key_poses), demonstration.key_poses, strict=True):
         anchor = anchors.get(role)
-        if anchor is None or any(name not in demonstration.layout for name in anchor.objects):
+        T_obj_ee = None if anchor is None else demonstration.in_frame(anchor, pose)
+        if anchor is None or T_obj_ee is None:
             if pose.phase in CONTACT_PHASES:
                 return None
             continue
-        T_obj_ee = se3.inverse(anchor.frame(demonstration.layout)) @ pose.T_world_ee
         kept.append(
             MemoryKeyPose(
-                anchor,
-                T_obj_ee,
-                pose.phase,
-                pose.confidence,
-                pose.closed,
-                pose.opening,
-                pose.n_steps,
-                pose.dwell,
-                axes.get(role),
-                sub_task_index(pose.contact, pose.phase, n_sub_tasks),
+                anchor, T_obj_ee, pose.phase, pose.confidence, pose.closed, pose.opening, pose.n_steps,
+                pose.dwell, axes.get(role), sub_task_index(pose.contact, pose.phase, n_sub_tasks),
             )
-        )
+        )  # fmt: skip
     return tuple(kept)

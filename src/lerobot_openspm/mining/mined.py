@@ -1,4 +1,4 @@
-"""What mining finds in a dataset. Memory entries and flow samples are both made of it."""
+"""The result of mining a dataset. Memory entries and flow samples are both made of it."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from lerobot_openspm.memory.robot import RobotModel
 from lerobot_openspm.mining.anchors import Demonstration, Role
 from lerobot_openspm.mining.key_poses import KeyPose
 from lerobot_openspm.mining.signals import Episode
-from lerobot_openspm.perception.objects.model import KnownObject
+from lerobot_openspm.perception.objects.base import KnownObject
 from lerobot_openspm.types import SubTask
 
 
@@ -22,8 +22,8 @@ class MinedEpisode:
 
     Attributes:
         episode: Its signals: hand poses, gripper, actions.
-        key_poses: Where its phases end, in order, with the phases' names; a judge has had its say.
-        sub_tasks: What its instruction asks for.
+        key_poses: Where its phases end, in order, with the phases' names; a judge's labels are merged in.
+        sub_tasks: The sub-tasks of its instruction.
     """
 
     episode: Episode
@@ -33,14 +33,13 @@ class MinedEpisode:
 
 @dataclass(frozen=True)
 class MinedKeyPoses:
-    """What a dataset's low-dimensional columns tell. No image was read.
+    """What a dataset's low-dimensional columns show. No image was read.
 
     Attributes:
         name: The dataset's repository id.
-        robot: The robot, as `episodes` show it.
-        episodes: Episodes with key poses that may be remembered and learned from.
-        held_out: Episodes with key poses that may not; a validation loss looks them up. Nobody judged their
-            phases.
+        robot: Model of the robot, fitted to `episodes`.
+        episodes: Episodes with key poses, to remember and learn from.
+        held_out: Other episodes with key poses, for a validation loss. No judge labelled their phases.
         skipped: Reason by episode index for those without key poses.
     """
 
@@ -61,7 +60,7 @@ class MinedTask:
         anchors: For each role of a key pose, the frame in which the demonstrations agree best.
         axes: For each demonstration, the axes along which drawers slid and about which knobs turned.
         qualities: For each demonstration the paper's ``r``, 0 to 1: how closely it agrees with the others.
-        outcomes: For each demonstration, where relative to what it left its targets.
+        outcomes: For each demonstration, where it left its targets relative to their landmarks.
     """
 
     episodes: tuple[MinedEpisode, ...]
@@ -73,18 +72,18 @@ class MinedTask:
 
     @property
     def sub_tasks(self) -> tuple[SubTask, ...]:
-        """What the instruction asks for."""
+        """The sub-tasks of the instruction."""
         return self.episodes[0].sub_tasks
 
 
 @dataclass(frozen=True)
 class MinedDataset(MinedKeyPoses):
-    """What columns and images together tell.
+    """What columns and images together show.
 
     Attributes:
-        cameras: The calibration that the images were looked at through.
+        cameras: The calibration of the images.
         objects: Models of the objects by name.
-        object_poses: For each of `episodes`, ``T_world_obj`` ``(4, 4)`` of what was found in its first frame.
+        object_poses: Per episode, ``T_world_obj`` ``(4, 4)`` of the objects found in its first frame.
         tasks: The episodes by instruction, with their anchors.
         simulator_objects: Objects in the order of the simulator's pose vector (oracle ablation only).
     """

@@ -1,10 +1,12 @@
-"""The objects of demonstrations: learned where the hand touched them, then found in every first frame."""
+"""The objects of demonstrations: learned where the hand touched them, then located in every first frame."""
 
 from __future__ import annotations
 
 import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
+from typing import Literal
 
 import numpy as np
 from tqdm import tqdm
@@ -16,29 +18,28 @@ from lerobot_openspm.mining.dataset import Demonstrations
 from lerobot_openspm.mining.key_poses import KeyPose
 from lerobot_openspm.mining.mined import MinedEpisode
 from lerobot_openspm.mining.outcomes import carried_to
-from lerobot_openspm.perception.objects.learning import learn_objects
-from lerobot_openspm.perception.objects.localise import localise_all
-from lerobot_openspm.perception.objects.model import KnownObject
-from lerobot_openspm.perception.objects.object_shape import ShapeBackend
+from lerobot_openspm.perception.objects.base import KnownObject, ShapeBackend
+from lerobot_openspm.perception.objects.kinds import learn_objects
 from lerobot_openspm.perception.oracle import name_simulator_poses
+from lerobot_openspm.perception.pipeline import detect
 from lerobot_openspm.types import ContactCue, PoseEstimate, Scene, Segmenter, Shape
 
 logger = logging.getLogger(__name__)
 
-# Least confidence at which a pushed object is believed to be where it is seen in the end.
-SURE = 0.8
+# A pushed object's final pose counts from this confidence on.
+MIN_END_CONFIDENCE = 0.8
 
 
 def learn_scenes(
     demonstrations: Demonstrations, mined: Sequence[MinedEpisode], cameras: Mapping[str, Camera]
 ) -> list[Scene]:
-    """What perception may learn from: two frames of every episode, and where the hand touched what."""
+    """What perception learns from: two frames of every episode, and where the hand touched what."""
     scenes = []
     for item in tqdm(mined, desc="Reading images", unit="episode"):
         later = _carried_off(item.key_poses)
         views = demonstrations.views(item.episode, 0, cameras)
         later_views = None if later is None else demonstrations.views(item.episode, later, cameras)
-        scenes.append(Scene(views, hints(item), later_views))
+        scenes.append(Scene(views, contact_cues(item), later_views))
     return scenes
 
 
@@ -47,9 +48,9 @@ class FoundObjects:
     """Object models by name, and poses ``T_world_obj`` ``(4, 4)`` of the objects found in each episode.
 
     Attributes:
-        models: The objects.
-        poses: Per episode, where they stood in its first frame.
-        ends: Per episode, where those that were moved ended.
+        models: The models.
+        poses: Per episode, the poses in its first frame.
+        ends: Per episode, the final poses of the objects that it moved.
     """
 
     models: dict[str, KnownObject]
@@ -74,10 +75,10 @@ def find_objects(
         known: Objects by name that are known already.
         rng: Chooses among the demonstrations of an object where there are more than needed.
         segmenter: Finds the objects' masks; None to learn what they look like.
-        shape: What is learned of an object that a segmenter finds.
-        shapes: Tells the sizes of objects, for shape "sam3d".
+        shape: What is learned about an object that a segmenter finds.
+        shapes: Measures objects, for shape "sam3d".
     """
-    named = sorted({hint.name for scene in scenes for hint in scene.hints} - set(known))
+    named = sorted({cue.name for scene in scenes for cue in scene.hints} - set(known))
     models = dict(known)
     if named:
         logger.info("learning what these look like: %s", ", ".join(named))
@@ -89,7 +90,7 @@ def find_objects(
     for scene, item in tqdm(zip(scenes, mined, strict=True), "Finding objects", len(scenes), unit="episode"):
         wanted = dict.fromkeys(name for sub_task in item.sub_tasks for name in sub_task.objects)
         sought = {name: models[name] for name in wanted if name in models}
-        estimates = localise_all(scene.views, sought, segmenter)
+        estimates = detect(scene.views, sought, segmenter)
         places = {name: _place(name, estimate, scene.hints) for name, estimate in estimates.items()}
         found.append({name: T for name, T in places.items() if T is not None})
         ends.append(_ends(scene, item, found[-1], models, segmenter))
@@ -103,20 +104,20 @@ def _ends(
     models: Mapping[str, KnownObject],
     segmenter: Segmenter | None,
 ) -> dict[str, Array]:
-    """Where an episode leaves what it moves: the carried by the hand's path, the pushed by the images."""
+    """Final poses of what an episode moves: carried objects by the hand's path, pushed ones by the images."""
     carried = carried_to(Demonstration(item.key_poses, poses), item.sub_tasks)
     pushed = {sub_task_of(p, item.sub_tasks).target for p in item.key_poses if p.phase == "push"}
     sought = {name: models[name] for name in sorted(pushed) if name in models}
     if not sought or scene.later_views is None:
         return carried
-    seen = localise_all(scene.later_views, sought, segmenter)
-    sure = {k: e.T_world_obj for k, e in seen.items() if e.status == "found" and e.confidence >= SURE}
-    return {**carried, **sure}
+    seen = detect(scene.later_views, sought, segmenter)
+    sure = {k: e for k, e in seen.items() if e.status == "found" and e.confidence >= MIN_END_CONFIDENCE}
+    return {**carried, **{name: estimate.T_world_obj for name, estimate in sure.items()}}
 
 
 def _place(name: str, estimate: PoseEstimate, touched: Sequence[ContactCue]) -> Array | None:
-    """Where an object is; of several that look alike, the one that the hand went to. None if unknown."""
-    points = [hint.point_world[:2] for hint in touched if hint.name == name]
+    """Pose of an object; of several that look alike, that of the one the hand went to. None if unknown."""
+    points = [cue.point_world[:2] for cue in touched if cue.name == name]
     if estimate.status == "not_found" or (estimate.status == "ambiguous" and not points):
         return None
     if not estimate.others or not points:
@@ -147,27 +148,27 @@ def simulator_poses(
     return found, ends, names
 
 
-def hints(item: MinedEpisode) -> tuple[ContactCue, ...]:
+def contact_cues(item: MinedEpisode) -> tuple[ContactCue, ...]:
     """Where the hand touched the objects of the instruction, for perception to learn their looks from."""
-    found = []
+    found: list[ContactCue] = []
+
+    def add(name: str, pose: KeyPose, kind: Literal["grasp", "release", "contact"]) -> None:
+        found.append(ContactCue(name, pose.T_world_ee[:3, 3], kind, f"{item.episode.task}: {len(found)}"))
+
     for pose in item.key_poses:
-        sub_task, point = sub_task_of(pose, item.sub_tasks), pose.T_world_ee[:3, 3]
+        sub_task = sub_task_of(pose, item.sub_tasks)
         if pose.phase == "grasp":
-            found.append(ContactCue(sub_task.target, point, "grasp", f"{item.episode.task}: {len(found)}"))
+            add(sub_task.target, pose, "grasp")
         elif pose.phase == "release" and sub_task.relation and not sub_task.part:
-            # What goes into an opened part lies where nothing was to be seen in the first frame.
-            found.append(
-                ContactCue(sub_task.landmark, point, "release", f"{item.episode.task}: {len(found)}")
-            )
-    for before, pose in zip(item.key_poses[:-1], item.key_poses[1:], strict=True):
+            # With a part, the release is inside a drawer that was shut in the first frame.
+            add(sub_task.landmark, pose, "release")
+    for before, pose in pairwise(item.key_poses):
         if pose.phase == "push" != before.phase:
-            target = sub_task_of(pose, item.sub_tasks).target
-            place = f"{item.episode.task}: {len(found)}"
-            found.append(ContactCue(target, before.T_world_ee[:3, 3], "contact", place))
+            add(sub_task_of(pose, item.sub_tasks).target, before, "contact")
     return tuple(found)
 
 
 def _carried_off(key_poses: Sequence[KeyPose]) -> int | None:
-    """A frame in which the first grasped or pushed object is elsewhere and the hand has let go."""
+    """A frame in which the moved object is elsewhere and the hand has let go; None if nothing was moved."""
     moved = [pose.frame for pose in key_poses if pose.phase in ("retreat", "push")]
     return max(moved) if moved else None

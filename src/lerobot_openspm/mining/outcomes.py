@@ -12,21 +12,21 @@ from lerobot_openspm.memory.entry import WORLD, Anchor, Outcome
 from lerobot_openspm.mining.anchors import Demonstration, sub_task_of
 from lerobot_openspm.types import SubTask
 
-# How exactly an object is found again where it was put: what deviates by less is no miss.
+# How exactly perception locates an object that was put down.
 FOUND_AGAIN_M = 0.010
-# Nor is this, however well the demonstrations agree.
+# The tolerance is never smaller, however well the demonstrations agree.
 LEAST_TOLERANCE_M = 0.020
-# Demonstrations that leave the target further apart than this say nothing about where it belongs.
+# Demonstrations that leave the target further apart than this do not show where it belongs.
 MOST_SPREAD_M = 0.050
 
 
 def carried_to(demonstration: Demonstration, sub_tasks: Sequence[SubTask]) -> dict[str, Array]:
     """Where the hand put what it carried, as if held rigidly: ``T_world_obj`` ``(4, 4)`` by name.
 
-    Needs no image, so it is also known of demonstrations that end with the hand around the object. An object
-    that was carried twice is where it was put last.
+    No image is needed, so this also works for demonstrations that end with the hand around the object. Of an
+    object that was carried twice, the last place counts.
     """
-    poses = dict(demonstration.layout)
+    poses = dict(demonstration.object_poses)
     carried: dict[str, Array] = {}
     T_ee_obj: tuple[str, Array] | None = None
     for pose in demonstration.key_poses:
@@ -45,7 +45,7 @@ def outcomes(
     ends: Sequence[Mapping[str, Array]],
     sub_tasks: Sequence[SubTask],
 ) -> list[tuple[Outcome, ...]]:
-    """What the demonstrations of one task have in common about where its targets end.
+    """Where the demonstrations of one task leave its targets, as far as they agree.
 
     Args:
         demonstrations: The demonstrations, with their objects' poses at the start.
@@ -53,13 +53,13 @@ def outcomes(
         sub_tasks: What the instruction asks for.
 
     Returns:
-        For each demonstration, one for every sub-task that names a landmark and of which enough is known.
+        For each demonstration, one outcome per sub-task that names a landmark and that enough of them show.
     """
     found: list[list[Outcome]] = [[] for _ in demonstrations]
     for i, sub_task in enumerate(sub_tasks):
-        # What a later sub-task moves on, or moves away from under it, is not where this one left it.
+        # A later sub-task may move the target on, or its landmark away.
         moved_on = any(later.target in sub_task.objects for later in sub_tasks[i + 1 :])
-        is_told = sub_task.relation and not sub_task.words  # else nobody says that it is to end there
+        is_told = sub_task.relation and not sub_task.words  # the instruction says where it ends
         if is_told and sub_task.landmark != sub_task.target and not moved_on:
             for n, outcome in _outcomes(i, sub_task, demonstrations, ends).items():
                 found[n].append(outcome)
@@ -72,19 +72,19 @@ def _outcomes(
     demonstrations: Sequence[Demonstration],
     ends: Sequence[Mapping[str, Array]],
 ) -> dict[int, Outcome]:
-    """The outcome of one sub-task by demonstration; none where too few show it, or they disagree."""
-    layouts = [{**one.layout, **end} for one, end in zip(demonstrations, ends, strict=True)]
+    """The outcome of one sub-task by demonstration; empty where too few show it, or they disagree."""
+    final_poses = [{**one.object_poses, **end} for one, end in zip(demonstrations, ends, strict=True)]
     known = [
         i
-        for i, (end, layout) in enumerate(zip(ends, layouts, strict=True))
-        if sub_task.target in end and sub_task.landmark in layout
+        for i, (end, poses) in enumerate(zip(ends, final_poses, strict=True))
+        if sub_task.target in end and sub_task.landmark in poses
     ]
     if not known or 2 * len(known) < len(demonstrations):
         return {}
     places = np.stack([ends[i][sub_task.target][:3, 3] for i in known])
     choices = []
     for anchor in (Anchor(sub_task.landmark, sub_task.landmark), Anchor(sub_task.landmark, WORLD)):
-        T_anchor_world = se3.inverse(np.stack([anchor.frame(layouts[i]) for i in known]))
+        T_anchor_world = se3.inverse(np.stack([anchor.frame(final_poses[i]) for i in known]))
         shown = se3.apply(T_anchor_world, places[:, None])[:, 0]
         middle = np.median(shown, axis=0)
         choices.append((float(np.linalg.norm(shown - middle, axis=-1).max()), anchor, middle, shown))

@@ -1,8 +1,16 @@
-"""Mining as a whole: a LeRobotDataset goes in, a MinedDataset comes out.
+"""Mining as a whole: a LeRobotDataset goes in, a MinedDataset comes out. Read this file first.
 
     mined = DatasetProcessor(dataset, options).mine()
 
-Memory entries (`mining/entries.py`) and flow samples (`flow/samples.py`) are both made of that one result.
+    dataset.py                 columns -> episodes (signals.py), and the robot that they show
+    key_poses.py               episode -> key poses, by gripper.py and corners.py
+    phase_labels/              optionally, what a judge says about their phases
+    objects.py                 where the hand touched what -> object models, and object poses per episode
+    anchors, axes, outcomes    the demonstrations of a task compared with each other
+
+Memory entries (`mining/entries.py`) and flow samples (`flow/samples.py`) are both made of that one result
+(`mined.py`). Where the dataset has its key poses in columns (`columns.py`, written by `annotate.py`), they
+are read instead of found.
 """
 
 from __future__ import annotations
@@ -20,24 +28,33 @@ from lerobot.datasets import LeRobotDataset, LeRobotDatasetMetadata
 
 from lerobot_openspm.errors import CalibrationError, DatasetError
 from lerobot_openspm.geometry.camera import Camera, check_sizes
+from lerobot_openspm.geometry.se3 import Array
 from lerobot_openspm.geometry.vector_layout import VectorLayout
 from lerobot_openspm.language.instruction import read_tasks
+from lerobot_openspm.language.lexicon import ENGLISH, Lexicon
 from lerobot_openspm.memory.robot import RobotModel
-from lerobot_openspm.mining.anchors import as_shown, things_taken
+from lerobot_openspm.mining.anchors import (
+    Demonstration,
+    align_symmetric,
+    as_shown,
+    consensus,
+    qualities,
+    things_taken,
+)
+from lerobot_openspm.mining.axes import constrained_axes
 from lerobot_openspm.mining.dataset import Demonstrations, open_dataset
 from lerobot_openspm.mining.key_poses import KeyPose, find_key_poses
-from lerobot_openspm.mining.mined import MinedDataset, MinedEpisode, MinedKeyPoses
+from lerobot_openspm.mining.mined import MinedDataset, MinedEpisode, MinedKeyPoses, MinedTask
 from lerobot_openspm.mining.objects import find_objects, learn_scenes, simulator_poses
+from lerobot_openspm.mining.outcomes import outcomes
 from lerobot_openspm.mining.signals import Episode, observe_robot
-from lerobot_openspm.mining.tasks import compare
-from lerobot_openspm.perception.objects.model import KnownObject
-from lerobot_openspm.perception.objects.object_shape import ShapeBackend
+from lerobot_openspm.perception.objects.base import KnownObject, ShapeBackend
 from lerobot_openspm.types import Segmenter, Shape
 
 logger = logging.getLogger(__name__)
 
-# Gives episodes back with their phases judged; see `docs/judgement.md`.
-PhaseJudgement = Callable[[Demonstrations, tuple[MinedEpisode, ...], RobotModel], tuple[MinedEpisode, ...]]
+# Merges a judge's phase labels into the key poses of episodes; see `docs/judgement.md`.
+LabelPhases = Callable[[Demonstrations, tuple[MinedEpisode, ...], RobotModel], tuple[MinedEpisode, ...]]
 
 
 @dataclass(frozen=True)
@@ -45,19 +62,20 @@ class MiningOptions:
     """How a dataset is mined.
 
     Attributes:
-        state_layout: What the numbers of ``observation.state`` mean.
-        action_layout: What the numbers of ``action`` mean.
+        state_layout: Layout of ``observation.state``.
+        action_layout: Layout of ``action``.
         cameras: Calibration by camera key. Not needed for key poses alone.
         calibration: Names the calibration in errors.
-        episodes: Episodes that may be remembered and learned from; all if not given.
+        episodes: Episodes to remember and learn from; all if not given.
         known_objects: Objects by name that are recognised instead of learned.
-        known_names: Names of the things that a memory is about, by which instructions are read.
-        known_robot: The same robot as seen before; tells which gripper command closes where these episodes
-            do not.
-        judge: Says, beside motion and gripper, which phase ends at a key pose.
+        known_names: Names of objects in the memory, by which instructions are read.
+        lexicon: The words that instructions are read by.
+        known_robot: Model of the same robot from earlier demonstrations; says which gripper command closes
+            where these episodes do not show it.
+        judge: Labels phases, beside motion and gripper.
         segmenter: Finds the objects' masks; None where the demonstrations teach what objects look like.
-        shape: What is learned of an object that a segmenter finds.
-        open_shapes: Starts what tells the sizes of objects, for shape "sam3d"; it is closed after use.
+        shape: What is learned about an object that a segmenter finds.
+        open_shapes: Starts the backend that measures objects, for shape "sam3d"; it is closed after use.
         is_oracle: Whether object poses come from the simulator instead (oracle ablation only).
     """
 
@@ -68,8 +86,9 @@ class MiningOptions:
     episodes: Sequence[int] | None = None
     known_objects: Mapping[str, KnownObject] = field(default_factory=dict[str, KnownObject])
     known_names: Collection[str] = frozenset()
+    lexicon: Lexicon = ENGLISH
     known_robot: RobotModel | None = None
-    judge: PhaseJudgement | None = None
+    judge: LabelPhases | None = None
     segmenter: Segmenter | None = None
     shape: Shape = "demonstrations"
     open_shapes: Callable[[], AbstractContextManager[ShapeBackend | None]] = nullcontext
@@ -82,8 +101,8 @@ class DatasetProcessor:
     Deterministic: every process of a distributed run mines the same.
 
     Args:
-        dataset: The dataset, or LeRobot's metadata of it. Of one that was opened for some of its episodes,
-            the others are held out, unless the options name episodes.
+        dataset: The dataset, or LeRobot's metadata of it. If it was opened for some of its episodes only, the
+            others are held out, unless the options name episodes.
         options: How to mine it.
     """
 
@@ -100,7 +119,7 @@ class DatasetProcessor:
         Raises:
             DatasetError: Files or columns are missing.
         """
-        # Opened anew: what its owner opened may lack episodes, or turn its images for augmentation.
+        # Opened again, because the owner's may lack episodes or augment its images.
         return Demonstrations(
             open_dataset(self._meta), self._options.state_layout, self._options.action_layout
         )
@@ -136,15 +155,15 @@ class DatasetProcessor:
         )  # fmt: skip
 
     def key_poses(self, held_out: bool = False) -> MinedKeyPoses:
-        """Find key poses and nothing else. Reads no image, unless a judge of phases looks at some.
+        """Find key poses only. No image is read, unless a judge of phases looks at some.
 
-        Where the dataset brings its key poses in columns, they are read, and nobody is asked about phases.
+        Where the dataset has its key poses in columns, they are read, and no judge is asked.
 
         Args:
-            held_out: Whether to find those of held-out episodes too.
+            held_out: Whether to find the key poses of held-out episodes too.
 
         Raises:
-            DatasetError: No episode that may be learned from has any. The error gives the reasons.
+            DatasetError: No episode that may be learned from has key poses. The error gives the reasons.
         """
         demonstrations, name = self.demonstrations, str(self._meta.repo_id)
         allowed = demonstrations.episodes(self._allowed)
@@ -152,12 +171,12 @@ class DatasetProcessor:
             raise DatasetError(f"no episode of dataset {name} may be learned from; name some")
         robot = observe_robot(allowed, self._options.known_robot)
         if demonstrations.has_key_poses:
-            logger.info("dataset %s brings its key poses in columns: they are read", name)
+            logger.info("dataset %s has its key poses in columns: they are read", name)
             find = demonstrations.key_poses
         else:
             find = partial(find_key_poses, robot=robot)
         names = set(self._options.known_names)
-        mined, skipped = mine_episodes(allowed, find, names)
+        mined, skipped = mine_episodes(allowed, find, names, self._options.lexicon)
         if not mined:
             raise DatasetError(
                 f"no key poses in the {len(allowed)} episodes of dataset {name}: "
@@ -170,7 +189,7 @@ class DatasetProcessor:
         if held_out:
             left = sorted(set(range(self._meta.total_episodes)) - {one.index for one in allowed})
             names |= {name for item in mined for sub_task in item.sub_tasks for name in sub_task.objects}
-            others, reasons = mine_episodes(demonstrations.episodes(left), find, names)
+            others, reasons = mine_episodes(demonstrations.episodes(left), find, names, self._options.lexicon)
             skipped |= reasons
         for index, reason in skipped.items():
             logger.warning("skipping episode %d of %s: %s", index, name, reason)
@@ -194,19 +213,21 @@ def mine_episodes(
     episodes: Sequence[Episode],
     find: Callable[[Episode], Sequence[KeyPose]],
     names: Collection[str] = frozenset(),
+    lexicon: Lexicon = ENGLISH,
 ) -> tuple[tuple[MinedEpisode, ...], dict[int, str]]:
-    """Find the key poses of episodes, and what their instructions ask for.
+    """Find the key poses of episodes, and read their instructions.
 
     Args:
         episodes: The demonstrations.
         find: Gives an episode's key poses.
-        names: Names of the things that a memory holds already, by which instructions are read.
+        names: Names of objects in the memory, by which instructions are read.
+        lexicon: The words that they are read by.
 
     Returns:
-        The episodes with key poses, and the reason by index of the others.
+        The episodes with key poses, and by index the reason why the others have none.
     """
     found, skipped = list[tuple[Episode, Sequence[KeyPose]]](), dict[int, str]()
-    tasks = read_tasks((episode.task for episode in episodes), names)
+    tasks = read_tasks((episode.task for episode in episodes), names, lexicon)
     for episode in episodes:
         if episode.task not in tasks:
             skipped[episode.index] = f"its task {episode.task!r} says nothing"
@@ -217,6 +238,42 @@ def mine_episodes(
     taken: dict[str, list[int]] = defaultdict(list)
     for episode, key_poses in found:
         taken[episode.task].append(things_taken(key_poses))
-    # What most demonstrations of a task show: one may have grasped again what had slipped.
+    # The median over a task's demonstrations, because in one of them something may have slipped.
     shown = {task: as_shown(tasks[task], median_low(counts)) for task, counts in taken.items()}
     return tuple(MinedEpisode(one, tuple(poses), shown[one.task]) for one, poses in found), skipped
+
+
+def compare(
+    episodes: Sequence[MinedEpisode],
+    object_poses: Sequence[Mapping[str, Array]],
+    ends: Sequence[Mapping[str, Array]],
+    yaw_periods: Mapping[str, float],
+) -> tuple[MinedTask, ...]:
+    """Compare the demonstrations of each task: anchors, axes, outcomes, and how closely they agree.
+
+    Args:
+        episodes: The demonstrations.
+        object_poses: For each, ``T_world_obj`` ``(4, 4)`` of the objects found in its first frame.
+        ends: For each, the final poses of the objects that it moved.
+        yaw_periods: Rotational symmetry of each object about its vertical axis, radians.
+    """
+    by_task: dict[str, list[int]] = defaultdict(list)
+    for i, item in enumerate(episodes):
+        by_task[item.episode.task].append(i)
+    tasks: list[MinedTask] = []
+    for members in by_task.values():
+        own, sub_tasks = tuple(episodes[i] for i in members), episodes[members[0]].sub_tasks
+        found = [Demonstration(episodes[i].key_poses, object_poses[i]) for i in members]
+        aligned = align_symmetric(found, yaw_periods)
+        anchors = consensus(aligned, sub_tasks)
+        tasks.append(
+            MinedTask(
+                episodes=own,
+                aligned=tuple(aligned),
+                anchors=anchors,
+                axes=tuple(constrained_axes(aligned, anchors)),
+                qualities=tuple(qualities(aligned, anchors)),
+                outcomes=tuple(outcomes(aligned, [ends[i] for i in members], sub_tasks)),
+            )
+        )
+    return tuple(tasks)

@@ -1,4 +1,4 @@
-"""The low-dimensional signals of episodes, and what they say about the robot."""
+"""The low-dimensional signals of episodes, and the robot model that they show."""
 
 from __future__ import annotations
 
@@ -50,7 +50,8 @@ def observe_robot(episodes: Sequence[Episode], known: RobotModel | None = None) 
 
     Args:
         episodes: The demonstrations.
-        known: The same robot as seen before; tells the gripper's convention where these episodes do not.
+        known: Model of the same robot from earlier demonstrations; its gripper commands are used where these
+            episodes show only one.
     """
     close, open_ = _gripper_commands(episodes, known)
     opening = np.concatenate([episode.opening for episode in episodes])

@@ -1,4 +1,9 @@
-"""One environment's observation, taken out of LeRobot's batch and checked."""
+"""One environment's observation, taken out of LeRobot's batch and checked.
+
+Besides its image ``observation.images.<camera>``, a camera may give ``observation.masks.<camera>``, the
+number of the object that each pixel shows and 0 for none, and ``observation.depth.<camera>``, metres along
+the optical axis and 0 where not measured. Both layers are ``(environments, 1, H, W)``.
+"""
 
 from __future__ import annotations
 
@@ -13,15 +18,16 @@ from lerobot.utils.constants import OBS_STATE
 from numpy.typing import NDArray
 
 from lerobot_openspm.errors import ObservationError
-from lerobot_openspm.geometry import se3
 from lerobot_openspm.geometry.camera import Camera
 from lerobot_openspm.geometry.se3 import Array
 from lerobot_openspm.geometry.vector_layout import VectorLayout
-from lerobot_openspm.perception.layers import depth_of, find_layers, labels_of
+from lerobot_openspm.perception.oracle import decode_object_poses
 from lerobot_openspm.types import Hand, View
 
 # Named by the environment that gives them: position and quat_wxyz per object (oracle ablation only).
 OBJECT_POSES = "observation.object_poses"
+IMAGES, MASKS, DEPTH = "observation.images.", "observation.masks.", "observation.depth."
+MAX_LABEL = np.iinfo(np.int32).max
 
 
 @dataclass(frozen=True)
@@ -35,7 +41,7 @@ class Observation:
         images: Images ``(3, H, W)`` by camera, still as tensors: few of them are ever looked at. A
             mapping that makes them when they are asked for will do.
         object_poses: Simulator poses ``(n * 7,)``, or None.
-        layers: Masks and depths ``(1, H, W)`` of some images, see :mod:`lerobot_openspm.perception.layers`.
+        layers: Masks and depths ``(1, H, W)`` of some cameras, by key.
     """
 
     instruction: str
@@ -89,7 +95,7 @@ class Observation:
         depth, labels = depth_of(self.layers, key, size), labels_of(self.layers, key, size)
         return View(image, scaled, scaled.T_world_cam(self.hand.T_world_ee), depth, labels)
 
-    def simulator_layout(self, names: Sequence[str]) -> dict[str, Array]:
+    def simulator_poses(self, names: Sequence[str]) -> dict[str, Array]:
         """Simulator poses ``T_world_obj`` by name (oracle ablation only)."""
         if self.object_poses is None:
             raise ObservationError(
@@ -105,9 +111,7 @@ class Observation:
             raise ObservationError(
                 f"{OBJECT_POSES!r} is not finite: {self.object_poses}; check the simulation"
             )
-        rows = self.object_poses.reshape(len(names), 7)
-        T = se3.transform(se3.matrix_from_quat_xyzw(rows[:, [4, 5, 6, 3]]), rows[:, :3])
-        return dict(zip(names, T, strict=True))
+        return decode_object_poses(self.object_poses, names)
 
 
 def split_batch(batch: Mapping[str, Any], state_layout: VectorLayout) -> list[Observation]:
@@ -174,3 +178,88 @@ def _as_uint8(image: torch.Tensor, key: str) -> NDArray[np.uint8]:
             f"camera {key!r} gave an image with NaN or infinite values, expected 0 to 1; check the camera"
         )
     return np.round(np.clip(array, 0, 1) * 255).astype(np.uint8)
+
+
+def find_layers(batch: Mapping[str, Any], environments: int) -> dict[str, torch.Tensor]:
+    """Masks and depths ``(environments, 1, H, W)`` of a batch by key.
+
+    Raises:
+        ObservationError: One is no tensor with four axes, or is of another number of environments.
+    """
+    found = {key: value for key, value in batch.items() if key.startswith((MASKS, DEPTH))}
+    for key, value in found.items():
+        shape = tuple(getattr(value, "shape", ()))
+        if not isinstance(value, torch.Tensor) or len(shape) != 4 or shape[0] != environments:
+            raise ObservationError(
+                f"{key!r} is a {type(value).__name__} of shape {shape}, expected a tensor of "
+                f"({environments}, 1, height, width); give one layer an environment"
+            )
+    return found
+
+
+def labels_of(
+    layers: Mapping[str, torch.Tensor], image_key: str, size: tuple[int, ...]
+) -> NDArray[np.int32] | None:
+    """Numbers of objects ``(H, W)`` of an image; None where the observation has none.
+
+    Args:
+        layers: ``(1, H, W)`` by key, of one environment.
+        image_key: ``observation.images.<camera>``.
+        size: Height and width of that image.
+
+    Raises:
+        ObservationError: Of another size than the image, or not whole numbers from 0 on.
+    """
+    key, array = _layer(layers, MASKS, image_key, size)
+    if array is None:
+        return None
+    # Not by type: LeRobot makes floating point numbers of whatever an environment observes.
+    if array.min() < 0 or array.max() > MAX_LABEL or (array != np.floor(array)).any():
+        raise ObservationError(
+            f"{key!r} holds values from {array.min():g} to {array.max():g} that are no numbers of objects, "
+            "expected 0, 1, 2, ...; do not normalise or interpolate masks"
+        )
+    return array.astype(np.int32)
+
+
+def depth_of(
+    layers: Mapping[str, torch.Tensor], image_key: str, size: tuple[int, ...]
+) -> NDArray[np.float32] | None:
+    """Metres along the optical axis ``(H, W)`` of an image; None where the observation has none.
+
+    Args:
+        layers: ``(1, H, W)`` by key, of one environment.
+        image_key: ``observation.images.<camera>``.
+        size: Height and width of that image.
+
+    Raises:
+        ObservationError: Of another size than the image, not floating point, not finite, or negative.
+    """
+    key, array = _layer(layers, DEPTH, image_key, size)
+    if array is None:
+        return None
+    if not np.issubdtype(array.dtype, np.floating) or array.min() < 0:
+        raise ObservationError(
+            f"{key!r} is of {array.dtype} and at least {array.min():g}, expected metres as floating point, 0 "
+            "where not measured; divide millimetres by 1000"
+        )
+    return array.astype(np.float32)
+
+
+def _layer(
+    layers: Mapping[str, torch.Tensor], prefix: str, image_key: str, size: tuple[int, ...]
+) -> tuple[str, NDArray[Any] | None]:
+    key = prefix + image_key.removeprefix(IMAGES)
+    if not image_key.startswith(IMAGES) or key not in layers:
+        return key, None
+    array = layers[key].detach().cpu().numpy()
+    if array.shape != (1, *size):
+        raise ObservationError(
+            f"{key!r} has shape {array.shape}, expected {(1, *size)}, the size of {image_key!r}; give it at "
+            "the image's size"
+        )
+    if not np.isfinite(array).all():
+        raise ObservationError(
+            f"{key!r} holds NaN or infinite values, expected finite ones; give 0 where nothing is known"
+        )
+    return key, array[0]

@@ -8,11 +8,11 @@ import numpy as np
 
 from lerobot_openspm.geometry import se3
 from lerobot_openspm.geometry.se3 import Array
-from lerobot_openspm.perception.objects.model import KnownObject
+from lerobot_openspm.perception.objects.base import KnownObject
 
 
 def decode_object_poses(values: Array, names: Sequence[str]) -> dict[str, Array]:
-    """Read ``n * 7`` numbers (position, quat_wxyz per object); names are ``<object>.<component>``."""
+    """Read position and quat_wxyz ``(n * 7,)``; names are ``<object>`` or ``<object>.<component>``."""
     objects = list(dict.fromkeys(name.rsplit(".", 1)[0] for name in names))
     rows = np.asarray(values, float).reshape(len(objects), 7)
     quat_xyzw = rows[:, [4, 5, 6, 3]]

@@ -1,23 +1,53 @@
-"""One environment's eyes: which cameras can be believed, and where the objects are."""
+"""From an observation to detections: which cameras can be believed, and where the objects are."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import Protocol
 
+import cv2
 import numpy as np
 
+from lerobot_openspm.geometry import se3
+from lerobot_openspm.geometry.camera import Camera, project
 from lerobot_openspm.geometry.se3 import Array
-from lerobot_openspm.memory.memory import Memory
-from lerobot_openspm.perception.objects.localise import localise_all
+from lerobot_openspm.perception.objects.base import KnownObject, look_at
 from lerobot_openspm.perception.observation import Observation
-from lerobot_openspm.perception.occlusion import hand_mask
 from lerobot_openspm.perception.oracle import name_simulator_poses
 from lerobot_openspm.perception.tracking.camera_health import CameraWatch
-from lerobot_openspm.types import Detections, PoseEstimate, Segmenter, View
+from lerobot_openspm.types import Detections, Mask, PoseEstimate, Segmenter, View
 
 # How exact the simulator's poses are taken to be (oracle ablation only): metres and radians.
 ORACLE_STD = 1e-4
+# The hand and the arm behind it as balls along the hand's approach axis: from its fingertips this far back.
+TIP_M, BACK_M, BALLS = 0.01, -0.30, 12
+# The fingers are slimmer than what carries them; they end here.
+FINGERS_M, FINGER_SHARE = -0.05, 0.6
+
+
+class KnownWorld(Protocol):
+    """What was learned of objects and cameras; a memory is one."""
+
+    @property
+    def objects(self) -> Mapping[str, KnownObject]:
+        """Known objects by name."""
+        ...
+
+    @property
+    def cameras(self) -> Mapping[str, Camera]:
+        """Calibration by camera key."""
+        ...
+
+    @property
+    def perception(self) -> str:
+        """Whose object frames are used: "oracle" for the simulator's (ablation), else "demonstrations"."""
+        ...
+
+    @property
+    def simulator_objects(self) -> Sequence[str]:
+        """Objects in the order of the simulator's pose vector (oracle ablation only)."""
+        ...
 
 
 @dataclass
@@ -30,12 +60,12 @@ class Perception:
         segmenter: Finds the masks of objects that were learned from a segmenter's; None if none were.
     """
 
-    memory: Memory
+    memory: KnownWorld
     hand_radius_m: float
     segmenter: Segmenter | None = None
     _watch: CameraWatch = field(default_factory=CameraWatch)
     _has_looked: bool = False
-    _labelled: set[str] = field(default_factory=set)
+    _labelled: set[str] = field(default_factory=set[str])
 
     def detect(
         self, observation: Observation, names: Sequence[str], expected: Mapping[str, Array], time_s: float
@@ -65,22 +95,56 @@ class Perception:
             self._labelled |= {name for name, view in views.items() if view.labels is not None}
         T_world_ee = observation.hand.T_world_ee
         faults = self._watch.check(views, absent, T_world_ee, time_s)
-        good = {camera: view for camera, view in views.items() if camera not in faults}
-        return Detections(self._find(good, names, expected, T_world_ee) if good else {}, faults)
-
-    def _find(
-        self,
-        views: Mapping[str, View],
-        names: Sequence[str],
-        expected: Mapping[str, Array],
-        T_world_ee: Array,
-    ) -> dict[str, PoseEstimate]:
-        hidden = {camera: hand_mask(view, T_world_ee, self.hand_radius_m) for camera, view in views.items()}
-        known = {n: self.memory.objects[n] for n in names if n in self.memory.objects}
-        return localise_all(views, known, self.segmenter, hidden, expected)
+        sound = {camera: view for camera, view in views.items() if camera not in faults}
+        if not sound:
+            return Detections({}, faults)
+        hidden = {camera: hand_mask(view, T_world_ee, self.hand_radius_m) for camera, view in sound.items()}
+        known = {name: self.memory.objects[name] for name in names if name in self.memory.objects}
+        look = look_at(sound, list(known), self.segmenter, hidden, expected)
+        return Detections({name: one.localise(look) for name, one in known.items()}, faults)
 
     def _simulator_poses(self, observation: Observation, names: Sequence[str]) -> dict[str, PoseEstimate]:
-        poses = observation.simulator_layout(self.memory.simulator_objects)
+        poses = observation.simulator_poses(self.memory.simulator_objects)
         named = name_simulator_poses(poses, names, self.memory.objects)
         covariance = ORACLE_STD**2 * np.eye(4)
-        return {name: PoseEstimate("found", T, covariance, 1.0, {}) for name, T in named.items()}
+        return {name: PoseEstimate("found", T, covariance, 1.0) for name, T in named.items()}
+
+
+def detect(
+    views: Mapping[str, View], objects: Mapping[str, KnownObject], segmenter: Segmenter | None = None
+) -> dict[str, PoseEstimate]:
+    """Find objects in the views of one moment, nothing being known of where they may be.
+
+    Args:
+        views: Views by camera name.
+        objects: The objects by phrase.
+        segmenter: Finds the masks of objects that were learned from a segmenter's; None if none were.
+
+    Raises:
+        ObservationError: There is no view, or one is malformed.
+        PerceptionError: An object needs a segmenter and there is none, or the segmenter cannot be used.
+    """
+    look = look_at(views, list(objects), segmenter, {}, {})
+    return {name: known.localise(look) for name, known in objects.items()}
+
+
+def hand_mask(view: View, T_world_ee: Array, radius: float) -> Mask:
+    """Pixels ``(H, W)`` that the hand may cover, drawn generously; none in a camera that the hand carries.
+
+    Args:
+        view: The view.
+        T_world_ee: The hand's pose ``(4, 4)``; its z axis points out of it, away from the arm.
+        radius: Of the hand, metres.
+    """
+    mask = np.zeros(view.image.shape[:2], np.uint8)
+    if view.camera.mount == "ee":
+        return mask.astype(bool)
+    z = np.linspace(TIP_M, BACK_M, BALLS)
+    centres = se3.apply(T_world_ee, np.stack([0 * z, 0 * z, z], axis=1))
+    uv, depth = project(view.camera, view.T_world_cam, centres)
+    for at, centre, distance in zip(z, uv, depth, strict=True):
+        if distance > radius and np.abs(centre).max() < 1e4:
+            own = radius * (FINGER_SHARE if at > FINGERS_M else 1.0)
+            radius_px = max(1, round(view.camera.focal_px * own / float(distance)))
+            cv2.circle(mask, (round(centre[0]), round(centre[1])), radius_px, 1, -1)
+    return mask.astype(bool)

@@ -2,10 +2,12 @@
 
 import numpy as np
 import pytest
-from benchmarks.libero.episode import initial_states
+from benchmarks.worlds import initial_states
 
 from lerobot_openspm.envs.libero import recording
+from lerobot_openspm.envs.libero.recording import LiberoGoal
 from lerobot_openspm.envs.libero.simulator import DO_NOTHING, LiberoSimulator, tasks
+from lerobot_openspm.envs.recording import RecordedEpisode, record
 from lerobot_openspm.envs.seeds import DEMO_SEED_START
 
 pytest.importorskip("libero.libero", reason="needs lerobot[libero]")
@@ -43,26 +45,32 @@ def test_no_demonstration_starts_from_an_evaluation_state(task):
     simulator.close()
 
 
+def recorded(size: int) -> RecordedEpisode:
+    scene = LiberoGoal().scene(TASKS[0], size, size)
+    episode = record(scene, TASKS[0], DEMO_SEED_START)
+    scene.close()
+    return episode
+
+
 def test_recording_only_ever_draws_scenes_by_their_seed(monkeypatch):
     def refuse(*_):
         raise AssertionError("a demonstration was begun from a given state")
 
     monkeypatch.setattr(LiberoSimulator, "reset_to", refuse)
     monkeypatch.setattr(recording, "expert_actions", lambda *_: iter([np.array(DO_NOTHING)] * 2))
-    episode = recording.LiberoSource().record(TASKS[0], DEMO_SEED_START, 64, 64)
+    episode = recorded(64)
     assert (episode.seed, episode.status, episode.success) == (DEMO_SEED_START, "failed", False)
 
 
 def test_the_layout_is_the_public_datasets(monkeypatch):
     monkeypatch.setattr(recording, "expert_actions", lambda *_: iter([np.array(DO_NOTHING)]))
-    source = recording.LiberoSource()
-    episode = source.record(TASKS[0], DEMO_SEED_START, 256, 256)
-    assert source.cameras == ("image", "image2")
+    suite, episode = LiberoGoal(), recorded(256)
+    assert suite.cameras == ("image", "image2")
     shapes = {name: images.shape for name, images in episode.images.items()}
-    assert shapes == dict.fromkeys(source.cameras, (1, 256, 256, 3))
+    assert shapes == dict.fromkeys(suite.cameras, (1, 256, 256, 3))
     assert episode.columns["observation.state"].shape == (1, 8)
     assert episode.columns["action"].shape == (1, 7)
     motors = ["x", "y", "z", "roll", "pitch", "yaw"]
-    assert source.names["observation.state"] == {"motors": [*motors, "gripper", "gripper"]}
-    assert source.names["action"] == {"motors": [*motors, "gripper"]}
+    assert suite.names["observation.state"] == {"motors": [*motors, "gripper", "gripper"]}
+    assert suite.names["action"] == {"motors": [*motors, "gripper"]}
     assert episode.instruction == tasks()[TASKS[0]]

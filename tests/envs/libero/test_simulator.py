@@ -83,9 +83,9 @@ def _batched(state):
 
 
 def test_the_calibration_file_is_the_simulators():
-    from lerobot_openspm.envs.libero.calibration import calibration_document
+    from lerobot_openspm.envs.libero.recording import LiberoGoal
 
-    written, read = json.loads(CALIBRATION.read_text()), calibration_document()
+    written, read = json.loads(CALIBRATION.read_text()), LiberoGoal().calibration(256, 256)
     assert written.keys() == read.keys()
     for key, camera in read["cameras"].items():
         for field, value in camera.items():

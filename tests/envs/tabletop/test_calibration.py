@@ -5,21 +5,22 @@ import cv2
 import numpy as np
 import pytest
 
-from lerobot_openspm.envs.calibration import calibration_document, camera_calibration
 from lerobot_openspm.envs.tabletop import scene
+from lerobot_openspm.envs.tabletop.recording import Tabletop
 from lerobot_openspm.geometry.camera import cameras_from_dict, project
 
 CAMERA_FILE = Path(__file__).parents[3] / "configs/cameras/openspm_tabletop.json"
+DOCUMENT = Tabletop().calibration(256, 256)
 
 
 def _world_from_camera(env, camera: str) -> np.ndarray:
-    calibration = camera_calibration(camera)
+    calibration = DOCUMENT["cameras"][f"observation.images.{camera}"]
     mount = env.ee_pose() if calibration["mount"] == "ee" else np.eye(4)
     return mount @ np.array(calibration["T_mount_cam"])
 
 
 def test_file_is_what_the_simulator_says():
-    assert json.loads(CAMERA_FILE.read_text()) == json.loads(json.dumps(calibration_document()))
+    assert json.loads(CAMERA_FILE.read_text()) == json.loads(json.dumps(DOCUMENT))
 
 
 @pytest.mark.parametrize("camera", scene.CAMERA_NAMES)
@@ -51,9 +52,7 @@ def test_projection_hits_the_coloured_pixels(make_env, camera):
         )
         edge = np.vstack([xy, np.full(360, scene.BURNER_TOP), np.ones(360)])
         points = (env.object_poses()["stove"] @ edge).T[:, :3]
-        calibrated = cameras_from_dict(calibration_document(), "the simulator")[
-            f"observation.images.{camera}"
-        ]
+        calibrated = cameras_from_dict(DOCUMENT, "the simulator")[f"observation.images.{camera}"]
         outline, _ = project(calibrated, _world_from_camera(env, camera), points)
         moments = cv2.moments(outline.astype(np.float32))
         expected = np.array([moments["m10"], moments["m01"]]) / moments["m00"]

@@ -7,7 +7,6 @@ from lerobot_openspm.envs.seeds import TUNING_SEED_START
 from lerobot_openspm.envs.tabletop.configuration import TabletopEnvConfig
 from lerobot_openspm.envs.tabletop.tasks import (
     ANY_TASK,
-    COMPOUND_TASK_NAMES,
     COMPOUND_TASKS,
     TASK_NAMES,
     TASKS,
@@ -17,10 +16,10 @@ from lerobot_openspm.language.instruction import parse_instruction
 
 
 def test_compound_selects_five_tasks_and_all_does_not_hold_them():
-    assert len(COMPOUND_TASK_NAMES) == 5
-    assert select_tasks("compound") == list(COMPOUND_TASK_NAMES)
+    assert len(COMPOUND_TASKS) == 5
+    assert select_tasks("compound") == list(COMPOUND_TASKS)
     assert select_tasks("all") == list(TASK_NAMES)
-    one = COMPOUND_TASK_NAMES[2]
+    one = list(COMPOUND_TASKS)[2]
     assert select_tasks(f"turn_on_stove, {one}") == ["turn_on_stove", one]
     envs = TabletopEnvConfig(task="compound", observation_height=128, observation_width=128).create_envs(1)
     assert list(envs["openspm_tabletop"]) == list(range(10, 15))
@@ -34,13 +33,13 @@ def test_the_whole_was_never_demonstrated_and_its_parts_were(task):
     assert [(one,) for one in whole] == [parse_instruction(TASKS[part].instruction) for part in task.parts]
 
 
-@pytest.mark.parametrize(("task", "steps"), [("bowl_on_plate", 300), (COMPOUND_TASK_NAMES[0], 600)])
+@pytest.mark.parametrize(("task", "steps"), [("bowl_on_plate", 300), ("bowl_on_plate_then_stove", 600)])
 def test_every_part_has_three_hundred_steps(make_env, task, steps):
     assert make_env(task)._max_episode_steps == steps
     assert make_env(task, episode_length=7)._max_episode_steps == 7
 
 
-@pytest.mark.parametrize("task", COMPOUND_TASK_NAMES)
+@pytest.mark.parametrize("task", COMPOUND_TASKS)
 def test_a_compound_task_can_be_done_and_is_done_when_all_its_parts_are(make_env, task):
     env = make_env(task)
     env._observe = dict  # nobody looks

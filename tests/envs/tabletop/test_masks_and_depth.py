@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from lerobot_openspm.envs.calibration import calibration_document
 from lerobot_openspm.envs.tabletop import scene
+from lerobot_openspm.envs.tabletop.recording import Tabletop
 from lerobot_openspm.geometry import se3
 from lerobot_openspm.geometry.camera import cameras_from_dict, project, ray_directions
 
@@ -35,7 +35,7 @@ def observation(env):
 
 
 def camera_of(env, name):
-    camera = cameras_from_dict(calibration_document(SIZE, SIZE), "tabletop")[f"observation.images.{name}"]
+    camera = cameras_from_dict(Tabletop().calibration(SIZE, SIZE), "tabletop")[f"observation.images.{name}"]
     return camera, camera.T_world_cam(env.ee_pose())
 
 

@@ -2,8 +2,8 @@
 
 import numpy as np
 
+from lerobot_openspm.mining.phase_labels.base import Moment, PhaseQuestion
 from lerobot_openspm.mining.phase_labels.question import contact_sheets
-from lerobot_openspm.mining.phase_labels.types import Moment, PhaseQuestion
 
 PHASES = ("approach", "approach", "grasp", "lift", "pre-place", "place", "release", "retreat")
 CLOSING = (False, False, True, True, True, True, False, False)

@@ -7,28 +7,27 @@ from pathlib import Path
 import pytest
 from tests.mining.phase_labels.questions import PHASES, moment, pick_and_place
 
-from lerobot_openspm.mining.phase_labels.cache import AnswerCache
-from lerobot_openspm.mining.phase_labels.types import PhaseAnswer
+from lerobot_openspm.mining.phase_labels.base import PhaseLabel
+from lerobot_openspm.mining.phase_labels.labelling import LabelCache
 
-ANSWERS = (None, *(PhaseAnswer(phase, 0.7) for phase in PHASES[1:]))
+LABELS = (None, *(PhaseLabel(phase, 0.7) for phase in PHASES[1:]))
 JUDGE = "openai tiny v1"
 
 
 @pytest.fixture
-def cache(tmp_path: Path) -> AnswerCache:
-    kept = AnswerCache(tmp_path / "cache")
-    kept.save(pick_and_place(), JUDGE, ANSWERS)
+def cache(tmp_path: Path) -> LabelCache:
+    kept = LabelCache(tmp_path / "cache")
+    kept.save(pick_and_place(), JUDGE, LABELS)
     return kept
 
 
-def file_of(cache: AnswerCache) -> Path:
+def file_of(cache: LabelCache) -> Path:
     (path,) = cache.folder.rglob("*.json")
     return path
 
 
-def test_what_was_kept_comes_back(cache: AnswerCache):
-    assert cache.load(pick_and_place(), JUDGE) == ANSWERS
-    assert file_of(cache).relative_to(cache.folder).parts[0] == "local_a"
+def test_what_was_kept_comes_back(cache: LabelCache):
+    assert cache.load(pick_and_place(), JUDGE) == LABELS
 
 
 @pytest.mark.parametrize(
@@ -42,15 +41,15 @@ def test_what_was_kept_comes_back(cache: AnswerCache):
         replace(pick_and_place(), candidates=(*pick_and_place().candidates[:-1], moment(8.0, False, 0.2))),
     ],
 )
-def test_another_question_has_no_answers(cache: AnswerCache, other):
+def test_another_question_has_no_answers(cache: LabelCache, other):
     assert cache.load(other, JUDGE) is None
 
 
-def test_another_model_is_asked_itself(cache: AnswerCache):
+def test_another_model_is_asked_itself(cache: LabelCache):
     assert cache.load(pick_and_place(), "openai huge v1") is None
 
 
-def test_one_pixel_makes_another_question(cache: AnswerCache):
+def test_one_pixel_makes_another_question(cache: LabelCache):
     question = pick_and_place()
     (sheet,) = question.sheets["observation.images.wrist"]
     sheet[5, 5, 0] ^= 1
@@ -61,10 +60,7 @@ DAMAGED = {
     "nothing": lambda _: b"",
     "no JSON": lambda _: b"\x00\xff",
     "deep": lambda _: b"[" * 900_000,
-    "huge": lambda blob: blob + b" " * 1_000_000,
     "a list": lambda _: b"[]",
-    "older": lambda blob: blob.replace(b'"version": 1', b'"version": 0'),
-    "another key": lambda blob: blob.replace(b'"key": "', b'"key": "0'),
     "an answer less": lambda blob: blob.replace(b"null,", b""),
     "an unknown phase": lambda blob: blob.replace(b'"lift"', b'"fly"'),
     "a confidence of 7": lambda blob: blob.replace(b"0.7", b"7.0"),
@@ -81,37 +77,37 @@ def test_damaged_files_are_ignored_with_a_warning_and_written_anew(cache, caplog
     path = file_of(cache)
     path.write_bytes(DAMAGED[damage](path.read_bytes()))
     assert cache.load(pick_and_place(), JUDGE) is None
-    assert f"ignoring the cached answers in {path}" in caplog.text
-    cache.save(pick_and_place(), JUDGE, ANSWERS)
-    assert cache.load(pick_and_place(), JUDGE) == ANSWERS
+    assert f"ignoring the cached labels in {path}" in caplog.text
+    cache.save(pick_and_place(), JUDGE, LABELS)
+    assert cache.load(pick_and_place(), JUDGE) == LABELS
 
 
-def test_truncated_anywhere(cache: AnswerCache):
+def test_truncated_anywhere(cache: LabelCache):
     path, question = file_of(cache), pick_and_place(cameras=0)
-    cache.save(question, JUDGE, ANSWERS)
+    cache.save(question, JUDGE, LABELS)
     path = next(p for p in cache.folder.rglob("*.json") if p != path)
     blob = path.read_bytes().rstrip()
     for n in range(0, len(blob), max(1, len(blob) // 50)):
         path.write_bytes(blob[:n])
         assert cache.load(question, JUDGE) is None
     path.write_bytes(blob)
-    assert cache.load(question, JUDGE) == ANSWERS
+    assert cache.load(question, JUDGE) == LABELS
 
 
 def test_a_folder_that_cannot_be_written_to_stops_nothing(tmp_path: Path, caplog: pytest.LogCaptureFixture):
     (tmp_path / "file").touch()
-    AnswerCache(tmp_path / "file").save(pick_and_place(), JUDGE, ANSWERS)
-    assert "could not keep answers in" in caplog.text
+    LabelCache(tmp_path / "file").save(pick_and_place(), JUDGE, LABELS)
+    assert "could not keep labels in" in caplog.text
 
 
 @pytest.mark.parametrize("name", ["../../etc", "..", "a/b c", ""])
 def test_a_datasets_name_leads_nowhere_else(tmp_path: Path, name: str):
-    kept = AnswerCache(tmp_path / "cache")
-    kept.save(replace(pick_and_place(), dataset=name), JUDGE, ANSWERS)
+    kept = LabelCache(tmp_path / "cache")
+    kept.save(replace(pick_and_place(), dataset=name), JUDGE, LABELS)
     assert file_of(kept).resolve().is_relative_to((tmp_path / "cache").resolve())
 
 
-def test_a_file_can_be_read_by_a_person(cache: AnswerCache):
+def test_a_file_can_be_read_by_a_person(cache: LabelCache):
     kept = json.loads(file_of(cache).read_text())
     assert (kept["dataset"], kept["episode"], kept["judge"]) == ("local/a", 0, JUDGE)
-    assert kept["answers"][2] == {"phase": "grasp", "confidence": 0.7}
+    assert kept["labels"][2] == {"phase": "grasp", "confidence": 0.7}

@@ -10,21 +10,20 @@ import pytest
 from tests.mining.phase_labels.loopback_chat import LoopbackChat, Reply, completion, question_of, say
 from tests.mining.phase_labels.questions import PHASES, pick_and_place
 
-from lerobot_openspm.errors import JudgementError
+from lerobot_openspm.errors import PhaseLabelError
 from lerobot_openspm.mining.phase_labels.endpoint import (
     API_KEY_VARIABLE,
     MAX_ANSWER_BYTES,
     ChatEndpoint,
-    Patience,
+    EndpointJudge,
 )
-from lerobot_openspm.mining.phase_labels.judges import EndpointJudge
 
 KEY = "sk-very-secret"
 N = len(PHASES)
 
 
 def judge(api_base: str, timeout_s: float = 10.0) -> EndpointJudge:
-    return EndpointJudge(ChatEndpoint(api_base, "tiny-vl", Patience(timeout_s), sleep=lambda _: None))
+    return EndpointJudge(ChatEndpoint(api_base, "tiny-vl", timeout_s, backoff_s=0.0))
 
 
 def asked(answer, timeout_s: float = 10.0):
@@ -94,7 +93,7 @@ def test_the_key_comes_from_the_environment_and_is_never_told(monkeypatch, caplo
     caplog.set_level(logging.DEBUG)
     with (
         LoopbackChat(lambda _: Reply(f"wrong key {KEY}".encode(), 401)).running() as chat,
-        pytest.raises(JudgementError) as caught,
+        pytest.raises(PhaseLabelError) as caught,
     ):
         judge(chat.api_base).judge(pick_and_place())
     assert chat.headers[0]["Authorization"] == f"Bearer {KEY}"
@@ -125,7 +124,7 @@ def test_the_key_comes_from_the_environment_and_is_never_told(monkeypatch, caplo
 )
 def test_what_is_no_answer_is_one_error(reply: Reply, words: str, requests: int):
     chat = LoopbackChat(lambda _: reply)
-    with chat.running(), pytest.raises(JudgementError, match=words):
+    with chat.running(), pytest.raises(PhaseLabelError, match=words):
         judge(chat.api_base).judge(pick_and_place())
     assert len(chat.requests) == requests
 
@@ -142,7 +141,7 @@ def test_what_is_no_answer_is_one_error(reply: Reply, words: str, requests: int)
 def test_a_slow_server_is_waited_for_once_and_no_longer_than_asked(reply: Reply):
     chat = LoopbackChat(lambda _: reply)
     begin = time.monotonic()
-    with chat.running(), pytest.raises(JudgementError, match=r"took longer than 0.5 s"):
+    with chat.running(), pytest.raises(PhaseLabelError, match=r"took longer than 0.5 s"):
         judge(chat.api_base, 0.5).judge(pick_and_place())
     assert time.monotonic() - begin < 2.5
     assert len(chat.requests) == 1
@@ -154,7 +153,7 @@ def test_a_redirect_is_not_followed(monkeypatch: pytest.MonkeyPatch):
         there = f"{elsewhere.api_base}/chat/completions"
         with (
             LoopbackChat(lambda _: Reply(b"", 307, location=there)).running() as chat,
-            pytest.raises(JudgementError, match="code 307"),
+            pytest.raises(PhaseLabelError, match="code 307"),
         ):
             judge(chat.api_base).judge(pick_and_place())
     assert (len(chat.requests), elsewhere.requests) == (1, [])
@@ -164,7 +163,7 @@ def test_a_server_that_is_gone():
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]
-    with pytest.raises(JudgementError, match=r"could not be asked .*3 times"):
+    with pytest.raises(PhaseLabelError, match=r"could not be asked .*3 times"):
         judge(f"http://127.0.0.1:{port}/v1").judge(pick_and_place())
 
 

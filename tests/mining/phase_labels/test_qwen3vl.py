@@ -5,12 +5,11 @@ from pathlib import Path
 import pytest
 from tests.mining.phase_labels.questions import pick_and_place
 
-from lerobot_openspm.errors import JudgementError, PerceptionError
+from lerobot_openspm.errors import PerceptionError, PhaseLabelError
 from lerobot_openspm.memory.entry import PHASES as CLOSED_SET
 from lerobot_openspm.mining.phase_labels import qwen3vl
-from lerobot_openspm.mining.phase_labels.judges import Qwen3VLJudge
 from lerobot_openspm.mining.phase_labels.prompt import Prompt
-from lerobot_openspm.mining.phase_labels.qwen3vl import Qwen3VL
+from lerobot_openspm.mining.phase_labels.qwen3vl import Qwen3VL, Qwen3VLJudge
 
 
 @pytest.fixture(scope="module")
@@ -45,8 +44,8 @@ def test_the_alternatives_probabilities_add_up_to_one(model: Qwen3VL):
     import torch
 
     alternatives = ("ax", "bx", "cx")
-    (piece,) = model.write(Prompt("Which?"), one_of(*alternatives))
-    inputs = model._inputs(Prompt("Which?"))
+    (piece,) = model.write(Prompt("Which?", (), {}), one_of(*alternatives))
+    inputs = model._inputs(Prompt("Which?", (), {}))
     with torch.inference_mode():
         logits = model._model(**inputs).logits[0, -1]
     tokens = [model._processor.tokenizer(a)["input_ids"][0] for a in alternatives]
@@ -56,7 +55,7 @@ def test_the_alternatives_probabilities_add_up_to_one(model: Qwen3VL):
 
 
 def test_what_is_forced_is_certain(model: Qwen3VL):
-    (piece,) = model.write(Prompt("Say it."), one_of("1: approach\n"))
+    (piece,) = model.write(Prompt("Say it.", (), {}), one_of("1: approach\n"))
     assert (piece.text, piece.probability) == ("1: approach\n", 1.0)
 
 
@@ -65,7 +64,7 @@ def test_a_later_piece_depends_on_what_was_written_before(model: Qwen3VL):
         following = {"no ": ("never", "none"), "yes ": ("always", "all")}
         return following.get(written[-1], ()) if written else tuple(following)
 
-    first, second = model.write(Prompt("?"), grammar)
+    first, second = model.write(Prompt("?", (), {}), grammar)
     assert second.text in {"no ": ("never", "none"), "yes ": ("always", "all")}[first.text]
 
 
@@ -73,16 +72,16 @@ def test_nothing_is_computed_after_the_end_of_the_grammar(model: Qwen3VL, monkey
     """Although the tiny model's settings, unlike the real one's, name no token that ends an answer."""
     generate, outputs = model._model.generate, []
     monkeypatch.setattr(model._model, "generate", lambda **o: outputs.append(generate(**o)) or outputs[-1])
-    model.write(Prompt("Say it."), one_of("ab"))
-    prompt = model._inputs(Prompt("Say it."))["input_ids"]
+    model.write(Prompt("Say it.", (), {}), one_of("ab"))
+    prompt = model._inputs(Prompt("Say it.", (), {}))["input_ids"]
     spelled = model._processor.tokenizer.decode(outputs[0][0, prompt.shape[1] :])
     assert spelled == "ab<|im_end|>"
 
 
 def test_a_grammar_without_end_is_an_error(model: Qwen3VL, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(qwen3vl, "MAX_NEW_TOKENS", 12)
-    with pytest.raises(JudgementError, match="wrote 12 tokens and came to no end"):
-        model.write(Prompt("Go on."), lambda written: ("la", "lo"))
+    with pytest.raises(PhaseLabelError, match="wrote 12 tokens and came to no end"):
+        model.write(Prompt("Go on.", (), {}), lambda written: ("la", "lo"))
 
 
 def test_it_is_loaded_from_its_files(tiny_qwen3vl_folder: Path, model: Qwen3VL):
@@ -113,5 +112,5 @@ def test_a_device_that_is_too_small_is_a_failure_to_answer(model: Qwen3VL, monke
         raise torch.OutOfMemoryError("CUDA out of memory")
 
     monkeypatch.setattr(model._model, "generate", full)
-    with pytest.raises(JudgementError, match="tiny does not fit"):
-        model.write(Prompt("?"), one_of("a"))
+    with pytest.raises(PhaseLabelError, match="tiny does not fit"):
+        model.write(Prompt("?", (), {}), one_of("a"))

@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from tests.perception.builders import lesson, localise
 from tests.perception.drawn_masks import (
     LABELS,
     body,
@@ -15,16 +16,15 @@ from tests.perception.drawn_masks import (
 )
 from tests.perception.drawn_world import demonstration, draw_pose, draw_poses
 
-from lerobot_openspm.errors import DatasetError, PerceptionError
+from lerobot_openspm.errors import PerceptionError
 from lerobot_openspm.geometry import se3
+from lerobot_openspm.perception.objects.base import Appearance, ObjectShape
 from lerobot_openspm.perception.objects.box.learn import learn_boxes
-from lerobot_openspm.perception.objects.box.localise import localise_box
-from lerobot_openspm.perception.objects.learning import learn_objects
-from lerobot_openspm.perception.objects.localise import localise, localise_all
+from lerobot_openspm.perception.objects.box.model import BoxModel
+from lerobot_openspm.perception.objects.kinds import learn_objects
 from lerobot_openspm.perception.objects.mask_association import touched
-from lerobot_openspm.perception.objects.model import BoxModel, ObjectModel
-from lerobot_openspm.perception.objects.object_shape import ObjectShape
-from lerobot_openspm.perception.segmentation.learned import LearnedSegmenter
+from lerobot_openspm.perception.objects.shape.model import ShapeModel
+from lerobot_openspm.perception.pipeline import detect
 from lerobot_openspm.types import ContactCue, Segmentation
 
 NAMES = ("block", "cup")
@@ -46,7 +46,7 @@ def scenes():
 
 @pytest.fixture(scope="module")
 def models(scenes):
-    return learn_boxes(NAMES, scenes, segmenter())
+    return learn_boxes(lesson(NAMES, scenes, (), segmenter(), "box"))
 
 
 @pytest.fixture(scope="module")
@@ -69,10 +69,9 @@ def test_objects_are_found_within_millimetres(models, unseen, name):
     errors, turns = [], []
     for poses in unseen:
         views = masked_views(poses)
-        found = localise_box(views, models[name], instances_of(views, name))
+        found = localise(views, models[name], instances_of(views, name))
         assert found.status == "found"
         assert found.confidence > 0.9
-        assert set(found.masks) == {"front", "side"}
         errors.append(np.linalg.norm(found.T_world_obj[:2, 3] - poses[name][:2, 3]))
         turns.append(turned_yaw(found.T_world_obj, poses[name], np.pi))
     assert np.mean(errors) < 0.0015
@@ -82,12 +81,12 @@ def test_objects_are_found_within_millimetres(models, unseen, name):
 
 
 def test_one_demonstration_is_enough(scenes, unseen):
-    learned = learn_boxes(NAMES, scenes[:1], segmenter())
+    learned = learn_boxes(lesson(NAMES, scenes[:1], (), segmenter(), "box"))
     assert learned["block"].yaw_period == pytest.approx(2 * np.pi)  # nothing showed that it looks alike
     for poses in unseen[:4]:
         views = masked_views(poses)
         for name in NAMES:
-            found = localise_box(views, learned[name], instances_of(views, name))
+            found = localise(views, learned[name], instances_of(views, name))
             assert np.linalg.norm(found.T_world_obj[:2, 3] - poses[name][:2, 3]) < 0.004
 
 
@@ -95,7 +94,7 @@ def test_one_camera_is_enough_where_the_plane_is_known(models, unseen):
     errors = []
     for poses in unseen:
         views = masked_views(poses, only=("front",))
-        found = localise_box(views, models["block"], instances_of(views, "block"))
+        found = localise(views, models["block"], instances_of(views, "block"))
         errors.append(np.linalg.norm(found.T_world_obj[:2, 3] - poses["block"][:2, 3]))
     assert np.mean(errors) < 0.003
 
@@ -105,10 +104,10 @@ def test_the_yaw_stays_within_half_a_period_of_the_demonstrations(models):
     for yaw in np.linspace(-np.pi, np.pi, 9):
         poses = {"block": se3.from_yaw([0.0, -0.1, 0.0], yaw)}
         views = masked_views(poses)
-        found = localise_box(views, model, instances_of(views, "block")).T_world_obj
+        found = localise(views, model, instances_of(views, "block")).T_world_obj
         assert abs(se3.yaw_of(found) - 0.4) <= np.pi / 2 + 1e-9
         assert turned_yaw(found, poses["block"], np.pi) < np.deg2rad(4)
-    assert se3.yaw_of(localise_box(views, models["cup"], instances_of(views, "block")).T_world_obj) == 0
+    assert se3.yaw_of(localise(views, models["cup"], instances_of(views, "block")).T_world_obj) == 0
 
 
 def test_moving_everything_moves_the_answer(models):
@@ -117,8 +116,8 @@ def test_moving_everything_moves_the_answer(models):
     moved = {name: T_moved @ T for name, T in poses.items()}
     here, there = masked_views(poses), masked_views(moved, T_moved)
     for name in NAMES:
-        one = localise_box(here, models[name], instances_of(here, name))
-        two = localise_box(there, models[name], instances_of(there, name))
+        one = localise(here, models[name], instances_of(here, name))
+        two = localise(there, models[name], instances_of(there, name))
         assert (T_moved @ one.T_world_obj)[:3, 3] == pytest.approx(two.T_world_obj[:3, 3], abs=5e-4)
 
 
@@ -139,7 +138,7 @@ def two_blocks():
 
 def test_two_equally_good_instances_are_ambiguous(models):
     views, poses, found = two_blocks()
-    estimate = localise_box(views, models["block"], found)
+    estimate = localise(views, models["block"], found)
     assert estimate.status == "ambiguous"
     assert len(estimate.others) == 1
     for T in poses.values():
@@ -153,7 +152,7 @@ def test_a_part_that_is_segmented_too_is_no_second_object(models):
     (whole,) = instances_of(views, "block")["front"]
     part = whole.mask.copy()
     part[:, np.flatnonzero(part.any(0))[-1]] = False
-    estimate = localise_box(views, models["block"], {"front": (whole, Segmentation(part, 0.8))})
+    estimate = localise(views, models["block"], {"front": (whole, Segmentation(part, 0.8))})
     assert estimate.status == "found"
 
 
@@ -162,7 +161,7 @@ def test_of_two_instances_the_one_of_the_right_size_is_taken(models):
     views = masked_views(poses)
     block, wrong = instances_of(views, "block"), instances_of(views, "distractor")
     found = {camera: (*wrong[camera], *block[camera]) for camera in views}
-    estimate = localise_box(views, models["block"], found)
+    estimate = localise(views, models["block"], found)
     assert estimate.status == "found"
     assert np.linalg.norm(estimate.T_world_obj[:2, 3] - poses["block"][:2, 3]) < 0.004
 
@@ -182,7 +181,7 @@ def test_the_instance_that_the_hand_touched_is_learned():
 
 @pytest.mark.parametrize("found", [{}, {"front": ()}])
 def test_without_masks_nothing_is_found(models, unseen, found):
-    estimate = localise_box(masked_views(unseen[0]), models["block"], found)
+    estimate = localise(masked_views(unseen[0]), models["block"], found)
     assert estimate.status == "not_found"
     assert estimate.confidence == 0
     assert estimate.covariance[0, 0] >= 1
@@ -191,7 +190,7 @@ def test_without_masks_nothing_is_found(models, unseen, found):
 def test_something_quite_different_is_not_found(models, unseen):
     views = masked_views(unseen[0])
     huge = {camera: (Segmentation(np.ones_like(v.labels, bool), 1.0),) for camera, v in views.items()}
-    assert localise_box(views, models["block"], huge).status == "not_found"
+    assert localise(views, models["block"], huge).status == "not_found"
 
 
 def test_what_is_never_seen_near_the_hints_is_left_out(scenes, caplog):
@@ -201,24 +200,22 @@ def test_what_is_never_seen_near_the_hints_is_left_out(scenes, caplog):
         )
         for s in scenes
     ]
-    assert learn_boxes(["block"], away, segmenter()) == {}
+    assert learn_boxes(lesson(["block"], away, (), segmenter(), "box")) == {}
     assert "no mask of 'block' near where the hand touched it" in caplog.text
-    with pytest.raises(DatasetError, match="no object to learn"):
-        learn_boxes([], scenes, segmenter())
 
 
 def test_learning_chooses_by_segmenter_and_shape(scenes, unseen):
-    boxes = learn_objects(scenes, np.random.default_rng(0), segmenter=segmenter(), shape_source="box")
+    boxes = learn_objects(scenes, np.random.default_rng(0), segmenter=segmenter(), source="box")
     assert {name: type(model) for name, model in boxes.items()} == dict.fromkeys(NAMES, BoxModel)
     shapes = learn_objects(scenes, np.random.default_rng(0), segmenter=segmenter())
     for name, model in shapes.items():
-        assert isinstance(model, ObjectModel)
+        assert isinstance(model, ShapeModel)
         assert model.log_odds is None, name
     for models in (boxes, shapes):
         errors = []
         for poses in unseen[:6]:
             views = masked_views(poses)
-            for name, found in localise_all(views, models, segmenter()).items():
+            for name, found in detect(views, models, segmenter()).items():
                 assert found.status == "found"
                 errors.append(np.linalg.norm(found.T_world_obj[:2, 3] - poses[name][:2, 3]))
         assert np.mean(errors) < 0.003
@@ -232,23 +229,18 @@ def test_a_segmenter_is_asked_once_for_all_objects(models, unseen, scenes):
             asked.append(list(phrases))
             return segmenter().segment(views, phrases)
 
-    localise_all(masked_views(unseen[0]), models, Counting())
-    localise_all(masked_views(unseen[0]), {}, Counting())
+    detect(masked_views(unseen[0]), models, Counting())
+    detect(masked_views(unseen[0]), {}, Counting())
     assert asked == [list(NAMES)]
-    learn_boxes(NAMES, scenes[:2], Counting())
+    learn_boxes(lesson(NAMES, scenes[:2], (), Counting(), "box"))
     assert asked == [list(NAMES)] * 3
-
-
-def test_colours_are_not_asked_of_what_was_learned_from_masks(models, unseen):
-    with pytest.raises(PerceptionError, match=r"'block' was learned from another segmenter's masks.*nothing"):
-        LearnedSegmenter(models).segment(masked_views(unseen[0]), ["block"])
 
 
 def test_what_was_learned_from_masks_is_not_sought_without(models, unseen):
     views = masked_views(unseen[0])
     with pytest.raises(PerceptionError, match="'block' was learned from a segmenter's masks"):
         localise(views, models["block"])
-    shaped = ObjectModel("cup", None, np.zeros((8, 3), np.float32), 0.01, 0.0, 0.0, 0.0, 0.0, 0.9)
+    shaped = ShapeModel("cup", None, np.zeros((8, 3), np.float32), 0.01, 0.0, 0.0, 0.0, 0.0, 0.9)
     with pytest.raises(PerceptionError, match="'cup' was learned from a segmenter's masks"):
         localise(views, shaped)
 
@@ -259,16 +251,20 @@ class Told:
     def __init__(self):
         self.asked = []
 
-    def describe(self, view, segmentation, points_world=None):
-        name = next(name for name in NAMES if (view.labels == LABELS[name])[segmentation.mask].mean() > 0.5)
+    def describe(self, objects: list[Appearance]):
+        return [self._shape(one) for one in objects]
+
+    def _shape(self, one: Appearance):
+        labels = one.view.labels[one.segmentation.mask]
+        name = next(name for name in NAMES if (labels == LABELS[name]).mean() > 0.5)
         self.asked.append(name)
-        foot = np.append(points_world[:, :2].mean(axis=0), 0.0)
+        foot = np.append(one.points_world[:, :2].mean(axis=0), 0.0)
         return ObjectShape(se3.from_yaw(foot, 0.0), np.asarray(body(name, np.eye(4)).size, float), 0.9)
 
 
 def test_a_shape_backend_tells_the_size_once_per_object_and_the_masks_the_rest(scenes, unseen):
     told = Told()
-    models = learn_boxes(NAMES, scenes, segmenter(), told)
+    models = learn_boxes(lesson(NAMES, scenes, (), segmenter(), "sam3d", told))
     assert sorted(told.asked) == sorted(NAMES)
     for name in NAMES:
         assert models[name].size == pytest.approx(body(name, np.eye(4)).size, abs=1e-9)
@@ -276,5 +272,5 @@ def test_a_shape_backend_tells_the_size_once_per_object_and_the_masks_the_rest(s
     assert models["block"].yaw_period == pytest.approx(np.pi)
     views = masked_views(unseen[0])
     for name in NAMES:
-        found = localise_box(views, models[name], instances_of(views, name))
+        found = localise(views, models[name], instances_of(views, name))
         assert np.linalg.norm(found.T_world_obj[:2, 3] - unseen[0][name][:2, 3]) < 0.004

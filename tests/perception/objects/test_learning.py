@@ -5,14 +5,14 @@ import json
 
 import numpy as np
 import pytest
+from tests.perception.builders import localise
 from tests.perception.drawn_world import SHAPES, demonstration, draw_poses, partly_hidden, render, views_of
 
 from lerobot_openspm.errors import DatasetError, MemoryFormatError, ObservationError
 from lerobot_openspm.geometry import se3
 from lerobot_openspm.perception.objects import store
-from lerobot_openspm.perception.objects.learning import learn_objects
-from lerobot_openspm.perception.objects.localise import localise, prepare
-from lerobot_openspm.perception.objects.model import ObjectModel
+from lerobot_openspm.perception.objects.kinds import learn_objects
+from lerobot_openspm.perception.objects.shape.model import ShapeModel
 
 
 @pytest.fixture
@@ -45,7 +45,7 @@ def errors(model, name, scenes):
 
 
 def test_objects_that_move_far_are_known_by_their_shapes(models):
-    assert {name: type(model) for name, model in models.items()} == {"block": ObjectModel, "cup": ObjectModel}
+    assert {name: type(model) for name, model in models.items()} == {"block": ShapeModel, "cup": ShapeModel}
 
 
 def test_objects_are_found_within_millimetres(models, unseen):
@@ -141,13 +141,6 @@ def test_covariance_is_positive_and_knows_what_cannot_be_seen(models, unseen):
         assert (np.linalg.eigvalsh(estimate.covariance) > 0).all()
         assert np.sqrt(estimate.covariance[0, 0]) < 0.005
     assert np.sqrt(estimate.covariance[3, 3]) == pytest.approx(np.pi / np.sqrt(3))
-
-
-def test_prepared_views_give_the_same_answer(models, unseen):
-    views = views_of(unseen[3])
-    plain = localise(views, models["cup"])
-    prepared = localise({key: prepare(view) for key, view in views.items()}, models["cup"])
-    assert np.array_equal(plain.T_world_obj, prepared.T_world_obj)
 
 
 def test_malformed_views_are_refused(models, unseen):

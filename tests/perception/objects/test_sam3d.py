@@ -14,16 +14,21 @@ from tests.perception.objects import sam3d_scene as scene
 from lerobot_openspm.errors import PerceptionError
 from lerobot_openspm.geometry import se3
 from lerobot_openspm.geometry.camera import project
-from lerobot_openspm.perception.objects.sam3d import worker as sam3d_worker
-from lerobot_openspm.perception.objects.sam3d.size import Sam3dShape, reconstruction_from, request_arrays
+from lerobot_openspm.perception.objects.base import Appearance
+from lerobot_openspm.perception.objects.sam3d.reconstruction import reconstruction_from
+from lerobot_openspm.perception.objects.sam3d.size import Sam3dShape, request_arrays
 from lerobot_openspm.types import Segmentation, View
 
 FAKE = Path(__file__).with_name("fake_sam3d_worker.py")
 
 
-def client(folder, mode="honest", **options):
-    command = (sys.executable, str(FAKE), mode, sam3d_worker.__file__, str(folder))
-    return Sam3dShape(command, **{"start_timeout_s": 30.0, "timeout_s": 30.0} | options)
+def backend(folder, mode="honest", **options):
+    return Sam3dShape((sys.executable, str(FAKE), mode, str(folder)), **options)
+
+
+def describe(folder, *one):
+    (shape,) = backend(folder).describe([Appearance(*one)])
+    return shape
 
 
 def told(folder, **arrays):
@@ -103,38 +108,40 @@ def assert_the_box(shape, within=0.002):
 def test_depth_gives_the_size(tmp_path, mirrored):
     view, segmentation = scene.seen(mirrored)
     told(tmp_path, **scene.described(view.T_world_cam))
-    with client(tmp_path, seed=5) as shapes:
-        assert_the_box(shapes.describe(view, segmentation))
+    assert_the_box(describe(tmp_path, view, segmentation))
     with np.load(tmp_path / "request.npz") as request:
-        assert request["seed"] == 5
         for name, array in request_arrays(view, segmentation).items():
-            np.testing.assert_array_equal(request[name], array)
+            np.testing.assert_array_equal(request[f"0.{name}"], array)
 
 
-@pytest.mark.parametrize("how", ["plane", "points"])
-def test_without_depth_the_plane_or_points_give_the_size(tmp_path, how):
+def test_without_depth_points_give_the_size(tmp_path):
     view, segmentation = scene.seen(depth=False)
     told(tmp_path, **scene.described(view.T_world_cam, size=2.7))
-    points = None
-    if how == "points":
-        upper_side = scene.surface(scene.EXTENTS, 20)
-        upper_side = upper_side[upper_side[:, 2] > 0.99 * scene.EXTENTS[2] / 2]
-        points = se3.apply(scene.T_WORLD_OBJ, upper_side + scene.UP)
-    with client(tmp_path, support_height=0.0 if how == "plane" else None) as shapes:
-        # Which points are the front ones is known only roughly: 0.5 % of the distance.
-        assert_the_box(
-            shapes.describe(view, segmentation, points), within=0.0045 if how == "points" else 0.002
-        )
+    upper_side = scene.surface(scene.EXTENTS, 20)
+    upper_side = upper_side[upper_side[:, 2] > 0.99 * scene.EXTENTS[2] / 2]
+    points = se3.apply(scene.T_WORLD_OBJ, upper_side + scene.UP)
+    # Which points are the front ones is known only roughly: 0.5 % of the distance.
+    assert_the_box(describe(tmp_path, view, segmentation, points), within=0.0045)
     with np.load(tmp_path / "request.npz") as request:
-        assert "pointmap" not in request
+        assert set(request) == {"0.image", "0.mask"}
+
+
+def test_many_objects_are_described_in_one_run_in_their_order(tmp_path):
+    (near, segmentation), (_, other) = scene.seen(), scene.seen(depth=False)
+    told(tmp_path, **scene.described(near.T_world_cam))
+    far = se3.apply(scene.T_WORLD_OBJ, 2 * scene.surface(scene.EXTENTS, 20))
+    flat = View(near.image, near.camera, near.T_world_cam)
+    shapes = backend(tmp_path).describe([Appearance(near, segmentation), Appearance(flat, other, far)])
+    assert_the_box(shapes[0])
+    assert shapes[1].extents[0] != pytest.approx(shapes[0].extents[0])
+    assert backend(tmp_path, "dies").describe([]) == []
 
 
 def test_a_shape_elsewhere_has_little_quality(tmp_path):
     view, segmentation = scene.seen()
     answer = scene.described(view.T_world_cam)
     told(tmp_path, **answer | {"translation": answer["translation"] + [0.05, 0, 0]})
-    with client(tmp_path) as shapes:
-        assert shapes.describe(view, segmentation).quality < 0.6
+    assert describe(tmp_path, view, segmentation).quality < 0.6
 
 
 def test_what_cannot_be_asked_starts_no_worker(tmp_path):
@@ -148,32 +155,18 @@ def test_what_cannot_be_asked_starts_no_worker(tmp_path):
             segmentation,
         ),
     }
-    with client(tmp_path) as shapes:
-        for message, arguments in lacking.items():
-            with pytest.raises(PerceptionError, match=message):
-                shapes.describe(*arguments)
-    assert not (tmp_path / "started").exists()
-
-
-@pytest.mark.parametrize(
-    ("height", "upside_down"), [(5.0, False), (0.0, True)], ids=["plane above camera", "camera looks up"]
-)
-def test_a_plane_that_cannot_be_under_the_object(tmp_path, height, upside_down):
-    view, segmentation = scene.seen(depth=False)
-    told(tmp_path, **scene.described(view.T_world_cam))
-    T = view.T_world_cam.copy()
-    if upside_down:
-        T[:3, :3] = np.diag([1, -1, -1]) @ T[:3, :3]
-    with client(tmp_path, support_height=height) as shapes, pytest.raises(PerceptionError, match="support_h"):
-        shapes.describe(View(view.image, view.camera, T), segmentation)
+    for message, arguments in lacking.items():
+        with pytest.raises(PerceptionError, match=message):
+            describe(tmp_path, *arguments)
+    assert not (tmp_path / "pid").exists()
 
 
 def test_points_behind_the_camera_give_no_size(tmp_path):
     view, segmentation = scene.seen(depth=False)
     told(tmp_path, **scene.described(view.T_world_cam))
     behind = se3.apply(view.T_world_cam, np.array([[0, 0, -1.0]]))
-    with client(tmp_path) as shapes, pytest.raises(PerceptionError, match="got none of 1"):
-        shapes.describe(view, segmentation, behind)
+    with pytest.raises(PerceptionError, match="got none of 1"):
+        describe(tmp_path, view, segmentation, behind)
 
 
 WRONG = {
@@ -216,8 +209,8 @@ def test_an_answer_that_lacks_something(name):
 def test_an_object_as_large_as_a_house(tmp_path):
     view, segmentation = scene.seen()
     told(tmp_path, **scene.described(view.T_world_cam, size=100))
-    with client(tmp_path) as shapes, pytest.raises(PerceptionError, match="less than 10 m"):
-        shapes.describe(view, segmentation)
+    with pytest.raises(PerceptionError, match="less than 10 m"):
+        describe(tmp_path, view, segmentation)
 
 
 def test_half_precision_is_good_enough_for_a_rotation():

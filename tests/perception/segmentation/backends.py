@@ -1,6 +1,6 @@
 """Every segmentation backend with a scene to look at, each made once a process."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cache
 
@@ -8,10 +8,8 @@ import numpy as np
 from tests.perception.drawn_world import SHAPES, TABLE, draw_poses, render, views_of
 from tests.perception.segmentation import tiny_models
 
-from lerobot_openspm.perception.objects.model import ObjectModel
 from lerobot_openspm.perception.segmentation.given import GivenSegmenter
 from lerobot_openspm.perception.segmentation.grounded_sam2 import GroundedSam2Segmenter
-from lerobot_openspm.perception.segmentation.learned import LearnedSegmenter
 from lerobot_openspm.perception.segmentation.sam3 import Sam3Segmenter
 from lerobot_openspm.types import Segmenter, View
 
@@ -55,12 +53,6 @@ def scene() -> Views:
     return labelled(draw_poses(np.random.default_rng(7)))
 
 
-def demonstrations(objects: Mapping[str, ObjectModel]) -> Backend:
-    """Objects learned from demonstrations."""
-    segmenter = LearnedSegmenter(objects)
-    return Backend(segmenter, scene(), segmenter, without_objects())
-
-
 @cache
 def sam3() -> Backend:
     """SAM 3 with random weights; it sees something everywhere, unless it asks for certainty."""
@@ -85,7 +77,6 @@ def given() -> Backend:
     return Backend(segmenter, scene(), segmenter, without_objects())
 
 
-# What needs nothing but itself; the masks of learned objects come with the objects.
 BACKENDS: dict[str, Callable[[], Backend]] = {
     "sam3": sam3,
     "grounded_sam2": grounded_sam2,

@@ -9,8 +9,7 @@ from tests.perception.segmentation import tiny_models
 from lerobot_openspm.errors import PerceptionError
 from lerobot_openspm.perception.segmentation.given import GivenSegmenter
 from lerobot_openspm.perception.segmentation.grounded_sam2 import GroundedSam2Segmenter
-from lerobot_openspm.perception.segmentation.learned import LearnedSegmenter
-from lerobot_openspm.perception.segmentation.make import DEFAULT_WEIGHTS, SEGMENTERS, make_segmenter
+from lerobot_openspm.perception.segmentation.make import BACKENDS, make_segmenter
 from lerobot_openspm.perception.segmentation.sam3 import Sam3Segmenter
 
 
@@ -29,30 +28,28 @@ def folders(tmp_path_factory):
 def test_nothing_heavy_is_imported_before_it_is_needed():
     code = (
         "import sys; from lerobot_openspm.perception.segmentation.make import make_segmenter; "
-        "make_segmenter('given', {}, {}); sys.exit(bool({'torch', 'transformers'} & set(sys.modules)))"
+        "make_segmenter('given', {}); sys.exit(bool({'torch', 'transformers'} & set(sys.modules)))"
     )
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
 
 
 def test_each_name_makes_its_backend(folders):
     weights = {"sam3": [folders["sam3"]], "grounded_sam2": [folders["grounding_dino"], folders["sam2"]]}
-    made = [make_segmenter(kind, {}, {}, weights.get(kind, ())) for kind in SEGMENTERS]
-    assert [type(one) for one in made] == [
-        LearnedSegmenter, Sam3Segmenter, GroundedSam2Segmenter, GivenSegmenter
-    ]  # fmt: skip
+    made = [make_segmenter(name, {}, weights.get(name, ())) for name in BACKENDS]
+    assert [type(one) for one in made] == [Sam3Segmenter, GroundedSam2Segmenter, GivenSegmenter]
 
 
 def test_the_default_weights_are_the_ones_that_the_authors_publish():
-    assert DEFAULT_WEIGHTS["sam3"] == ("facebook/sam3",)
-    assert DEFAULT_WEIGHTS["grounded_sam2"] == (
+    assert BACKENDS["sam3"].weights == ("facebook/sam3",)
+    assert BACKENDS["grounded_sam2"].weights == (
         "IDEA-Research/grounding-dino-tiny",
         "facebook/sam2.1-hiera-tiny",
     )
 
 
 def test_an_unknown_name_is_refused_with_the_known_ones():
-    with pytest.raises(PerceptionError, match="no segmenter 'sam'; choose one of demonstrations, sam3, g"):
-        make_segmenter("sam", {}, {})
+    with pytest.raises(PerceptionError, match="no segmenter 'sam'; choose one of sam3, grounded_sam2, g"):
+        make_segmenter("sam", {})
 
 
 @pytest.mark.parametrize(
@@ -64,9 +61,9 @@ def test_an_unknown_name_is_refused_with_the_known_ones():
             "takes 1 names of weights, got 2: a, b; .* by default: facebook/sam3",
         ),
         ("grounded_sam2", ["a"], "takes 2 names of weights, got 1: a; .*sam2.1-hiera-tiny"),
-        ("demonstrations", ["a"], "takes 0 names of weights, got 1: a; .*none"),
+        ("given", ["a"], "takes 0 names of weights, got 1: a; .*none"),
     ],
 )
 def test_the_wrong_number_of_weights_is_refused(kind, weights, message):
     with pytest.raises(PerceptionError, match=message):
-        make_segmenter(kind, {}, {}, weights)
+        make_segmenter(kind, {}, weights)

@@ -14,7 +14,7 @@ R = np.diag([1e-6, 1e-6, 4e-6, 1e-4, 1e-4, 4e-4])
 
 def tracks(n: int, steps: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray, kalman.Belief]:
     """True poses and measurements `(steps, n, 4, 4)` of objects moved by the model, and the first belief."""
-    T = se3.from_position_rotvec(rng.uniform(-0.5, 0.5, (n, 3)), rng.uniform(-1.5, 1.5, (n, 3)))
+    T = se3.transform(se3.exp_so3(rng.uniform(-1.5, 1.5, (n, 3))), rng.uniform(-0.5, 0.5, (n, 3)))
     rates = np.concatenate([0.1 * rng.standard_normal((n, 3)), 0.3 * rng.standard_normal((n, 3))], axis=1)
     half = np.linalg.cholesky(R)
     noise = np.linalg.cholesky(STEP.Q + 1e-18 * np.eye(12))
@@ -121,7 +121,7 @@ def test_an_unmeasured_yaw_stays_unknown():
 def test_moving_the_world_moves_the_estimate(T: np.ndarray, seed: int):
     rng = np.random.default_rng(seed)
     noise = 1e-4 * np.eye(6)  # the same along every axis, so that a turn of the world leaves it alone
-    start = se3.from_position_rotvec(rng.uniform(-0.1, 0.1, (1, 3)), rng.uniform(-0.1, 0.1, (1, 3)))
+    start = se3.transform(se3.exp_so3(rng.uniform(-0.1, 0.1, (1, 3))), rng.uniform(-0.1, 0.1, (1, 3)))
     plain, moved = (kalman.begin(pose, noise[None], 0.1, 0.1) for pose in (start, T @ start))
     for _ in range(4):
         seen = se3.apply_increment(start, 0.02 * rng.standard_normal((1, 6)))
@@ -155,7 +155,9 @@ def test_the_covariance_stays_symmetric_and_positive(seed: int):
     belief = kalman.begin(np.eye(4)[None], R[None], 1.0, 1.0)
     for _ in range(100):
         spread = np.diag(10.0 ** rng.uniform(-12, 2, 6))
-        measured = se3.from_position_rotvec(0.1 * rng.standard_normal(3), 0.3 * rng.standard_normal(3))[None]
+        measured = se3.transform(se3.exp_so3(0.3 * rng.standard_normal(3)), 0.1 * rng.standard_normal(3))[
+            None
+        ]
         belief, _ = kalman.update(kalman.predict(belief, STEP), measured, spread[None], np.inf)
         P = belief.covariance[0]
         np.testing.assert_array_equal(P, P.T)

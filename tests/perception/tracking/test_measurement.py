@@ -7,7 +7,7 @@ from lerobot_openspm.perception.tracking.measurement import measurement_covarian
 from lerobot_openspm.types import PoseEstimate, Support
 
 GOOD = PoseEstimate(
-    "found", np.eye(4), np.diag([1e-6, 2e-6, 0.0, 1e-4]), 1.0, {}, 1.0, Support("shape", 1000.0, 1.0, 0.95)
+    "found", np.eye(4), np.diag([1e-6, 2e-6, 0.0, 1e-4]), 1.0, 1.0, Support("shape", 1000.0, 1.0, 0.95)
 )
 
 

@@ -20,7 +20,7 @@ LOOK_S = 0.25
 
 
 def seen(T, status="found", **changes):
-    fields = {"covariance": COVARIANCE, "confidence": 1.0, "masks": {}, **changes}
+    fields = {"covariance": COVARIANCE, "confidence": 1.0, **changes}
     return PoseEstimate(status, T, **fields)
 
 

@@ -10,12 +10,24 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from lerobot_openspm.envs.libero.simulator import LiberoSimulator
-from lerobot_openspm.envs.motions import Actions, Pace, ScriptedHand, pointing_down, pose, yaw_matrix
+from lerobot_openspm.envs.motions import (
+    DOWN,
+    Actions,
+    Pace,
+    ScriptedHand,
+    in_world,
+    pointing_down,
+    raised,
+    yaw_matrix,
+)
+from lerobot_openspm.geometry.se3 import transform
 
 LiberoHand = ScriptedHand[LiberoSimulator]
 
@@ -77,7 +89,6 @@ PLATE_FIRST_LEG = 0.08
 PLATE_HALF_WAY = 0.4
 PLATE_GOAL = np.array([-0.010, 0.0, 0.0])
 
-DOWN = np.diag([1.0, -1.0, -1.0])
 # The hand in the cabinet's frame: pointing into its front, one finger above the other.
 LEVEL = np.array([[-1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, 1.0, 0.0]])
 
@@ -103,115 +114,24 @@ def expert_actions(
     yield from hand.hold(FINAL_HOLD_STEPS)
 
 
-def _bowl_on_plate(hand: LiberoHand) -> Actions:
-    yield from _pick(hand, _origin(hand, "bowl") + BOWL_RIM)
-    yield from _place(hand, "bowl", _origin(hand, "plate") + BOWL_ON_PLATE)
+@dataclass(frozen=True)
+class Put:
+    """What to pick up, where from its origin to grasp it, where its origin goes, how high to lift it."""
+
+    name: str
+    grasp: np.ndarray
+    goal: Callable[[LiberoHand], np.ndarray]
+    rise: float = CARRY_RISE
 
 
-def _bowl_on_stove(hand: LiberoHand) -> Actions:
-    yield from _pick(hand, _origin(hand, "bowl") + BOWL_RIM)
-    yield from _place(hand, "bowl", _region(hand, "flat_stove_1_cook_region") + BOWL_ON_BURNER)
-
-
-def _bowl_on_cabinet(hand: LiberoHand) -> Actions:
-    yield from _pick(hand, _origin(hand, "bowl") + BOWL_RIM, CABINET_CARRY_RISE)
-    yield from _place(hand, "bowl", _region(hand, "wooden_cabinet_1_top_side"))
-
-
-def _cheese_in_bowl(hand: LiberoHand) -> Actions:
-    yield from _pick(hand, _origin(hand, "cheese") + CHEESE_MIDDLE)
-    yield from _place(hand, "cheese", _origin(hand, "bowl") + CHEESE_IN_BOWL)
-
-
-def _bottle_on_cabinet(hand: LiberoHand) -> Actions:
-    yield from _pick(hand, _origin(hand, "bottle") + BOTTLE_NECK, CABINET_CARRY_RISE)
-    yield from _place(hand, "bottle", _region(hand, "wooden_cabinet_1_top_side") + BOTTLE_ON_CABINET)
-
-
-def _bottle_on_rack(hand: LiberoHand) -> Actions:
-    yield from _pick(hand, _origin(hand, "bottle") + BOTTLE_NECK, RACK_CARRY_RISE)
-    yield from _place(hand, "bottle", _in_frame(_frame(hand, "rack"), BOTTLE_ON_RACK))
-
-
-def _open_middle_drawer(hand: LiberoHand) -> Actions:
-    yield from _open_drawer(hand, "middle")
-
-
-def _bowl_in_top_drawer(hand: LiberoHand) -> Actions:
-    yield from _open_drawer(hand, "top")
-    offset, turn = hand.grasp_noise()
-    rotation = yaw_matrix(turn) @ Rotation.from_rotvec([-BOWL_LEAN, 0.0, 0.0]).as_matrix() @ DOWN
-    at_rim = pose(_origin(hand, "bowl") + BOWL_RIM + offset, rotation)
-    yield from _grasp(hand, at_rim)
-    aside = pose(at_rim[:3, 3] + BOWL_ASIDE, rotation)
-    yield from hand.travel(aside)
-    yield from hand.travel(_raised(aside, DRAWER_CARRY_RISE - BOWL_ASIDE[2]))
-    yield from _place(hand, "bowl", _region(hand, "wooden_cabinet_1_top_region") + BOWL_IN_DRAWER)
-
-
-def _turn_on_stove(hand: LiberoHand) -> Actions:
-    offset, turn = hand.grasp_noise()
-    stove = _frame(hand, "stove")
-    lean = Rotation.from_rotvec([0.0, KNOB_LEAN, 0.0]).as_matrix()
-    at_knob = pose(_in_frame(stove, KNOB) + offset, stove[:3, :3] @ yaw_matrix(turn) @ lean @ DOWN)
-    yield from _grasp(hand, at_knob)
-    yield from hand.advance(pose(at_knob[:3, 3], yaw_matrix(KNOB_TURN) @ at_knob[:3, :3]))
-    yield from hand.grip(closing=False)
-    yield from _retreat(hand)
-
-
-def _push_plate(hand: LiberoHand) -> Actions:
-    """Push the plate's edge with both fingertips of the open hand: two points of contact keep it straight."""
-    plate = _origin(hand, "plate")
-    offset, turn = hand.grasp_noise()
-    corner = plate + np.array([0.0, PLATE_FIRST_LEG, 0.0])
-    goal = _region(hand, "main_table_stove_front_region") + PLATE_GOAL
-    lean = Rotation.from_rotvec([-PLATE_LEAN, 0.0, 0.0]).as_matrix() @ yaw_matrix(math.pi / 2) @ DOWN
-
-    def behind(middle: np.ndarray, heading: float, distance: float) -> np.ndarray:
-        """T_world_ee with the plate's middle straight ahead; heading 0 looks along the world's y."""
-        rotation = yaw_matrix(heading)
-        position = middle + offset - distance * rotation[:, 1]
-        position[2] = plate[2] + PLATE_PUSH_Z
-        return pose(position, yaw_matrix(turn) @ rotation @ lean)
-
-    start = behind(plate, 0.0, PLATE_CLEAR)
-    yield from hand.travel(_backed(start, PRE_GRASP))
-    yield from hand.advance(start)
-    yield from hand.advance(behind(corner, 0.0, PLATE_TOUCHING), slowness=0.7)
-    heading = math.atan2(corner[0] - goal[0], goal[1] - corner[1])
-    # The hand rises while it turns, by as much as the plate is high: arrive low half-way.
-    half_way = corner + PLATE_HALF_WAY * (goal - corner)
-    for middle in (half_way, goal):
-        yield from hand.advance(behind(middle, heading, PLATE_TOUCHING), slowness=0.7)
-    yield from _retreat(hand)
-
-
-def _open_drawer(hand: LiberoHand, name: str) -> Actions:
-    """Take the handle from the front with a level hand, pull along the drawer's axis, let go and back off.
-
-    The handles stand above one another, too close for fingers that come from above.
-    """
-    cabinet = _frame(hand, "cabinet")
-    offset, turn = hand.grasp_noise()
-    rotation = cabinet[:3, :3] @ yaw_matrix(turn) @ LEVEL
-    handle = np.array([HANDLE_X + offset[0], HANDLE_Y, HANDLE_Z[name] + offset[1]])
-
-    def at(out: float) -> np.ndarray:
-        return pose(_in_frame(cabinet, handle - [0.0, out, 0.0]), rotation)
-
-    yield from _grasp(hand, at(0.0))
-    yield from hand.advance(at(DRAWER_PULL))
-    yield from hand.grip(closing=False)
-    yield from hand.travel(at(DRAWER_PULL + DRAWER_BACK_OFF))
-
-
-def _pick(hand: LiberoHand, grasp: np.ndarray, rise: float = CARRY_RISE) -> Actions:
-    """Grasp from above at a world point (3,), fingers opening along the world's y, and lift straight up."""
+def _put(put: Put, hand: LiberoHand) -> Actions:
+    """Grasp from above, fingers opening along the world's y, lift straight up and place."""
+    grasp = hand.origin(put.name) + put.grasp
     offset, turn = hand.grasp_noise()
     at_grasp = pointing_down(grasp + offset, turn)
     yield from _grasp(hand, at_grasp)
-    yield from hand.travel(_raised(at_grasp, rise))
+    yield from hand.travel(raised(at_grasp, put.rise))
+    yield from _place(hand, put.name, put.goal(hand))
 
 
 def _grasp(hand: LiberoHand, at_grasp: np.ndarray) -> Actions:
@@ -227,42 +147,22 @@ def _place(hand: LiberoHand, name: str, goal: np.ndarray) -> Actions:
     The object crosses the table at the height that it was lifted to.
     """
     release = goal + hand.grasp_noise()[0] + [0.0, 0.0, RELEASE_GAP]
-    above = np.array([release[0], release[1], max(_origin(hand, name)[2], release[2] + LOWERING)])
+    above = np.array([release[0], release[1], max(hand.origin(name)[2], release[2] + LOWERING)])
     yield from hand.travel(_carried(hand, name, above))
     yield from hand.advance(_carried(hand, name, release))
     yield from hand.grip(closing=False)
-    yield from _retreat(hand)
+    yield from hand.retreat(RETREAT_RISE)
 
 
 def _carried(hand: LiberoHand, name: str, goal: np.ndarray) -> np.ndarray:
     """T_world_ee that brings the grasped object to a world point (3,), the hand keeping its orientation."""
     T_world_ee = hand.simulator.ee_pose()
-    return pose(T_world_ee[:3, 3] + goal - _origin(hand, name), T_world_ee[:3, :3])
-
-
-def _retreat(hand: LiberoHand) -> Actions:
-    yield from hand.travel(_raised(hand.simulator.ee_pose(), RETREAT_RISE))
-
-
-def _raised(T_world_ee: np.ndarray, height: float) -> np.ndarray:
-    return pose(T_world_ee[:3, 3] + [0.0, 0.0, height], T_world_ee[:3, :3])
+    return transform(T_world_ee[:3, :3], T_world_ee[:3, 3] + goal - hand.origin(name))
 
 
 def _backed(T_world_ee: np.ndarray, distance: float) -> np.ndarray:
     """The pose that lies `distance` before another along the fingers."""
-    return pose(T_world_ee[:3, 3] - distance * T_world_ee[:3, 2], T_world_ee[:3, :3])
-
-
-def _frame(hand: LiberoHand, name: str) -> np.ndarray:
-    return hand.simulator.object_poses()[name]
-
-
-def _origin(hand: LiberoHand, name: str) -> np.ndarray:
-    return _frame(hand, name)[:3, 3]
-
-
-def _in_frame(T_world_obj: np.ndarray, point: np.ndarray) -> np.ndarray:
-    return T_world_obj[:3, :3] @ point + T_world_obj[:3, 3]
+    return transform(T_world_ee[:3, :3], T_world_ee[:3, 3] - distance * T_world_ee[:3, 2])
 
 
 def _region(hand: LiberoHand, name: str) -> np.ndarray:
@@ -270,15 +170,106 @@ def _region(hand: LiberoHand, name: str) -> np.ndarray:
     return np.array(hand.simulator.sim.data.get_site_xpos(name))
 
 
+def _open_drawer(name: str, hand: LiberoHand) -> Actions:
+    """Take the handle from the front with a level hand, pull along the drawer's axis, let go and back off.
+
+    The handles stand above one another, too close for fingers that come from above.
+    """
+    cabinet = hand.frame("cabinet")
+    offset, turn = hand.grasp_noise()
+    rotation = cabinet[:3, :3] @ yaw_matrix(turn) @ LEVEL
+    handle = np.array([HANDLE_X + offset[0], HANDLE_Y, HANDLE_Z[name] + offset[1]])
+
+    def at(out: float) -> np.ndarray:
+        return transform(rotation, in_world(cabinet, handle - [0.0, out, 0.0]))
+
+    yield from _grasp(hand, at(0.0))
+    yield from hand.advance(at(DRAWER_PULL))
+    yield from hand.grip(closing=False)
+    yield from hand.travel(at(DRAWER_PULL + DRAWER_BACK_OFF))
+
+
+def _bowl_in_top_drawer(hand: LiberoHand) -> Actions:
+    yield from _open_drawer("top", hand)
+    offset, turn = hand.grasp_noise()
+    rotation = yaw_matrix(turn) @ Rotation.from_rotvec([-BOWL_LEAN, 0.0, 0.0]).as_matrix() @ DOWN
+    at_rim = transform(rotation, hand.origin("bowl") + BOWL_RIM + offset)
+    yield from _grasp(hand, at_rim)
+    aside = transform(rotation, at_rim[:3, 3] + BOWL_ASIDE)
+    yield from hand.travel(aside)
+    yield from hand.travel(raised(aside, DRAWER_CARRY_RISE - BOWL_ASIDE[2]))
+    yield from _place(hand, "bowl", _region(hand, "wooden_cabinet_1_top_region") + BOWL_IN_DRAWER)
+
+
+def _turn_on_stove(hand: LiberoHand) -> Actions:
+    offset, turn = hand.grasp_noise()
+    stove = hand.frame("stove")
+    lean = Rotation.from_rotvec([0.0, KNOB_LEAN, 0.0]).as_matrix()
+    at_knob = transform(stove[:3, :3] @ yaw_matrix(turn) @ lean @ DOWN, in_world(stove, KNOB) + offset)
+    yield from _grasp(hand, at_knob)
+    yield from hand.advance(transform(yaw_matrix(KNOB_TURN) @ at_knob[:3, :3], at_knob[:3, 3]))
+    yield from hand.grip(closing=False)
+    yield from hand.retreat(RETREAT_RISE)
+
+
+def _push_plate(hand: LiberoHand) -> Actions:
+    """Push the plate's edge with both fingertips of the open hand: two points of contact keep it straight."""
+    plate = hand.origin("plate")
+    offset, turn = hand.grasp_noise()
+    corner = plate + np.array([0.0, PLATE_FIRST_LEG, 0.0])
+    goal = _region(hand, "main_table_stove_front_region") + PLATE_GOAL
+    lean = Rotation.from_rotvec([-PLATE_LEAN, 0.0, 0.0]).as_matrix() @ yaw_matrix(math.pi / 2) @ DOWN
+
+    def behind(middle: np.ndarray, heading: float, distance: float) -> np.ndarray:
+        """T_world_ee with the plate's middle straight ahead; heading 0 looks along the world's y."""
+        rotation = yaw_matrix(heading)
+        position = middle + offset - distance * rotation[:, 1]
+        position[2] = plate[2] + PLATE_PUSH_Z
+        return transform(yaw_matrix(turn) @ rotation @ lean, position)
+
+    start = behind(plate, 0.0, PLATE_CLEAR)
+    yield from hand.travel(_backed(start, PRE_GRASP))
+    yield from hand.advance(start)
+    yield from hand.advance(behind(corner, 0.0, PLATE_TOUCHING), slowness=0.7)
+    heading = math.atan2(corner[0] - goal[0], goal[1] - corner[1])
+    # The hand rises while it turns, by as much as the plate is high: arrive low half-way.
+    half_way = corner + PLATE_HALF_WAY * (goal - corner)
+    for middle in (half_way, goal):
+        yield from hand.advance(behind(middle, heading, PLATE_TOUCHING), slowness=0.7)
+    yield from hand.retreat(RETREAT_RISE)
+
+
+def _on(name: str, offset: np.ndarray) -> Callable[[LiberoHand], np.ndarray]:
+    return lambda hand: hand.origin(name) + offset
+
+
+def _on_region(name: str, offset: np.ndarray) -> Callable[[LiberoHand], np.ndarray]:
+    return lambda hand: _region(hand, name) + offset
+
+
+def _on_rack(hand: LiberoHand) -> np.ndarray:
+    return in_world(hand.frame("rack"), BOTTLE_ON_RACK)
+
+
+_TOP = "wooden_cabinet_1_top_side"
+_PUTS = {
+    "put_the_bowl_on_the_stove": Put(
+        "bowl", BOWL_RIM, _on_region("flat_stove_1_cook_region", BOWL_ON_BURNER)
+    ),
+    "put_the_wine_bottle_on_top_of_the_cabinet": Put(
+        "bottle", BOTTLE_NECK, _on_region(_TOP, BOTTLE_ON_CABINET), CABINET_CARRY_RISE
+    ),
+    "put_the_bowl_on_top_of_the_cabinet": Put(
+        "bowl", BOWL_RIM, _on_region(_TOP, np.zeros(3)), CABINET_CARRY_RISE
+    ),
+    "put_the_cream_cheese_in_the_bowl": Put("cheese", CHEESE_MIDDLE, _on("bowl", CHEESE_IN_BOWL)),
+    "put_the_bowl_on_the_plate": Put("bowl", BOWL_RIM, _on("plate", BOWL_ON_PLATE)),
+    "put_the_wine_bottle_on_the_rack": Put("bottle", BOTTLE_NECK, _on_rack, RACK_CARRY_RISE),
+}
 EXPERTS: dict[str, Callable[[LiberoHand], Actions]] = {
-    "open_the_middle_drawer_of_the_cabinet": _open_middle_drawer,
-    "put_the_bowl_on_the_stove": _bowl_on_stove,
-    "put_the_wine_bottle_on_top_of_the_cabinet": _bottle_on_cabinet,
+    **{task: partial(_put, put) for task, put in _PUTS.items()},
+    "open_the_middle_drawer_of_the_cabinet": partial(_open_drawer, "middle"),
     "open_the_top_drawer_and_put_the_bowl_inside": _bowl_in_top_drawer,
-    "put_the_bowl_on_top_of_the_cabinet": _bowl_on_cabinet,
     "push_the_plate_to_the_front_of_the_stove": _push_plate,
-    "put_the_cream_cheese_in_the_bowl": _cheese_in_bowl,
     "turn_on_the_stove": _turn_on_stove,
-    "put_the_bowl_on_the_plate": _bowl_on_plate,
-    "put_the_wine_bottle_on_the_rack": _bottle_on_rack,
 }

@@ -1,39 +1,78 @@
-"""Recording LIBERO's experts in the layout of the public LIBERO dataset."""
+"""LIBERO's suite libero_goal as a suite to record, in the layout of the public LIBERO dataset."""
 
-import functools
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 
-from lerobot_openspm.envs.libero.calibration import calibration_document
+from lerobot_openspm.envs.calibration import calibration
 from lerobot_openspm.envs.libero.experts import expert_actions
-from lerobot_openspm.envs.libero.simulator import CAMERAS, OBJECTS, LiberoSimulator, tasks
-from lerobot_openspm.envs.recording import (
-    OBJECT_POSES,
-    Names,
-    RecordedEpisode,
-    Recorder,
-    pose_names,
-    pose_vector,
+from lerobot_openspm.envs.libero.simulator import (
+    CAMERA_MOUNTS,
+    CAMERAS,
+    OBJECTS,
+    SUITE,
+    LiberoSimulator,
+    tasks,
 )
+from lerobot_openspm.envs.motions import Actions
+from lerobot_openspm.envs.recording import OBJECT_POSES, Names, pose_names, pose_vector
+from lerobot_openspm.envs.selection import select
 
 # An expert that takes longer than the policy may is no use as a demonstration.
 MAX_STEPS = 300
-# LIBERO ends an episode when its goal first holds, often in mid-motion: a demonstration that ended there too
-# would tell a policy to stop at the very threshold.
+# LIBERO ends an episode when its goal first holds, often in mid-motion. A demonstration that ended there too
+# would teach a policy to stop at the very threshold, so it goes on a little, as people do.
 STEPS_AFTER_SUCCESS = 10
 
 
-class LiberoSource:
-    """The suite libero_goal, see `Source`."""
+class LiberoScene:
+    """One task of LIBERO, see `Scene`."""
+
+    def __init__(self, task: str, image_size: int) -> None:
+        self._simulator = LiberoSimulator(task, image_size)
+        self.instruction = self._simulator.instruction
+        self.status, self._steps_left = "failed", MAX_STEPS
+
+    def reset(self, seed: int) -> None:
+        """See `Scene`."""
+        self._simulator.reset(seed)
+        self.status, self._steps_left = "failed", MAX_STEPS
+
+    def expert(self, rng: np.random.Generator) -> Actions:
+        """See `Scene`."""
+        return expert_actions(self._simulator, self._simulator.task, rng)
+
+    def images(self) -> Mapping[str, np.ndarray]:
+        """See `Scene`."""
+        return self._simulator.images()
+
+    def columns(self) -> Mapping[str, np.ndarray]:
+        """See `Scene`."""
+        poses = pose_vector(self._simulator.object_poses())
+        return {"observation.state": self._simulator.state(), OBJECT_POSES: poses}
+
+    def step(self, action: np.ndarray) -> bool:
+        """See `Scene`."""
+        self._steps_left -= 1
+        if self._simulator.step(action) and self.status != "success":
+            self.status, self._steps_left = "success", min(self._steps_left, STEPS_AFTER_SUCCESS)
+        return self._steps_left == 0
+
+    def close(self) -> None:
+        """See `Scene`."""
+        self._simulator.close()
+
+
+class LiberoGoal:
+    """The suite libero_goal, see `Suite`."""
 
     robot_type = "panda"
     cameras = tuple(CAMERAS)
 
     @property
     def names(self) -> Mapping[str, Names]:
-        """See `Source`."""
+        """See `Suite`."""
         # The public dataset's names. Its "roll, pitch, yaw" are an axis-angle.
         return {
             "observation.state": {"motors": ["x", "y", "z", "roll", "pitch", "yaw", "gripper", "gripper"]},
@@ -42,49 +81,22 @@ class LiberoSource:
         }
 
     def tasks(self, selection: str) -> list[str]:
-        """See `Source`."""
+        """See `Suite`."""
         known = list(tasks())
-        if selection in ("all", "libero_goal"):
-            return known
-        names = [name.strip() for name in selection.split(",")]
-        if unknown := [name for name in names if name not in known]:
-            raise ValueError(
-                f"libero_goal has no tasks {unknown}, expected all or some of {', '.join(known)}"
-            )
-        return names
+        return select(selection, known, {"all": known, SUITE: known}, SUITE)
 
-    def all_tasks(self) -> Sequence[str]:
-        """See `Source`."""
-        return list(tasks())
-
-    def record(self, task: str, seed: int, height: int, width: int) -> RecordedEpisode:
-        """See `Source`. The episode goes on a little beyond success, as people's do."""
+    def scene(self, task: str, height: int, width: int) -> LiberoScene:
+        """See `Suite`."""
         if height != width:
             raise ValueError(f"LIBERO's images are recorded square, got {height} x {width}")
-        simulator = _simulator(task, height)
-        simulator.reset(seed)
-        recorder, steps_left = Recorder(), MAX_STEPS
-        success = False
-        for action in expert_actions(simulator, task, np.random.default_rng(seed)):
-            columns = {
-                "observation.state": simulator.state(),
-                "action": action,
-                OBJECT_POSES: pose_vector(simulator.object_poses()),
-            }
-            recorder.add(simulator.images(), columns)
-            steps_left -= 1
-            if simulator.step(action) and not success:
-                success, steps_left = True, min(steps_left, STEPS_AFTER_SUCCESS)
-            if steps_left == 0:
-                break
-        status = "success" if success else "failed"
-        return recorder.episode(task, simulator.instruction, seed, success, status)
+        return LiberoScene(task, height)
 
     def calibration(self, height: int, width: int) -> dict[str, Any]:
-        """See `Source`."""
-        return calibration_document(height, width)
-
-
-@functools.lru_cache(maxsize=1)
-def _simulator(task: str, image_size: int) -> LiberoSimulator:
-    return LiberoSimulator(task, image_size)
+        """See `Suite`. LeRobot turns robosuite's images by 180 degrees, which leaves them mirrored."""
+        simulator = LiberoSimulator(next(iter(tasks())))
+        simulator.reset(0)
+        model, data, T_world_ee = simulator.sim.model._model, simulator.sim.data._data, simulator.ee_pose()
+        size = height, width
+        found = calibration(model, data, CAMERAS, CAMERA_MOUNTS, T_world_ee, size, mirrored=True)
+        simulator.close()
+        return found

@@ -14,18 +14,20 @@ import functools
 import os
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from lerobot.envs.utils import preprocess_observation
 from lerobot.processor.env_processor import LiberoProcessorStep
 
 from lerobot_openspm.envs.libero.rendering import Renderer
+from lerobot_openspm.geometry.se3 import transform
 
 SUITE = "libero_goal"
 HAND_BODY, GRIP_SITE = "robot0_right_hand", "gripper0_grip_site"
 # LIBERO's cameras, by the names that LeRobot gives their images.
 CAMERAS = {"image": "agentview", "image2": "robot0_eye_in_hand"}
+CAMERA_MOUNTS: dict[str, Literal["world", "ee"]] = {"image": "world", "image2": "ee"}
 # Everything on the table, in the order of the recorded pose vectors.
 OBJECTS = ("bowl", "cheese", "bottle", "plate", "cabinet", "stove", "rack")
 # Objects float or overlap a little after a reset; LeRobot's environment waits as long.
@@ -37,10 +39,15 @@ def tasks() -> dict[str, str]:
     """Names of the suite's tasks with their instructions, in LIBERO's order.
 
     Raises:
+        ValueError: LIBERO is not installed.
         RuntimeError: LIBERO was never set up, and there is nobody to answer its question.
     """
     try:
         from libero.libero import benchmark  # pyright: ignore[reportMissingImports]
+    except ImportError as error:
+        raise ValueError(
+            f"env.type=libero needs LIBERO ({error}); install it with: pip install 'lerobot[libero]'"
+        ) from error
     except EOFError as error:
         raise RuntimeError(
             "LIBERO asks once, when it is first imported, whether its datasets go to a folder of yours, and "
@@ -134,10 +141,8 @@ class LiberoSimulator:
 
     def ee_pose(self) -> np.ndarray:
         """``T_world_ee``, (4, 4)."""
-        T_world_ee = np.eye(4)
-        T_world_ee[:3, :3] = self.sim.data.get_body_xmat(HAND_BODY)
-        T_world_ee[:3, 3] = self.sim.data.get_site_xpos(GRIP_SITE)
-        return T_world_ee
+        data = self.sim.data
+        return transform(data.get_body_xmat(HAND_BODY), data.get_site_xpos(GRIP_SITE))
 
     def finger_positions(self) -> np.ndarray:
         """Positions of the two fingers, (2,), metres, of opposite signs as LIBERO gives them."""
@@ -190,10 +195,7 @@ class LiberoSimulator:
 
     def body_pose(self, name: str) -> np.ndarray:
         """``T_world_body`` (4, 4) of any body of the MuJoCo model."""
-        T_world_body = np.eye(4)
-        T_world_body[:3, :3] = self.sim.data.get_body_xmat(name)
-        T_world_body[:3, 3] = self.sim.data.get_body_xpos(name)
-        return T_world_body
+        return transform(self.sim.data.get_body_xmat(name), self.sim.data.get_body_xpos(name))
 
     def joint_position(self, name: str) -> float:
         """Position of a fixture's joint, metres or radians."""

@@ -5,28 +5,41 @@ They read the true poses and act by the same 7-D actions.
 
 import math
 from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from lerobot_openspm.envs.motions import (
-    LEVEL_ROTATION,
-    TABLETOP_PACE,
+    DOWN,
     Actions,
+    Pace,
     ScriptedHand,
+    in_world,
     pointing_down,
-    pose,
     yaw_matrix,
 )
 from lerobot_openspm.envs.tabletop import scene
-from lerobot_openspm.envs.tabletop.simulator import TabletopSimulator
+from lerobot_openspm.envs.tabletop.simulator import MAX_STEP_M, MAX_STEP_RAD, TabletopSimulator
 from lerobot_openspm.envs.tabletop.tasks import ANY_TASK, TASKS
+from lerobot_openspm.geometry.se3 import transform, yaw_of
+
+TabletopHand = ScriptedHand[TabletopSimulator]
+
+PACE = Pace(
+    MAX_STEP_M, MAX_STEP_RAD, closing_steps=(7, 11), opening_steps=(7, 11), asked_m=MAX_STEP_M,
+    asked_rad=MAX_STEP_RAD,
+)  # fmt: skip
+# Fingers pointing along -x with the camera above: the hand at home, turned by 90 degrees about y.
+LEVEL = Rotation.from_euler("y", 90, degrees=True).as_matrix() @ DOWN
 
 HOVER_Z = 0.21
 CARRY_Z = 0.26
 BOWL_GRASP = np.array([0.0, scene.BOWL_RADIUS - scene.BOWL_WALL / 2, 0.040])
-BOX_GRASP_Z = 0.020
-BOTTLE_GRASP_Z = 0.140
+GRASP_Z = {"box": 0.020, "bottle": 0.140}
 RELEASE_GAP = 0.003
+RETREAT_RISE = 0.12
 # How high the underside of a carried object crosses the table: above the bottle, or above bowl and rack.
 TRANSIT_Z = {"bowl": 0.175, "box": 0.175, "bottle": 0.095}
 DRAWER_PULL = {"drawer_middle": 0.135, "drawer_top": 0.152}
@@ -34,6 +47,8 @@ KNOB_TURN = math.radians(98)
 KNOB_GRASP_Z = 0.053
 # In the cabinet's frame: beside the middle, so that the outer finger finds room in the drawer when it opens.
 BOWL_IN_DRAWER_Y = -0.028
+# Fingertips level with the rim: there is no room to open them inside the bowl.
+BOX_DROP = scene.BOWL_HEIGHT + scene.FINGERTIP_BEYOND_EE - GRASP_Z["box"] - RELEASE_GAP
 PLATE_INNER = scene.PLATE_RADIUS - scene.PLATE_RIM_WIDTH - 0.010
 FINAL_HOLD_STEPS = 15
 
@@ -42,7 +57,7 @@ def expert_actions(
     simulator: TabletopSimulator,
     task: str,
     rng: np.random.Generator,
-    operator: type[ScriptedHand[TabletopSimulator]] = ScriptedHand,
+    operator: type[TabletopHand] = ScriptedHand,
 ) -> Actions:
     """Yield the actions that solve `task` from the simulator's present state.
 
@@ -54,130 +69,80 @@ def expert_actions(
         rng: Source of the demonstration's imperfections.
         operator: Who leads the hand.
     """
-    hand = operator(simulator, rng, TABLETOP_PACE)
+    hand = operator(simulator, rng, PACE)
     for i, part in enumerate(ANY_TASK[task].parts or (task,)):
         if i > 0:
+            # Back up to where every task begins, clear of all that stands on the table.
             hand.closing = False
-            yield from _rise(hand)
+            yield from hand.retreat(scene.HOME_POSITION[2] - float(simulator.ee_pose()[2, 3]))
         yield from EXPERTS[part](hand)
     yield from hand.hold(FINAL_HOLD_STEPS)
 
 
-def _rise(hand: ScriptedHand) -> Actions:
-    """Up to where every task begins, clear of all that stands on the table."""
-    T_world_ee = hand.simulator.ee_pose()
-    yield from _retreat(hand, scene.HOME_POSITION[2] - float(T_world_ee[2, 3]))
+@dataclass(frozen=True)
+class Put:
+    """What to pick up, how high to lift it, and the point of which object's frame its origin goes to."""
+
+    name: str
+    carry_z: float
+    support: str
+    goal: tuple[float, float, float]
 
 
-def _above(point: np.ndarray, z: float) -> np.ndarray:
-    return np.array([point[0], point[1], z])
+def _put(put: Put, hand: TabletopHand) -> Actions:
+    yield from _pick(hand, put.name, put.carry_z)
+    yield from _place(hand, put.name, in_world(hand.frame(put.support), put.goal))
 
 
-def _yaw(T_world_obj: np.ndarray) -> float:
-    return math.atan2(T_world_obj[1, 0], T_world_obj[0, 0])
-
-
-def _in_frame(T_world_obj: np.ndarray, x: float, y: float, z: float) -> np.ndarray:
-    return T_world_obj[:3, :3] @ np.array([x, y, z]) + T_world_obj[:3, 3]
-
-
-def _pick(hand: ScriptedHand, grasp: np.ndarray, yaw: float, carry_z: float) -> Actions:
-    """Grasp from above at a world point (3,) and lift to `carry_z`."""
+def _pick(hand: TabletopHand, name: str, carry_z: float) -> Actions:
+    """Grasp an object from above and lift it until the hand is at `carry_z`."""
+    T_world_obj, yaw = hand.frame(name), 0.0
+    if name == "bowl":
+        # Always the same side of the world: the bowl looks alike from everywhere, its yaw cannot be followed.
+        grasp = T_world_obj[:3, 3] + BOWL_GRASP
+    else:
+        grasp = _at_height(T_world_obj[:3, 3], GRASP_Z[name])
+    if name == "box":
+        # Half a turn of the box looks the same: take the smaller turn of the hand.
+        yaw = math.remainder(yaw_of(T_world_obj), math.pi)
     offset, turn = hand.grasp_noise()
     grasp, yaw = grasp + offset, yaw + turn
-    yield from hand.travel(pointing_down(_above(grasp, max(HOVER_Z, grasp[2] + 0.07)), yaw))
+    yield from hand.travel(pointing_down(_at_height(grasp, max(HOVER_Z, grasp[2] + 0.07)), yaw))
     yield from hand.advance(pointing_down(grasp, yaw))
     yield from hand.grip(closing=True)
-    yield from hand.travel(pointing_down(_above(grasp, carry_z), yaw))
+    yield from hand.travel(pointing_down(_at_height(grasp, carry_z), yaw))
 
 
-def _place(hand: ScriptedHand, name: str, goal: np.ndarray) -> Actions:
+def _place(hand: TabletopHand, name: str, goal: np.ndarray) -> Actions:
     """Put the grasped object's origin at a world point (3,), let go and retreat upwards."""
     release = goal + hand.grasp_noise()[0] + np.array([0.0, 0.0, RELEASE_GAP])
     approach = max(0.05, TRANSIT_Z[name] - release[2])
     yield from hand.travel(_carried(hand, name, release + np.array([0.0, 0.0, approach])))
     yield from hand.advance(_carried(hand, name, release))
     yield from hand.grip(closing=False)
-    yield from _retreat(hand)
+    yield from hand.retreat(RETREAT_RISE)
 
 
-def _carried(hand: ScriptedHand, name: str, goal: np.ndarray) -> np.ndarray:
-    """T_world_ee that brings the grasped object to a world point (3,), the hand keeping its orientation."""
+def _carried(hand: TabletopHand, name: str, goal: np.ndarray) -> np.ndarray:
+    """T_world_ee that brings the grasped object to a world point (3,), the hand keeping its yaw."""
     T_world_ee = hand.simulator.ee_pose()
-    moved = T_world_ee[:3, 3] + goal - hand.simulator.object_poses()[name][:3, 3]
-    yaw = math.atan2(T_world_ee[1, 0], T_world_ee[0, 0])
-    return pointing_down(moved, yaw)
+    return pointing_down(T_world_ee[:3, 3] + goal - hand.origin(name), float(yaw_of(T_world_ee)))
 
 
-def _retreat(hand: ScriptedHand, height: float = 0.12) -> Actions:
-    T_world_ee = hand.simulator.ee_pose()
-    T_world_ee[2, 3] += height
-    yield from hand.travel(T_world_ee)
+def _at_height(point: np.ndarray, z: float) -> np.ndarray:
+    return np.array([point[0], point[1], z])
 
 
-def _pick_bowl(hand: ScriptedHand, carry_z: float = CARRY_Z) -> Actions:
-    # Always the same side of the world: the bowl looks alike from everywhere, so its yaw cannot be followed.
-    bowl = hand.simulator.object_poses()["bowl"][:3, 3]
-    yield from _pick(hand, bowl + BOWL_GRASP, 0.0, carry_z)
-
-
-def _bowl_on_plate(hand: ScriptedHand) -> Actions:
-    yield from _pick_bowl(hand)
-    yield from _place(
-        hand, "bowl", _in_frame(hand.simulator.object_poses()["plate"], 0, 0, scene.PLATE_FLOOR)
-    )
-
-
-def _bowl_on_stove(hand: ScriptedHand) -> Actions:
-    yield from _pick_bowl(hand)
-    stove = hand.simulator.object_poses()["stove"]
-    yield from _place(hand, "bowl", _in_frame(stove, scene.BURNER_X, 0, scene.BURNER_TOP))
-
-
-def _bowl_on_cabinet(hand: ScriptedHand) -> Actions:
-    yield from _pick_bowl(hand, carry_z=scene.CABINET_HEIGHT + 0.12)
-    cabinet = hand.simulator.object_poses()["cabinet"]
-    yield from _place(hand, "bowl", _in_frame(cabinet, 0, 0, scene.CABINET_HEIGHT))
-
-
-def _box_in_bowl(hand: ScriptedHand) -> Actions:
-    poses = hand.simulator.object_poses()
-    box = poses["box"]
-    # Half a turn of the box looks the same: take the smaller turn of the hand.
-    yaw = math.remainder(_yaw(box), math.pi)
-    yield from _pick(hand, _above(box[:3, 3], BOX_GRASP_Z), yaw, CARRY_Z)
-    # Fingertips level with the rim: there is no room to open them inside the bowl.
-    drop = scene.BOWL_HEIGHT + scene.FINGERTIP_BEYOND_EE - BOX_GRASP_Z - RELEASE_GAP
-    yield from _place(hand, "box", _in_frame(hand.simulator.object_poses()["bowl"], 0, 0, drop))
-
-
-def _pick_bottle(hand: ScriptedHand, carry_z: float) -> Actions:
-    bottle = hand.simulator.object_poses()["bottle"][:3, 3]
-    yield from _pick(hand, _above(bottle, BOTTLE_GRASP_Z), 0.0, carry_z)
-
-
-def _bottle_on_cabinet(hand: ScriptedHand) -> Actions:
-    yield from _pick_bottle(hand, BOTTLE_GRASP_Z + scene.CABINET_HEIGHT + 0.06)
-    cabinet = hand.simulator.object_poses()["cabinet"]
-    yield from _place(hand, "bottle", _in_frame(cabinet, 0, 0, scene.CABINET_HEIGHT))
-
-
-def _bottle_on_rack(hand: ScriptedHand) -> Actions:
-    yield from _pick_bottle(hand, BOTTLE_GRASP_Z + 0.13)
-    rack = hand.simulator.object_poses()["rack"]
-    yield from _place(hand, "bottle", _in_frame(rack, 0, 0, scene.RACK_SHELF_HEIGHT))
-
-
-def _open_drawer(hand: ScriptedHand, name: str) -> Actions:
+def _open_drawer(name: str, hand: TabletopHand) -> Actions:
     """Take the handle from the front with a level hand, pull along the drawer's axis, let go and back off."""
-    cabinet = hand.simulator.object_poses()["cabinet"]
+    cabinet = hand.frame("cabinet")
     offset, turn = hand.grasp_noise()
-    rotation = yaw_matrix(_yaw(cabinet) + turn) @ LEVEL_ROTATION
+    rotation = yaw_matrix(float(yaw_of(cabinet)) + turn) @ LEVEL
     height = scene.handle_height(scene.DRAWER_NAMES.index(name)) + float(offset[0])
     bar = scene.HANDLE_X + float(offset[1])
 
     def at(x: float, z: float) -> np.ndarray:
-        return pose(_in_frame(cabinet, x, 0.0, z), rotation)
+        return transform(rotation, in_world(cabinet, (x, 0.0, z)))
 
     yield from hand.travel(at(bar + 0.10, height + 0.16))
     yield from hand.travel(at(bar + 0.08, height))
@@ -188,64 +153,63 @@ def _open_drawer(hand: ScriptedHand, name: str) -> Actions:
     yield from hand.travel(at(bar + DRAWER_PULL[name] + 0.07, height))
 
 
-def _open_middle_drawer(hand: ScriptedHand) -> Actions:
-    yield from _open_drawer(hand, "drawer_middle")
-
-
-def _bowl_in_top_drawer(hand: ScriptedHand) -> Actions:
-    yield from _open_drawer(hand, "drawer_top")
-    yield from _retreat(hand, 0.10)
-    yield from _pick_bowl(hand, carry_z=0.32)
-    cabinet = hand.simulator.object_poses()["cabinet"]
+def _bowl_in_top_drawer(hand: TabletopHand) -> Actions:
+    yield from _open_drawer("drawer_top", hand)
+    yield from hand.retreat(0.10)
+    yield from _pick(hand, "bowl", carry_z=0.32)
     front = scene.CABINET_HALF[0] + hand.simulator.joint_position("drawer_top")
     middle = (scene.CABINET_HALF[0] + front) / 2
-    goal = _in_frame(cabinet, middle, BOWL_IN_DRAWER_Y, scene.drawer_height(2) + 0.008)
-    yield from _place(hand, "bowl", goal)
+    goal = (middle, BOWL_IN_DRAWER_Y, scene.drawer_height(2) + 0.008)
+    yield from _place(hand, "bowl", in_world(hand.frame("cabinet"), goal))
 
 
-def _push_plate(hand: ScriptedHand) -> Actions:
+def _push_plate(hand: TabletopHand) -> Actions:
     """Lower the closed fingers into the plate and drag it by its inner rim; it centres itself behind them."""
-    poses = hand.simulator.object_poses()
-    goal = _in_frame(poses["stove"], scene.PLATE_GOAL_X, 0, 0)[:2]
-    plate = poses["plate"][:2, 3]
+    goal = in_world(hand.frame("stove"), (scene.PLATE_GOAL_X, 0, 0))[:2]
+    plate = hand.origin("plate")[:2]
     way = (goal - plate) / np.linalg.norm(goal - plate)
     z = scene.PLATE_FLOOR + scene.FINGERTIP_BEYOND_EE + 0.003
     hand.closing = True
     start = np.append(plate + way * 0.03, z) + hand.grasp_noise()[0]
-    yield from hand.travel(pointing_down(_above(start, 0.12)))
+    yield from hand.travel(pointing_down(_at_height(start, 0.12)))
     yield from hand.advance(pointing_down(start))
     yield from hand.advance(pointing_down(np.append(goal + way * PLATE_INNER, z)), slowness=0.6)
     for _ in range(3):
-        error = goal - hand.simulator.object_poses()["plate"][:2, 3]
-        short = float(error @ way)
+        short = float((goal - hand.origin("plate")[:2]) @ way)
         if short < 0.008:
             break
         ee = hand.simulator.ee_pose()[:2, 3]
         yield from hand.advance(pointing_down(np.append(ee + way * short, z)), slowness=0.4)
-    yield from _retreat(hand)
+    yield from hand.retreat(RETREAT_RISE)
 
 
-def _turn_on_stove(hand: ScriptedHand) -> Actions:
-    stove = hand.simulator.object_poses()["stove"]
+def _turn_on_stove(hand: TabletopHand) -> Actions:
+    stove = hand.frame("stove")
     offset, turn = hand.grasp_noise()
-    grasp = _in_frame(stove, scene.KNOB_X, 0, KNOB_GRASP_Z) + offset
-    yaw = _yaw(stove) + turn
-    yield from hand.travel(pointing_down(_above(grasp, 0.15), yaw))
+    grasp = in_world(stove, (scene.KNOB_X, 0, KNOB_GRASP_Z)) + offset
+    yaw = float(yaw_of(stove)) + turn
+    yield from hand.travel(pointing_down(_at_height(grasp, 0.15), yaw))
     yield from hand.advance(pointing_down(grasp, yaw))
     yield from hand.grip(closing=True)
     yield from hand.advance(pointing_down(grasp, yaw + KNOB_TURN), slowness=0.8)
     yield from hand.grip(closing=False)
-    yield from _retreat(hand)
+    yield from hand.retreat(RETREAT_RISE)
 
 
-EXPERTS: dict[str, Callable[[ScriptedHand], Actions]] = {
-    "bowl_on_plate": _bowl_on_plate,
-    "bowl_on_stove": _bowl_on_stove,
-    "bowl_on_cabinet": _bowl_on_cabinet,
-    "box_in_bowl": _box_in_bowl,
-    "bottle_on_cabinet": _bottle_on_cabinet,
-    "bottle_on_rack": _bottle_on_rack,
-    "open_middle_drawer": _open_middle_drawer,
+_CABINET_TOP = (0, 0, scene.CABINET_HEIGHT)
+_PUTS = {
+    "bowl_on_plate": Put("bowl", CARRY_Z, "plate", (0, 0, scene.PLATE_FLOOR)),
+    "bowl_on_stove": Put("bowl", CARRY_Z, "stove", (scene.BURNER_X, 0, scene.BURNER_TOP)),
+    "bowl_on_cabinet": Put("bowl", scene.CABINET_HEIGHT + 0.12, "cabinet", _CABINET_TOP),
+    "box_in_bowl": Put("box", CARRY_Z, "bowl", (0, 0, BOX_DROP)),
+    "bottle_on_cabinet": Put(
+        "bottle", GRASP_Z["bottle"] + scene.CABINET_HEIGHT + 0.06, "cabinet", _CABINET_TOP
+    ),
+    "bottle_on_rack": Put("bottle", GRASP_Z["bottle"] + 0.13, "rack", (0, 0, scene.RACK_SHELF_HEIGHT)),
+}
+EXPERTS: dict[str, Callable[[TabletopHand], Actions]] = {
+    **{task: partial(_put, put) for task, put in _PUTS.items()},
+    "open_middle_drawer": partial(_open_drawer, "drawer_middle"),
     "bowl_in_top_drawer": _bowl_in_top_drawer,
     "push_plate": _push_plate,
     "turn_on_stove": _turn_on_stove,

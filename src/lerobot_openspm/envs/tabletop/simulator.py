@@ -1,29 +1,21 @@
-"""The MuJoCo side of the tabletop: physics, the hand's bounded drive, contacts, true poses and rendering."""
+"""The MuJoCo side of the tabletop: physics, the hand's bounded drive, contacts and true poses."""
 
 # mujoco ships no stubs for its compiled part.
 # pyright: reportAttributeAccessIssue=false
 
-import atexit
 import copy
 import functools
 import math
-import weakref
-from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from lerobot_openspm.envs.gl_backend import rendering_error, set_default_gl_backend
+from lerobot_openspm.envs.motions import DOWN
 from lerobot_openspm.envs.tabletop import scene
+from lerobot_openspm.envs.tabletop.mjcf import build_mjcf
 from lerobot_openspm.envs.tabletop.placement import Placement
-
-set_default_gl_backend()
-
-# After the choice of the backend: mujoco loads it on import, and fails there when its libraries are missing.
-try:
-    import mujoco
-except (ImportError, AttributeError, OSError, RuntimeError) as error:
-    raise rendering_error(error) from error
+from lerobot_openspm.envs.tabletop.rendering import Renderer, mujoco
+from lerobot_openspm.geometry.se3 import transform
 
 CONTROL_PERIOD_S = 0.05
 # The target moves in this many equal parts per control step, so that the hand is pulled smoothly.
@@ -37,7 +29,6 @@ MAX_LEAD_RAD = 0.30
 WORKSPACE_LOW = np.array([-0.40, -0.46, 0.010])
 WORKSPACE_HIGH = np.array([0.50, 0.46, 0.58])
 SETTLE_STEPS = 120
-HOME_ROTATION = np.diag([1.0, -1.0, -1.0])
 FINGER_OPEN_M = scene.FINGER_TRAVEL
 # Beyond closed, so that the position drive keeps pressing on whatever is between the fingers.
 FINGER_CLOSED_M = -0.02
@@ -47,7 +38,7 @@ HAND_BODIES = ("hand", "finger_left", "finger_right")
 @functools.cache
 def compiled_model(second_bowl: bool = False) -> mujoco.MjModel:
     """Compile a scene once per process; every simulator works on its own copy."""
-    return mujoco.MjModel.from_xml_string(scene.build_mjcf(second_bowl))
+    return mujoco.MjModel.from_xml_string(build_mjcf(second_bowl))
 
 
 def _bounded(vector: np.ndarray, limit: float) -> np.ndarray:
@@ -65,7 +56,6 @@ class TabletopSimulator:
     def __init__(self, second_bowl: bool = False) -> None:
         self.model: mujoco.MjModel = copy.copy(compiled_model(second_bowl))
         self.data = mujoco.MjData(self.model)
-        self._renderers: dict[tuple[int, int], Any] = {}
         self._movable = (*scene.MOVABLE_NAMES, *((scene.SECOND_BOWL,) if second_bowl else ()))
         fingers = ("finger_left", "finger_right")
         bodies = ("hand", *scene.OBJECT_NAMES, *self._movable, *scene.DRAWER_NAMES, "knob", *fingers)
@@ -74,9 +64,9 @@ class TabletopSimulator:
         self._qpos = {n: int(self.model.joint(n).qposadr[0]) for n in joints}
         self._dof = {n: int(self.model.joint(n).dofadr[0]) for n in joints}
         self._hand_bodies = {self._body[n] for n in HAND_BODIES}
-        self._geom_labels = self._label_geoms()
+        self._renderer = Renderer(self.model, self._label_geoms())
         self._target_position = np.array(scene.HOME_POSITION)
-        self._target_rotation = HOME_ROTATION.copy()
+        self._target_rotation = DOWN.copy()
 
     def reset(self, layout: dict[str, Placement]) -> None:
         """Place every object, put the hand home with open fingers and let the scene settle."""
@@ -94,7 +84,7 @@ class TabletopSimulator:
         self.data.qpos[self._qpos["finger_left"]] = FINGER_OPEN_M
         self.data.qpos[self._qpos["finger_right"]] = -FINGER_OPEN_M
         self._target_position = np.array(scene.HOME_POSITION)
-        self._target_rotation = HOME_ROTATION.copy()
+        self._target_rotation = DOWN.copy()
         self._drive_fingers(closing=False)
         self._write_target(self._target_position, self._target_rotation)
         mujoco.mj_step(self.model, self.data, SETTLE_STEPS)
@@ -149,10 +139,7 @@ class TabletopSimulator:
 
     def _pose(self, body: str) -> np.ndarray:
         index = self._body[body]
-        pose = np.eye(4)
-        pose[:3, :3] = self.data.xmat[index].reshape(3, 3)
-        pose[:3, 3] = self.data.xpos[index]
-        return pose
+        return transform(self.data.xmat[index].reshape(3, 3), self.data.xpos[index])
 
     def finger_positions(self) -> np.ndarray:
         """(2,) metres: left is positive, right negative, as in LIBERO; (0.04, -0.04) is open.
@@ -207,51 +194,19 @@ class TabletopSimulator:
         return warned or not bool(np.isfinite(self.data.qpos).all() and np.isfinite(self.data.qvel).all())
 
     def render(self, camera: str, height: int, width: int) -> np.ndarray:
-        """Render a camera to an upright (height, width, 3) uint8 RGB image.
-
-        Raises:
-            RenderingUnavailableError: The OpenGL stack of this machine is incomplete.
-        """
-        return np.ascontiguousarray(self._looking_through(camera, height, width).render())
+        """A camera's upright RGB image, (height, width, 3) uint8."""
+        return self._renderer.image(self.data, camera, height, width)
 
     def render_labels(self, camera: str, height: int, width: int) -> np.ndarray:
         """Number of the object that each pixel shows, (height, width) int32, as in `scene.OBJECT_LABELS`.
 
         Drawers and their handles are the cabinet's, the knob is the stove's; 0 is the hand and the room.
-
-        Raises:
-            RenderingUnavailableError: The OpenGL stack of this machine is incomplete.
         """
-        renderer = self._looking_through(camera, height, width)
-        renderer.enable_segmentation_rendering()
-        try:
-            geoms, kinds = np.moveaxis(renderer.render(), -1, 0)
-        finally:
-            renderer.disable_segmentation_rendering()
-        is_geom = kinds == mujoco.mjtObj.mjOBJ_GEOM
-        return np.where(is_geom, self._geom_labels[np.where(is_geom, geoms, 0)], 0).astype(np.int32)
+        return self._renderer.labels(self.data, camera, height, width)
 
     def render_depth(self, camera: str, height: int, width: int) -> np.ndarray:
-        """Distance along the optical axis of what each pixel shows, (height, width) float32 metres.
-
-        Raises:
-            RenderingUnavailableError: The OpenGL stack of this machine is incomplete.
-        """
-        renderer = self._looking_through(camera, height, width)
-        renderer.enable_depth_rendering()
-        try:
-            return np.array(renderer.render())
-        finally:
-            renderer.disable_depth_rendering()
-
-    def _looking_through(self, camera: str, height: int, width: int) -> Any:
-        renderer = self._renderers.get((height, width))
-        if renderer is None:
-            renderer = self._renderers[(height, width)] = _make_renderer(self.model, height, width)
-            # mujoco shuts EGL down at exit; registered after that hook, this one runs before it.
-            atexit.register(_close_at_exit, weakref.ref(self))
-        renderer.update_scene(self.data, camera=camera)
-        return renderer
+        """Distance along the optical axis of what each pixel shows, (height, width) float32 metres."""
+        return self._renderer.depth(self.data, camera, height, width)
 
     def _label_geoms(self) -> np.ndarray:
         """Number of each geom's object, (ngeom,); drawers and knob hang on their objects."""
@@ -264,22 +219,5 @@ class TabletopSimulator:
         return labels
 
     def close(self) -> None:
-        """Free the renderers' OpenGL contexts."""
-        while self._renderers:
-            self._renderers.popitem()[1].close()
-
-
-def _close_at_exit(reference: "weakref.ref[TabletopSimulator]") -> None:
-    simulator = reference()
-    if simulator is not None:
-        simulator.close()
-
-
-def _make_renderer(model: mujoco.MjModel, height: int, width: int) -> Any:
-    try:
-        renderer = mujoco.Renderer(model, height, width)
-    except (RuntimeError, ImportError, AttributeError, OSError, mujoco.FatalError) as error:
-        raise rendering_error(error) from error
-    renderer.scene.flags[mujoco.mjtRndFlag.mjRND_SHADOW] = False
-    renderer.scene.flags[mujoco.mjtRndFlag.mjRND_REFLECTION] = False
-    return renderer
+        """Free what OpenGL holds."""
+        self._renderer.close()

@@ -1,8 +1,10 @@
 """The ten tasks: their instructions, and the physical predicates that say when one is done.
 
-Beside them, five tasks that are made of the ten: their parts can be demonstrated and the whole never is. And
-five of the ten's goals with a second bowl on the table: the instruction says which of the two is meant.
+Beside them, five tasks that are made of two of the ten: the parts can be demonstrated, the whole never is.
+And five of the ten with a second bowl on the table, where the instruction says which bowl is meant.
 """
+
+from __future__ import annotations
 
 import math
 from collections.abc import Callable
@@ -11,10 +13,13 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from lerobot_openspm.envs.selection import select
 from lerobot_openspm.envs.tabletop import scene, two_bowls
 
 if TYPE_CHECKING:
     from lerobot_openspm.envs.tabletop.simulator import TabletopSimulator
+
+    Predicate = Callable[[TabletopSimulator], bool]
 
 DRAWER_OPEN_M = 0.10
 KNOB_ON_RAD = math.radians(75)
@@ -23,26 +28,26 @@ STEPS_PER_PART = 300
 UPRIGHT_COSINE = math.cos(math.radians(20))
 
 
-def _local(simulator: "TabletopSimulator", name: str, frame: str) -> np.ndarray:
+def _local(simulator: TabletopSimulator, name: str, frame: str) -> np.ndarray:
     """Origin of object `name` in the frame of object `frame`, (3,) metres."""
     poses = simulator.object_poses()
     return (np.linalg.inv(poses[frame]) @ poses[name])[:3, 3]
 
 
-def _is_upright(simulator: "TabletopSimulator", name: str) -> bool:
+def _is_upright(simulator: TabletopSimulator, name: str) -> bool:
     return bool(simulator.object_poses()[name][2, 2] > UPRIGHT_COSINE)
 
 
-def _is_left_on(simulator: "TabletopSimulator", name: str, support: str) -> bool:
+def _is_left_on(simulator: TabletopSimulator, name: str, support: str) -> bool:
     """At rest, touching the support and not the hand."""
     touched = simulator.touching(name)
     return support in touched and "hand" not in touched and simulator.is_at_rest(name)
 
 
-def _rests_near(
-    name: str, support: str, radius: float, centre_x: float = 0.0
-) -> Callable[["TabletopSimulator"], bool]:
-    def done(simulator: "TabletopSimulator") -> bool:
+def _rests_near(name: str, support: str, radius: float, centre_x: float = 0.0) -> Predicate:
+    """Whether an object was left within `radius` of a point on the x axis of another one's frame."""
+
+    def done(simulator: TabletopSimulator) -> bool:
         offset = _local(simulator, name, support)
         near = math.hypot(offset[0] - centre_x, offset[1]) < radius
         return near and _is_upright(simulator, name) and _is_left_on(simulator, name, support)
@@ -50,10 +55,10 @@ def _rests_near(
     return done
 
 
-def _rests_within(
-    name: str, support: str, half: tuple[float, float], height: float
-) -> Callable[["TabletopSimulator"], bool]:
-    def done(simulator: "TabletopSimulator") -> bool:
+def _rests_within(name: str, support: str, half: tuple[float, float], height: float) -> Predicate:
+    """Whether an object was left within half widths of another one's middle, at a height in its frame."""
+
+    def done(simulator: TabletopSimulator) -> bool:
         offset = _local(simulator, name, support)
         inside = abs(offset[0]) < half[0] and abs(offset[1]) < half[1] and abs(offset[2] - height) < 0.01
         return inside and _is_upright(simulator, name) and _is_left_on(simulator, name, support)
@@ -61,7 +66,7 @@ def _rests_within(
     return done
 
 
-def _box_in_bowl(simulator: "TabletopSimulator") -> bool:
+def _box_in_bowl(simulator: TabletopSimulator) -> bool:
     offset = _local(simulator, "box", "bowl")
     inside = (
         math.hypot(offset[0], offset[1]) < scene.BOWL_RADIUS - 0.01 and offset[2] < scene.BOWL_HEIGHT - 0.005
@@ -69,13 +74,13 @@ def _box_in_bowl(simulator: "TabletopSimulator") -> bool:
     return inside and _is_upright(simulator, "bowl") and _is_left_on(simulator, "box", "bowl")
 
 
-def _middle_drawer_open(simulator: "TabletopSimulator") -> bool:
+def _middle_drawer_open(simulator: TabletopSimulator) -> bool:
     name = "drawer_middle"
     is_open = simulator.joint_position(name) > DRAWER_OPEN_M and simulator.is_at_rest(name)
     return is_open and "hand" not in simulator.touching(name)
 
 
-def _bowl_in_top_drawer(simulator: "TabletopSimulator") -> bool:
+def _bowl_in_top_drawer(simulator: TabletopSimulator) -> bool:
     offset = _local(simulator, "bowl", "cabinet")
     front = scene.DRAWER_FRONT_X - 0.01 + simulator.joint_position("drawer_top")
     floor = scene.drawer_height(2) + 0.008
@@ -83,13 +88,13 @@ def _bowl_in_top_drawer(simulator: "TabletopSimulator") -> bool:
     return bool(inside) and _is_left_on(simulator, "bowl", "drawer_top")
 
 
-def _plate_before_stove(simulator: "TabletopSimulator") -> bool:
+def _plate_before_stove(simulator: TabletopSimulator) -> bool:
     offset = _local(simulator, "plate", "stove")
     near = math.hypot(offset[0] - scene.PLATE_GOAL_X, offset[1]) < PLATE_TOLERANCE_M
     return near and _is_left_on(simulator, "plate", "world")
 
 
-def _stove_on(simulator: "TabletopSimulator") -> bool:
+def _stove_on(simulator: TabletopSimulator) -> bool:
     turned = simulator.joint_position("knob") > KNOB_ON_RAD and simulator.is_at_rest("knob")
     return turned and "hand" not in simulator.touching("knob")
 
@@ -109,153 +114,100 @@ class Task:
 
     name: str
     instruction: str
-    is_done: Callable[["TabletopSimulator"], bool]
+    is_done: Predicate
     parts: tuple[str, ...] = ()
-    is_clear: Callable[[two_bowls.Layout], bool] | None = None
+    is_clear: two_bowls.Condition | None = None
 
     @property
     def max_steps(self) -> int:
-        """Control steps after which an episode ends by default: so many for each part."""
+        """Control steps after which an episode ends by default: `STEPS_PER_PART` for each part."""
         return STEPS_PER_PART * max(1, len(self.parts))
+
+
+def _by_name(*tasks: Task) -> dict[str, Task]:
+    return {task.name: task for task in tasks}
 
 
 _CABINET_TOP = ((scene.CABINET_HALF[0] - 0.01, scene.CABINET_HALF[1] - 0.01), scene.CABINET_HEIGHT)
 _RACK_SHELF = ((scene.RACK_HALF[0], scene.RACK_HALF[1] - 0.01), scene.RACK_SHELF_HEIGHT)
+_BOTTLE_ON_CABINET = _rests_within("bottle", "cabinet", *_CABINET_TOP)
+_BOTTLE_ON_RACK = _rests_within("bottle", "rack", *_RACK_SHELF)
+_BOWL_ON_CABINET = _rests_within("bowl", "cabinet", *_CABINET_TOP)
+_BOWL_ON_PLATE = _rests_near("bowl", "plate", 0.035)
+_BOWL_ON_STOVE = _rests_near("bowl", "stove", 0.05, scene.BURNER_X)
 
-TASKS: dict[str, Task] = {
-    task.name: task
-    for task in (
-        Task("bowl_on_plate", "put the bowl on the plate", _rests_near("bowl", "plate", 0.035)),
-        Task(
-            "bowl_on_stove", "put the bowl on the stove", _rests_near("bowl", "stove", 0.05, scene.BURNER_X)
-        ),
-        Task(
-            "bowl_on_cabinet",
-            "put the bowl on top of the cabinet",
-            _rests_within("bowl", "cabinet", *_CABINET_TOP),
-        ),
-        Task("box_in_bowl", "put the cream cheese box in the bowl", _box_in_bowl),
-        Task(
-            "bottle_on_cabinet",
-            "put the wine bottle on top of the cabinet",
-            _rests_within("bottle", "cabinet", *_CABINET_TOP),
-        ),
-        Task(
-            "bottle_on_rack", "put the wine bottle on the rack", _rests_within("bottle", "rack", *_RACK_SHELF)
-        ),
-        Task("open_middle_drawer", "open the middle drawer of the cabinet", _middle_drawer_open),
-        Task("bowl_in_top_drawer", "open the top drawer and put the bowl inside", _bowl_in_top_drawer),
-        Task("push_plate", "push the plate to the front of the stove", _plate_before_stove),
-        Task("turn_on_stove", "turn on the stove", _stove_on),
-    )
-}
+TASKS = _by_name(
+    Task("bowl_on_plate", "put the bowl on the plate", _BOWL_ON_PLATE),
+    Task("bowl_on_stove", "put the bowl on the stove", _BOWL_ON_STOVE),
+    Task("bowl_on_cabinet", "put the bowl on top of the cabinet", _BOWL_ON_CABINET),
+    Task("box_in_bowl", "put the cream cheese box in the bowl", _box_in_bowl),
+    Task("bottle_on_cabinet", "put the wine bottle on top of the cabinet", _BOTTLE_ON_CABINET),
+    Task("bottle_on_rack", "put the wine bottle on the rack", _BOTTLE_ON_RACK),
+    Task("open_middle_drawer", "open the middle drawer of the cabinet", _middle_drawer_open),
+    Task("bowl_in_top_drawer", "open the top drawer and put the bowl inside", _bowl_in_top_drawer),
+    Task("push_plate", "push the plate to the front of the stove", _plate_before_stove),
+    Task("turn_on_stove", "turn on the stove", _stove_on),
+)
 TASK_NAMES = tuple(TASKS)
 
 
-def _compound(name: str, instruction: str, *parts: str) -> Task:
+def _compound(name: str, *parts: str) -> Task:
     """A task whose goal is that the goals of all its parts hold at the same time."""
 
-    def done(simulator: "TabletopSimulator") -> bool:
+    def done(simulator: TabletopSimulator) -> bool:
         return all(TASKS[part].is_done(simulator) for part in parts)
 
-    return Task(name, instruction, done, parts)
+    return Task(name, " and ".join(TASKS[part].instruction for part in parts), done, parts)
 
 
 # Not among "all": nothing demonstrates them as a whole. The third and the fourth depend on their order: the
 # second part takes place where the first one has put something.
-COMPOUND_TASKS: dict[str, Task] = {
-    task.name: task
-    for task in (
-        _compound(
-            "bowl_on_plate_then_stove",
-            "put the bowl on the plate and turn on the stove",
-            "bowl_on_plate",
-            "turn_on_stove",
-        ),
-        _compound(
-            "bottle_on_rack_then_box_in_bowl",
-            "put the wine bottle on the rack and put the cream cheese box in the bowl",
-            "bottle_on_rack",
-            "box_in_bowl",
-        ),
-        _compound(
-            "bowl_on_plate_then_box_in_bowl",
-            "put the bowl on the plate and put the cream cheese box in the bowl",
-            "bowl_on_plate",
-            "box_in_bowl",
-        ),
-        _compound(
-            "push_plate_then_bowl_on_plate",
-            "push the plate to the front of the stove and put the bowl on the plate",
-            "push_plate",
-            "bowl_on_plate",
-        ),
-        _compound(
-            "open_drawer_then_bottle_on_cabinet",
-            "open the middle drawer of the cabinet and put the wine bottle on top of the cabinet",
-            "open_middle_drawer",
-            "bottle_on_cabinet",
-        ),
-    )
-}
-COMPOUND_TASK_NAMES = tuple(COMPOUND_TASKS)
+COMPOUND_TASKS = _by_name(
+    _compound("bowl_on_plate_then_stove", "bowl_on_plate", "turn_on_stove"),
+    _compound("bottle_on_rack_then_box_in_bowl", "bottle_on_rack", "box_in_bowl"),
+    _compound("bowl_on_plate_then_box_in_bowl", "bowl_on_plate", "box_in_bowl"),
+    _compound("push_plate_then_bowl_on_plate", "push_plate", "bowl_on_plate"),
+    _compound("open_drawer_then_bottle_on_cabinet", "open_middle_drawer", "bottle_on_cabinet"),
+)
 
 
-def _of_two_bowls(
-    name: str, instruction: str, like: str, is_clear: Callable[[two_bowls.Layout], bool]
-) -> Task:
-    """A task of the ten, done with the one of two bowls that the instruction tells."""
+def _of_two_bowls(name: str, like: str, instruction: str, is_clear: two_bowls.Condition) -> Task:
+    """A task of the ten, done with the one of two bowls that the instruction names."""
     return Task(name, instruction, TASKS[like].is_done, (like,), is_clear)
 
 
 # Not among "all" either: no demonstration shows two bowls.
-TWO_BOWL_TASKS: dict[str, Task] = {
-    task.name: task
-    for task in (
-        _of_two_bowls(
-            "bowl_next_to_rack_on_plate",
-            "pick up the bowl next to the rack and put it on the plate",
-            "bowl_on_plate",
-            two_bowls.next_to("rack"),
-        ),
-        _of_two_bowls(
-            "bowl_between_plate_and_box_on_stove",
-            "put the bowl between the plate and the cream cheese box on the stove",
-            "bowl_on_stove",
-            two_bowls.between("plate", "box"),
-        ),
-        _of_two_bowls(
-            "bowl_next_to_box_on_cabinet",
-            "pick up the bowl next to the cream cheese box and place it on top of the cabinet",
-            "bowl_on_cabinet",
-            two_bowls.next_to("box"),
-        ),
-        _of_two_bowls(
-            "left_bowl_on_plate", "put the left bowl on the plate", "bowl_on_plate", two_bowls.left
-        ),
-        _of_two_bowls(
-            "right_bowl_on_stove", "put the right bowl on the stove", "bowl_on_stove", two_bowls.right
-        ),
-    )
-}
-# Every task that can be named; the place of a name here is the task's number.
+TWO_BOWL_TASKS = _by_name(
+    _of_two_bowls(
+        "bowl_next_to_rack_on_plate",
+        "bowl_on_plate",
+        "pick up the bowl next to the rack and put it on the plate",
+        two_bowls.next_to("rack"),
+    ),
+    _of_two_bowls(
+        "bowl_between_plate_and_box_on_stove",
+        "bowl_on_stove",
+        "put the bowl between the plate and the cream cheese box on the stove",
+        two_bowls.between("plate", "box"),
+    ),
+    _of_two_bowls(
+        "bowl_next_to_box_on_cabinet",
+        "bowl_on_cabinet",
+        "pick up the bowl next to the cream cheese box and place it on top of the cabinet",
+        two_bowls.next_to("box"),
+    ),
+    _of_two_bowls("left_bowl_on_plate", "bowl_on_plate", "put the left bowl on the plate", two_bowls.left),
+    _of_two_bowls("right_bowl_on_stove", "bowl_on_stove", "put the right bowl on the stove", two_bowls.right),
+)
+# Every task that can be named; a task's number is its place here.
 ANY_TASK = {**TASKS, **COMPOUND_TASKS, **TWO_BOWL_TASKS}
-SELECTIONS = {"all": TASK_NAMES, "compound": COMPOUND_TASK_NAMES, "two_bowls": tuple(TWO_BOWL_TASKS)}
+SELECTIONS = {"all": TASK_NAMES, "compound": tuple(COMPOUND_TASKS), "two_bowls": tuple(TWO_BOWL_TASKS)}
 
 
 def select_tasks(spec: str) -> list[str]:
-    """Expand a task name, a comma list or a selection ("all": the ten) into task names, in the order given.
+    """Names of the tasks that a name, a comma list or a selection ("all": the ten) stands for.
 
     Raises:
         ValueError: A name is unknown, or there is none.
     """
-    names = [part.strip() for part in spec.split(",") if part.strip()]
-    if len(names) == 1 and names[0] in SELECTIONS:
-        return list(SELECTIONS[names[0]])
-    unknown = [name for name in names if name not in ANY_TASK]
-    if unknown or not names:
-        raise ValueError(
-            f"unknown openspm_tabletop task {', '.join(unknown) or repr(spec)}; "
-            f"expected {', '.join(map(repr, SELECTIONS))} or a comma list of: {', '.join(ANY_TASK)}"
-        )
-    return names
+    return select(spec, ANY_TASK, SELECTIONS, "openspm_tabletop")

@@ -9,6 +9,8 @@ from lerobot_openspm.envs.tabletop import scene
 from lerobot_openspm.envs.tabletop.placement import Placement
 
 Layout = dict[str, Placement]
+# Whether a layout leaves no doubt.
+Condition = Callable[[Layout], bool]
 
 # The meant bowl stands nearer to its landmark than this, and the other one further by as much again.
 NEAR_M = 0.20
@@ -20,7 +22,7 @@ OFF_M, OUTSIDE_SHARES = 0.15, (-0.2, 1.2)
 SIDE_M = 0.12
 
 
-def next_to(landmark: str) -> Callable[[Layout], bool]:
+def next_to(landmark: str) -> Condition:
     """Only the first bowl stands next to an object."""
 
     def is_clear(layout: Layout) -> bool:
@@ -29,7 +31,7 @@ def next_to(landmark: str) -> Callable[[Layout], bool]:
     return is_clear
 
 
-def between(a: str, b: str) -> Callable[[Layout], bool]:
+def between(a: str, b: str) -> Condition:
     """Only the first bowl stands between two objects."""
 
     def is_clear(layout: Layout) -> bool:

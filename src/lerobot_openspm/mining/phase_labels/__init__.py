@@ -1,1 +1,1 @@
-"""Judgement of phases by a multimodal model: the third kind of evidence for key poses."""
+"""Phase labels: optional judges that say, beside motion and gripper, which phase ends at a key pose."""

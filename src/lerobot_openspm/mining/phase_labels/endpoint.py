@@ -2,153 +2,127 @@
 
 from __future__ import annotations
 
+import asyncio
 import base64
 import json
 import os
-import time
-from collections.abc import Callable, Mapping
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Any
 
 import cv2
 import httpx
 
-from lerobot_openspm.errors import JudgementError
-from lerobot_openspm.mining.phase_labels.cutoff import Cutoff
-from lerobot_openspm.mining.phase_labels.prompt import Prompt
-from lerobot_openspm.mining.phase_labels.types import Picture
+from lerobot_openspm.errors import PhaseLabelError
+from lerobot_openspm.mining.phase_labels.base import PhaseLabels, PhaseQuestion, Picture
+from lerobot_openspm.mining.phase_labels.prompt import AS_JSON, WORDING, Prompt, phase_prompt, read_phases
 
 # lerobot-annotate's default.
 API_BASE = "http://localhost:8000/v1"
 API_KEY_VARIABLE = "OPENSPM_JUDGE_API_KEY"
+TIMEOUT_S, MAX_CONNECT_S = 60.0, 5.0
+ATTEMPTS = 3
 MAX_ANSWER_BYTES = 1_000_000
 MAX_ANSWER_TOKENS = 4096
-MAX_CONNECT_S = 5.0
 JPEG_QUALITY = 90
-# Of the codes with which servers say that they know no schemas.
+# Status codes of servers that do not know JSON schemas.
 NO_SCHEMA = (400, 415, 422, 501)
 BUSY = (429, 500, 502, 503, 504)
 
 
-class _TryAgainError(JudgementError):
-    """What may pass."""
-
-
-@dataclass(frozen=True)
-class Patience:
-    """How long and how often to ask.
-
-    Attributes:
-        timeout_s: For one question, all attempts together.
-        attempts: How often a question is asked at most. One that took too long is not asked again.
-        backoff_s: Wait before the second attempt; it doubles from one to the next.
-    """
-
-    timeout_s: float = 60.0
-    attempts: int = 3
-    backoff_s: float = 0.5
+class _TryAgainError(PhaseLabelError):
+    """A fault that may pass."""
 
 
 class ChatEndpoint:
     """Asks one model of one server.
 
-    Args:
-        api_base: Where it is, up to and with ``/v1``.
-        model_id: The model's name there.
-        patience: How long and how often to ask.
-        sleep: Waits, in seconds.
+    The API key is read from the environment variable :data:`API_KEY_VARIABLE` and only sent in the request's
+    header. Redirects are not followed, so the key reaches no other server.
 
-    An API key is taken from the environment variable :data:`API_KEY_VARIABLE` alone, and goes nowhere but
-    into the request's header. Redirects are not followed, so it reaches no other server.
+    Args:
+        api_base: Address of the server, up to and with ``/v1``.
+        model_id: The model's name there.
+        timeout_s: Limit for one question, all attempts together.
+        backoff_s: Wait before the second attempt; it doubles before the third.
     """
 
     def __init__(
-        self,
-        api_base: str,
-        model_id: str,
-        patience: Patience | None = None,
-        sleep: Callable[[float], None] = time.sleep,
+        self, api_base: str, model_id: str, timeout_s: float = TIMEOUT_S, backoff_s: float = 0.5
     ) -> None:
         self._url = api_base.rstrip("/") + "/chat/completions"
-        self._patience, self._sleep = patience or Patience(), sleep
+        self._timeout_s, self._backoff_s = timeout_s, backoff_s
         self._key = os.environ.get(API_KEY_VARIABLE, "")
         self._with_schema = True
-        # Each request connects anew, so that its cutoff knows its connection.
-        self._http = httpx.Client(limits=httpx.Limits(max_keepalive_connections=0))
         self.model_id = model_id
 
     def complete(self, prompt: Prompt) -> str:
         """The model's answer.
 
         Raises:
-            JudgementError: The server is gone, too slow, refuses, or says what is no answer.
+            PhaseLabelError: The server is gone, too slow, refuses, or gives no completion.
         """
-        deadline = time.monotonic() + self._patience.timeout_s
-        for attempt in range(1, self._patience.attempts + 1):
-            try:
-                return self._ask(prompt, deadline)
-            except _TryAgainError as error:
-                wait_s = self._patience.backoff_s * 2 ** (attempt - 1)
-                if attempt == self._patience.attempts or time.monotonic() + wait_s >= deadline:
-                    raise JudgementError(f"{error}, {attempt} times") from error
-                self._sleep(wait_s)
-        raise JudgementError(f"{self._url} was not asked: attempts is {self._patience.attempts}")
+        # In a thread of its own, because in a notebook this one already runs an event loop.
+        with ThreadPoolExecutor(1) as thread:
+            return thread.submit(asyncio.run, self._complete(prompt)).result()
 
-    def _ask(self, prompt: Prompt, deadline: float) -> str:
-        status, body = self._post(self._request(prompt), deadline)
+    async def _complete(self, prompt: Prompt) -> str:
+        # Answers are not compressed: unpacked they would have no bound.
+        headers = {"Accept-Encoding": "identity"}
+        if self._key:
+            headers["Authorization"] = f"Bearer {self._key}"
+        # httpx's timeouts start again with every byte; asyncio's ends a request whatever it is doing.
+        timeout = httpx.Timeout(None, connect=MAX_CONNECT_S)
+        try:
+            async with (
+                asyncio.timeout(self._timeout_s) as limit,
+                httpx.AsyncClient(headers=headers, timeout=timeout) as http,
+            ):
+                return await self._attempts(http, prompt, limit.when() or 0.0)
+        except TimeoutError as error:
+            raise PhaseLabelError(f"{self._url} took longer than {self._timeout_s:g} s") from error
+
+    async def _attempts(self, http: httpx.AsyncClient, prompt: Prompt, deadline: float) -> str:
+        """Ask until there is an answer, no attempt is left, or no time for another one."""
+        attempt, wait_s = 1, self._backoff_s
+        while True:
+            try:
+                return await self._ask(http, prompt)
+            except _TryAgainError as error:
+                if attempt == ATTEMPTS or asyncio.get_running_loop().time() + wait_s >= deadline:
+                    raise PhaseLabelError(f"{error}, {attempt} times") from error
+            await asyncio.sleep(wait_s)
+            attempt, wait_s = attempt + 1, 2 * wait_s
+
+    async def _ask(self, http: httpx.AsyncClient, prompt: Prompt) -> str:
+        status, body = await self._post(http, prompt)
         if self._with_schema and status in NO_SCHEMA:
             self._with_schema = False
-            status, body = self._post(self._request(prompt), deadline)
+            status, body = await self._post(http, prompt)
         if status != 200:
-            kind = _TryAgainError if status in BUSY else JudgementError
+            kind = _TryAgainError if status in BUSY else PhaseLabelError
             raise kind(f"{self._url} answered with code {status}: {self._shown(body)}")
         try:
             content = json.loads(body)["choices"][0]["message"]["content"]
         except (ValueError, RecursionError, KeyError, IndexError, TypeError) as error:
-            raise JudgementError(f"{self._url} gave no chat completion: {self._shown(body)}") from error
+            raise PhaseLabelError(f"{self._url} gave no chat completion: {self._shown(body)}") from error
         if not isinstance(content, str) or not content:
-            raise JudgementError(f"{self._url} gave a completion without text: {self._shown(body)}")
+            raise PhaseLabelError(f"{self._url} gave a completion without text: {self._shown(body)}")
         return content
 
-    def _post(self, request: Mapping[str, Any], deadline: float) -> tuple[int, bytes]:
-        """Status and body of one request. What a body is longer than, or comes later than, is not read."""
-        left_s = max(deadline - time.monotonic(), 0.001)
-        timeout = httpx.Timeout(left_s, connect=min(left_s, MAX_CONNECT_S))
-        # Unpacked, a packed body has no bounds.
-        headers = {"Accept-Encoding": "identity"}
-        if self._key:
-            headers["Authorization"] = f"Bearer {self._key}"
-        with Cutoff(left_s) as cutoff:
-            try:
-                answer = self._read(request, headers, timeout, cutoff)
-            except httpx.TimeoutException as error:
-                raise JudgementError(self._too_slow()) from error
-            except (httpx.TransportError, httpx.InvalidURL) as error:
-                if cutoff.passed:
-                    raise JudgementError(self._too_slow()) from error
-                why = f"{type(error).__name__}: {error}"
-                raise _TryAgainError(f"{self._url} could not be asked ({why})") from error
-            if cutoff.passed:  # what has no length ends, cut off, like a whole one
-                raise JudgementError(self._too_slow())
-            return answer
-
-    def _read(
-        self, request: Mapping[str, Any], headers: Mapping[str, str], timeout: httpx.Timeout, cutoff: Cutoff
-    ) -> tuple[int, bytes]:
+    async def _post(self, http: httpx.AsyncClient, prompt: Prompt) -> tuple[int, bytes]:
+        """Status and body of one request. A body over the limit is not read to its end."""
         body = bytearray()
-        ask = self._http.stream(
-            "POST", self._url, json=request, headers=headers, timeout=timeout,
-            extensions={"trace": cutoff.trace},
-        )  # fmt: skip
-        with ask as response:
-            for piece in response.iter_raw():
-                body += piece
-                if len(body) > MAX_ANSWER_BYTES:
-                    raise JudgementError(f"{self._url} answered with more than {MAX_ANSWER_BYTES} bytes")
-            return response.status_code, bytes(body)
-
-    def _too_slow(self) -> str:
-        return f"{self._url} took longer than {self._patience.timeout_s:g} s"
+        try:
+            async with http.stream("POST", self._url, json=self._request(prompt)) as response:
+                async for piece in response.aiter_raw():
+                    body += piece
+                    if len(body) > MAX_ANSWER_BYTES:
+                        raise PhaseLabelError(f"{self._url} answered with more than {MAX_ANSWER_BYTES} bytes")
+                return response.status_code, bytes(body)
+        except (httpx.TransportError, httpx.InvalidURL) as error:
+            kind = PhaseLabelError if isinstance(error, httpx.ConnectTimeout) else _TryAgainError
+            raise kind(f"{self._url} could not be asked ({type(error).__name__}: {error})") from error
 
     def _request(self, prompt: Prompt) -> dict[str, Any]:
         content: list[dict[str, Any]] = []
@@ -168,7 +142,7 @@ class ChatEndpoint:
         return request
 
     def _shown(self, body: bytes) -> str:
-        """The beginning of what a server said, without the key that it may have repeated."""
+        """The beginning of a server's answer, without the key that it may have repeated."""
         text = body.decode(errors="replace")
         text = text.replace(self._key, "***") if self._key else text
         return repr(text[:200])
@@ -177,3 +151,21 @@ class ChatEndpoint:
 def _data_url(picture: Picture) -> str:
     _, jpeg = cv2.imencode(".jpg", picture[:, :, ::-1], [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
     return "data:image/jpeg;base64," + base64.b64encode(jpeg.tobytes()).decode()
+
+
+@dataclass(frozen=True)
+class EndpointJudge:
+    """Phase labels from an endpoint, with the confidences that the model writes down."""
+
+    endpoint: ChatEndpoint
+    looks: bool = True
+
+    @property
+    def name(self) -> str:
+        """See :class:`lerobot_openspm.mining.phase_labels.base.PhaseJudge`."""
+        return f"openai {self.endpoint.model_id} v{WORDING}"
+
+    def judge(self, question: PhaseQuestion) -> PhaseLabels:
+        """See :class:`lerobot_openspm.mining.phase_labels.base.PhaseJudge`."""
+        text = self.endpoint.complete(phase_prompt(question, AS_JSON))
+        return read_phases(text, len(question.candidates))

@@ -1,15 +1,14 @@
-"""Merging what a judge says with what motion and gripper say.
+"""Merging a judge's phase labels with those of motion and gripper.
 
-Two pieces of evidence for the name of a phase: from motion and gripper with confidence ``g``, from the judge
-with confidence ``m``. They are independent of each other, so their odds are pooled, as in naive Bayes. The
-judge's odds are ``J = max(1, m / (1 - m))``: a judge that is not sure of what it says does not speak for the
-opposite.
+There are two pieces of evidence for the name of a phase: motion and gripper with confidence ``g``, the judge
+with confidence ``m``. They are independent, so their odds are pooled, as in naive Bayes. The judge's odds are
+``J = max(1, m / (1 - m))``: a judge that is unsure is no evidence for the opposite.
 
-    the two agree                            g' = g J / (g J + (1 - g))
+    both agree                               g' = g J / (g J + (1 - g))
     they differ, and the name is kept        g' = g / (g + (1 - g) J)
     they differ, and the judge's is taken    g' = m / (m + (1 - m) G),  G = max(1, g / (1 - g))
 
-The more confident one's name is taken. Where both are equally sure, g' is 1/2 whichever is taken, so nothing
+The more confident one's name is taken. Where both are equally sure, g' is 1/2 for either name, so nothing
 jumps. ``g = 1``, which is what the gripper's transitions have, stays 1: nothing overrules them.
 """
 
@@ -19,71 +18,85 @@ import math
 import sys
 from collections.abc import Sequence
 
-from lerobot_openspm.errors import JudgementError
-from lerobot_openspm.mining.phase_labels.structure import FIRST, LAST, SUCCESSORS
-from lerobot_openspm.mining.phase_labels.types import Answers, PhaseAnswer
+from lerobot_openspm.errors import PhaseLabelError
+from lerobot_openspm.mining.phase_labels.base import PhaseLabel, PhaseLabels
 
-# What a model says of its own confidence is too high more often than too low: it counts for no more.
-MAX_JUDGED = 0.95
-# The names that a judge may change, and to which: whether something is in the hand is the gripper's to say,
-# and at a contact it is the contact that gives the name.
+# Models overstate their confidence more often than not, so it is capped.
+MAX_CONFIDENCE = 0.95
+# The names that a judge may change, and to which. The gripper decides whether something is held, and at a
+# contact the contact gives the name.
 SIBLINGS = {"approach": "retreat", "retreat": "approach", "lift": "pre-place", "pre-place": "lift"}
+# The phases that may come next. An empty hand approaches and retreats; a hand that holds something lifts it,
+# carries it on and puts it down; grasp and release lie between the two.
+SUCCESSORS: dict[str, tuple[str, ...]] = {
+    "approach": ("approach", "grasp", "push"),
+    "grasp": ("lift", "pre-place", "place", "open", "turn"),
+    "lift": ("lift", "pre-place", "place"),
+    "pre-place": ("pre-place", "place"),
+    "place": ("release",),
+    "open": ("release",),
+    "turn": ("release",),
+    "release": ("retreat", "approach"),
+    "push": ("push", "retreat"),
+    "retreat": ("retreat", "approach"),
+}
+FIRST = ("approach",)
+LAST = ("retreat", "release", "push")
 
 
-def merge(kinematic: Sequence[PhaseAnswer], judged: Answers, threshold: float) -> tuple[PhaseAnswer, ...]:
-    """Merge a judge's evidence for the phases of an episode with that of motion and gripper.
+def merge(kinematic: Sequence[PhaseLabel], judged: PhaseLabels, threshold: float) -> tuple[PhaseLabel, ...]:
+    """Merge a judge's labels for the phases of an episode with those of motion and gripper.
 
     Args:
-        kinematic: What motion and gripper say of each candidate.
-        judged: What the judge says of each, or None.
-        threshold: Answers of less confidence change nothing.
+        kinematic: Each candidate's label by motion and gripper.
+        judged: The judge's label of each, or None.
+        threshold: Labels of less confidence change nothing.
 
     Returns:
-        Name and confidence of each. Which name comes after which is as followable as it was in `kinematic`.
+        Name and confidence of each. The sequence of names is as feasible as it was in `kinematic`.
 
     Raises:
-        JudgementError: There is not one answer for each candidate.
+        PhaseLabelError: There is not one label per candidate.
     """
     if len(kinematic) != len(judged):
-        raise JudgementError(f"got {len(judged)} answers for {len(kinematic)} candidates, expected as many")
-    heard = [_heard(answer, threshold) for answer in judged]
+        raise PhaseLabelError(f"got {len(judged)} labels for {len(kinematic)} candidates, expected as many")
+    heard = [_heard(label, threshold) for label in judged]
     names = _names(kinematic, heard)
     return tuple(_pooled(*evidence) for evidence in zip(kinematic, heard, names, strict=True))
 
 
-def _heard(answer: PhaseAnswer | None, threshold: float) -> PhaseAnswer | None:
+def _heard(label: PhaseLabel | None, threshold: float) -> PhaseLabel | None:
     """The label, if its confidence passes the threshold."""
-    if answer is None or answer.confidence < threshold:
+    if label is None or label.confidence < threshold:
         return None
-    return PhaseAnswer(answer.phase, min(answer.confidence, MAX_JUDGED))
+    return PhaseLabel(label.phase, min(label.confidence, MAX_CONFIDENCE))
 
 
-def _pooled(kinematic: PhaseAnswer, judged: PhaseAnswer | None, name: str) -> PhaseAnswer:
+def _pooled(kinematic: PhaseLabel, judged: PhaseLabel | None, name: str) -> PhaseLabel:
     """The formula above, for the name that was chosen."""
     if judged is None:
         return kinematic
     g, m = kinematic.confidence, judged.confidence
     if name != kinematic.phase:
-        return PhaseAnswer(name, m / (m + (1 - m) * max(1.0, g / (1 - g))))
+        return PhaseLabel(name, m / (m + (1 - m) * max(1.0, g / (1 - g))))
     odds = max(1.0, m / (1 - m))
     if odds == 1:  # not even the last digit changes
         return kinematic
     if judged.phase == kinematic.phase:
         # 1 - g first: rounding must not lift the quotient above 1.
-        return PhaseAnswer(name, g * odds / (g * odds + (1 - g)))
-    return PhaseAnswer(name, g / (g + (1 - g) * odds))
+        return PhaseLabel(name, g * odds / (g * odds + (1 - g)))
+    return PhaseLabel(name, g / (g + (1 - g) * odds))
 
 
-def _names(kinematic: Sequence[PhaseAnswer], judged: Sequence[PhaseAnswer | None]) -> list[str]:
-    """The names that together are likeliest, of those that make a followable sequence.
+def _names(kinematic: Sequence[PhaseLabel], judged: Sequence[PhaseLabel | None]) -> list[str]:
+    """The likeliest feasible sequence of names, by dynamic programming over the candidates.
 
-    Each candidate keeps its name or takes the judge's; what the judge's is worth more in log-odds is what
-    taking it gains. The best sequence is found from the front, one candidate at a time.
+    Each candidate keeps its name or takes the judge's, which gains the difference of their log-odds.
     """
     before: dict[str, tuple[float, list[str]]] = {}
-    for i, (kept, answer) in enumerate(zip(kinematic, judged, strict=True)):
+    for i, (kept, label) in enumerate(zip(kinematic, judged, strict=True)):
         now: dict[str, tuple[float, list[str]]] = {}
-        for name, gain in _options(kept, answer).items():
+        for name, gain in _options(kept, label).items():
             ways = [
                 (total + gain, [*names, name])
                 for last, (total, names) in before.items()
@@ -98,8 +111,8 @@ def _names(kinematic: Sequence[PhaseAnswer], judged: Sequence[PhaseAnswer | None
     return max(ends, key=lambda way: way[0], default=(0.0, list[str]()))[1]
 
 
-def _options(kinematic: PhaseAnswer, judged: PhaseAnswer | None) -> dict[str, float]:
-    """The names a candidate may take, with what taking them gains; its own comes first, and wins a tie."""
+def _options(kinematic: PhaseLabel, judged: PhaseLabel | None) -> dict[str, float]:
+    """The names a candidate may take, with the gain of each; its own comes first and wins a tie."""
     options = {kinematic.phase: 0.0}
     if judged and judged.confidence > kinematic.confidence and SIBLINGS.get(kinematic.phase) == judged.phase:
         options[judged.phase] = _log_odds(judged.confidence) - _log_odds(kinematic.confidence)

@@ -4,15 +4,16 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
-from typing import Any, cast
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
 
-from lerobot_openspm.errors import JudgementError
+from lerobot_openspm.errors import PhaseLabelError
 from lerobot_openspm.memory.entry import PHASES
-from lerobot_openspm.mining.phase_labels.types import Answers, PhaseAnswer, PhaseQuestion, Picture
+from lerobot_openspm.mining.phase_labels.base import PhaseLabel, PhaseLabels, PhaseQuestion, Picture
 
-# Part of every cached answer's key: another wording may be answered otherwise.
+# Version of the texts below. It is part of every cached label's key, because another text may be answered
+# otherwise.
 WORDING = 1
 
 MEANINGS = {
@@ -27,6 +28,7 @@ MEANINGS = {
     "open": "the hand has pulled or slid a held part, such as a drawer, open or shut",
     "turn": "the hand has turned a held part, such as a knob",
 }
+MEANINGS_TEXT = "\n".join(f"- {phase}: {meaning}" for phase, meaning in MEANINGS.items())
 INTRODUCTION = """A robot hand was guided through this task: "{instruction}".
 Each image is a contact sheet of one camera. Its tiles, row by row, show {n} candidate moments, with their \
 numbers in the corner; tiles of the same number in different images show the same moment.
@@ -40,114 +42,90 @@ AS_JSON = """Answer with JSON alone, one item for each of the {n} candidates, in
 The confidence is the probability, 0 to 1, that your phase is right."""
 AS_LINES = "Answer with one line for each of the {n} candidates, in order: its number, a colon and its phase."
 
-# What may be written next, given the pieces written so far; nothing: the end.
-Grammar = Callable[[tuple[str, ...]], tuple[str, ...]]
-
 
 @dataclass(frozen=True)
 class Prompt:
     """A question to a multimodal model.
 
     Attributes:
-        text: What is asked.
-        pictures: What it is asked about, RGB, each after its caption.
-        schema: JSON schema of the answer, for servers that hold their model to one.
+        text: The question.
+        pictures: The pictures that it is about, RGB, each after its caption.
+        schema: JSON schema of the answer, for servers that can enforce one.
     """
 
     text: str
-    pictures: Sequence[tuple[str, Picture]] = ()
-    schema: Mapping[str, Any] = field(default_factory=dict[str, Any])
+    pictures: Sequence[tuple[str, Picture]]
+    schema: Mapping[str, Any]
 
 
 def phase_prompt(question: PhaseQuestion, ending: str) -> Prompt:
     """The question as text and pictures; `ending` is :data:`AS_JSON` or :data:`AS_LINES`."""
     n = len(question.candidates)
     introduction = INTRODUCTION.format(
-        # A quotation mark in the instruction ends nothing.
         instruction=question.instruction.replace('"', "'"),
         n=n,
         trajectory=question.trajectory_json(),
-        phases="\n".join(f"- {phase}: {meaning}" for phase, meaning in MEANINGS.items()),
+        phases=MEANINGS_TEXT,
     )
     pictures = [
         (f"Camera {camera.rpartition('.')[2]}:", sheet)
         for camera, sheets in question.sheets.items()
         for sheet in sheets
     ]
-    return Prompt(introduction + ending.format(n=n), pictures, phase_schema(n))
-
-
-def phase_schema(n: int) -> dict[str, Any]:
-    """JSON schema of an answer for `n` candidates."""
-    item = {
-        "type": "object",
-        "properties": {
-            "candidate": {"type": "integer"},
-            "phase": {"type": "string", "enum": list(PHASES)},
-            "confidence": {"type": "number", "minimum": 0, "maximum": 1},
-        },
-        "required": ["candidate", "phase", "confidence"],
-        "additionalProperties": False,
+    label = {
+        "candidate": {"type": "integer"},
+        "phase": {"type": "string", "enum": list(PHASES)},
+        "confidence": {"type": "number", "minimum": 0, "maximum": 1},
     }
-    phases = {"type": "array", "items": item, "minItems": n, "maxItems": n}
-    return {
-        "type": "object",
-        "properties": {"phases": phases},
-        "required": ["phases"],
-        "additionalProperties": False,
-    }
+    return Prompt(introduction + ending.format(n=n), pictures, list_schema("phases", label, n, n))
 
 
-def phase_lines(n: int) -> Grammar:
-    """One line for each of `n` candidates, with one of the phases and nothing else."""
+def list_schema(name: str, fields: Mapping[str, Any], least: int, most: int) -> dict[str, Any]:
+    """JSON schema of an object with one list of `least` to `most` objects with these fields."""
 
-    def grammar(written: tuple[str, ...]) -> tuple[str, ...]:
-        number = len(written) + 1
-        return () if number > n else tuple(f"{number}: {phase}\n" for phase in PHASES)
+    def only(properties: Mapping[str, Any]) -> dict[str, Any]:
+        return {
+            "type": "object",
+            "properties": properties,
+            "required": list(properties),
+            "additionalProperties": False,
+        }
 
-    return grammar
+    return only({name: {"type": "array", "items": only(fields), "minItems": least, "maxItems": most}})
 
 
-def phase_in(line: str) -> str:
-    """The phase in a line that :func:`phase_lines` allows."""
-    return line.strip().partition(": ")[2]
-
-
-def read_phases(text: str, n: int) -> Answers:
-    """The answers in a model's JSON. An item that makes no sense, or comes twice, is no answer.
+def read_phases(text: str, n: int) -> PhaseLabels:
+    """The labels in a model's JSON. An item that is malformed, or comes twice, is no label.
 
     Raises:
-        JudgementError: It is no such JSON, or none of its items makes sense.
+        PhaseLabelError: It is no such JSON, or all of its items are malformed.
     """
     items = read_object(text).get("phases")
     if not isinstance(items, list):
-        raise JudgementError(f"the answer's 'phases' is {_short(items)}, expected a list")
-    answers: dict[int, PhaseAnswer | None] = {}
+        raise PhaseLabelError(f"the answer's 'phases' is {_short(items)}, expected a list")
+    labels: dict[int, PhaseLabel | None] = {}
     for item in items:
-        number = cast(dict[str, Any], item).get("candidate") if isinstance(item, dict) else None
-        if isinstance(number, int) and not isinstance(number, bool) and 1 <= number <= n:
-            answers[number] = None if number in answers else _answer(item)
-    read = tuple(answers.get(number) for number in range(1, n + 1))
+        number = item.get("candidate") if isinstance(item, dict) else None
+        if type(number) is int and 1 <= number <= n:
+            labels[number] = None if number in labels else _label(item)
+    read = tuple(labels.get(number) for number in range(1, n + 1))
     if not any(read):
-        raise JudgementError(f"none of the {len(items)} items in the answer makes sense: {_short(items)}")
+        raise PhaseLabelError(f"none of the {len(items)} items in the answer makes sense: {_short(items)}")
     return read
 
 
-def _answer(item: Mapping[str, Any]) -> PhaseAnswer | None:
-    phase, confidence = item.get("phase"), item.get("confidence")
-    if not isinstance(phase, str) or not isinstance(confidence, int | float) or isinstance(confidence, bool):
-        return None
+def _label(item: Any) -> PhaseLabel | None:
     try:
-        return PhaseAnswer(phase, float(confidence))
-    except (JudgementError, OverflowError):  # a whole number of more digits than a float has
+        return PhaseLabel.from_json(item)
+    except PhaseLabelError:
         return None
 
 
 def read_object(text: str) -> dict[str, Any]:
-    """The JSON object in what a model wrote, without its thoughts and the fences around it.
+    """The JSON object in a model's answer, without its thoughts and the fences around it.
 
     Raises:
-        JudgementError: There is none.
+        PhaseLabelError: There is none.
     """
     spoken = re.sub(r"<think>.*?</think>", "", text, flags=re.DOTALL)
     begin = spoken.find("{")
@@ -156,7 +134,7 @@ def read_object(text: str) -> dict[str, Any]:
             raise ValueError("there is no '{'")
         found, _ = json.JSONDecoder(parse_constant=_refuse).raw_decode(spoken, begin)
     except (ValueError, RecursionError) as error:
-        raise JudgementError(f"the answer is no JSON ({error}): {_short(text)}") from error
+        raise PhaseLabelError(f"the answer is no JSON ({error}): {_short(text)}") from error
     return found
 
 

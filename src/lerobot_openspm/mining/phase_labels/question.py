@@ -11,12 +11,12 @@ from lerobot_openspm.geometry import se3
 from lerobot_openspm.memory.robot import RobotModel
 from lerobot_openspm.mining.dataset import Demonstrations
 from lerobot_openspm.mining.mined import MinedEpisode
-from lerobot_openspm.mining.phase_labels.types import Moment, PhaseQuestion, Picture
+from lerobot_openspm.mining.phase_labels.base import Moment, PhaseQuestion, Picture
 from lerobot_openspm.mining.signals import Episode
 
 # The paper's three views.
 MAX_CAMERAS = 3
-# A tile is 7 x 7 patches of 32 pixels to Qwen3-VL: a hand and what it holds can be told, 20 are 1,000 tokens.
+# Qwen3-VL sees a tile as 7 x 7 patches of 32 pixels, enough to show what a hand holds; 20 are 1,000 tokens.
 TILE_PX = 224
 COLUMNS, TILES_PER_SHEET = 5, 20
 TRAJECTORY_MOMENTS = 32
@@ -30,8 +30,8 @@ def ask_about(
     Args:
         demonstrations: Its dataset.
         item: The episode with its candidate key poses.
-        robot: The robot that gave it; tells what the gripper's command means.
-        looks: Whether pictures belong to it.
+        robot: The robot that recorded it; says which gripper command closes.
+        looks: Whether the judge needs pictures.
     """
     episode, frames = item.episode, [pose.frame for pose in item.key_poses]
     pictures = demonstrations.pictures(episode, frames, MAX_CAMERAS) if looks else {}
@@ -48,7 +48,7 @@ def ask_about(
 
 
 def moments(episode: Episode, frames: Sequence[int], fps: float, robot: RobotModel) -> tuple[Moment, ...]:
-    """What the hand did at some frames."""
+    """The hand's state at some frames."""
     closing = robot.closed(episode.actions[:, 6])
     wide = max(robot.open_width, 1e-9)
     return tuple(

@@ -1,28 +1,34 @@
-"""Qwen3-VL in this process, held to what a grammar lets it write."""
+"""Qwen3-VL in this process, constrained by a grammar."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-from lerobot_openspm.errors import JudgementError
-from lerobot_openspm.mining.phase_labels.prompt import Grammar, Prompt
+from lerobot_openspm.errors import PhaseLabelError
+from lerobot_openspm.memory.entry import PHASES
+from lerobot_openspm.mining.phase_labels.base import PhaseLabel, PhaseLabels, PhaseQuestion
+from lerobot_openspm.mining.phase_labels.prompt import AS_LINES, WORDING, Prompt, phase_prompt
 from lerobot_openspm.perception.segmentation.pretrained import fetch, load_model, load_processor
 
 WEIGHTS = "Qwen/Qwen3-VL-2B-Instruct"
 MODEL_CLASS, PROCESSOR_CLASS = "Qwen3VLForConditionalGeneration", "Qwen3VLProcessor"
 MAX_NEW_TOKENS = 4096
 
+# The alternatives for the next piece, given the pieces written so far; none at the end.
+Grammar = Callable[[tuple[str, ...]], tuple[str, ...]]
+
 
 @dataclass(frozen=True)
 class Piece:
-    """One of the alternatives that a grammar gave.
+    """The alternative that was written at one place of a grammar.
 
     Attributes:
-        text: Which.
-        probability: Of it among all of the alternatives, given what was written before.
+        text: Its text.
+        probability: Its probability among the alternatives, given what was written before.
     """
 
     text: str
@@ -53,10 +59,10 @@ class Qwen3VL:
         return cls(model, load_processor(PROCESSOR_CLASS, checkpoint), name)
 
     def write(self, prompt: Prompt, grammar: Grammar) -> list[Piece]:
-        """Write the likeliest alternatives that a grammar allows, one after the other.
+        """Write greedily what a grammar allows.
 
         Raises:
-            JudgementError: The memory of the device does not do, or the grammar did not end.
+            PhaseLabelError: The device's memory is too small, or the grammar did not end.
         """
         import torch
         from transformers import LogitsProcessorList
@@ -78,7 +84,7 @@ class Qwen3VL:
                     logits_processor=LogitsProcessorList([measured]),
                 )
         except torch.OutOfMemoryError as error:
-            raise JudgementError(f"{self.model_id} does not fit into the memory of its device") from error
+            raise PhaseLabelError(f"{self.model_id} does not fit into the memory of its device") from error
         return speller.pieces(output[0, n_prompt:].tolist(), measured.steps)
 
     def _inputs(self, prompt: Prompt) -> Any:
@@ -94,7 +100,7 @@ class Qwen3VL:
 
 
 class _Measured:
-    """Reads along how probable each token was among those that were allowed; changes nothing."""
+    """A logits processor that records each allowed token's probability, and changes nothing."""
 
     def __init__(self) -> None:
         self.steps: list[dict[int, float]] = []
@@ -130,11 +136,11 @@ class _Speller:
         """What was written, each piece with the product of its tokens' probabilities.
 
         Raises:
-            JudgementError: The grammar did not end.
+            PhaseLabelError: The grammar did not end.
         """
         texts, alternatives = self._read(written)
         if alternatives:
-            raise JudgementError(f"the model wrote {len(written)} tokens and came to no end")
+            raise PhaseLabelError(f"the model wrote {len(written)} tokens and came to no end")
         found, at = [], 0
         for text in texts:
             tokens = self._spell(text)
@@ -146,21 +152,42 @@ class _Speller:
     def _read(self, written: list[int]) -> tuple[tuple[str, ...], tuple[str, ...]]:
         """The whole pieces in what was written, and the alternatives for the next one.
 
-        Goes on where it was last time: what is written only grows.
+        Continues from the last call, because what is written only grows.
         """
         while alternatives := self._grammar(tuple(self._pieces)):
-            piece = next((a for a in alternatives if self._comes(a, written)), None)
+            ahead = tuple(written[self._at :])
+            piece = next((a for a in alternatives if ahead[: len(self._spell(a))] == self._spell(a)), None)
             if piece is None:
                 break
             self._pieces.append(piece)
             self._at += len(self._spell(piece))
         return tuple(self._pieces), alternatives
 
-    def _comes(self, piece: str, written: list[int]) -> bool:
-        tokens = self._spell(piece)
-        return tuple(written[self._at : self._at + len(tokens)]) == tokens
-
     def _spell(self, text: str) -> tuple[int, ...]:
         if text not in self._spelled:
             self._spelled[text] = tuple(self._tokenizer(text, add_special_tokens=False)["input_ids"])
         return self._spelled[text]
+
+
+@dataclass(frozen=True)
+class Qwen3VLJudge:
+    """Phase labels from Qwen3-VL, with the probabilities that it gives the phases it writes."""
+
+    model: Qwen3VL
+    looks: bool = True
+
+    @property
+    def name(self) -> str:
+        """See :class:`lerobot_openspm.mining.phase_labels.base.PhaseJudge`."""
+        return f"qwen3vl {self.model.model_id} v{WORDING}"
+
+    def judge(self, question: PhaseQuestion) -> PhaseLabels:
+        """See :class:`lerobot_openspm.mining.phase_labels.base.PhaseJudge`."""
+        n = len(question.candidates)
+
+        def lines(written: tuple[str, ...]) -> tuple[str, ...]:
+            number = len(written) + 1
+            return () if number > n else tuple(f"{number}: {phase}\n" for phase in PHASES)
+
+        written = self.model.write(phase_prompt(question, AS_LINES), lines)
+        return tuple(PhaseLabel(one.text.strip().partition(": ")[2], one.probability) for one in written)

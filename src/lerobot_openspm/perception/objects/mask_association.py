@@ -9,23 +9,27 @@ import numpy as np
 
 from lerobot_openspm.geometry.camera import intersect_plane, project
 from lerobot_openspm.geometry.se3 import Array
-from lerobot_openspm.perception.blobs import Blob
-from lerobot_openspm.perception.objects.shape.colour_bootstrap import column
+from lerobot_openspm.perception.foreground import Blob
+from lerobot_openspm.perception.objects.base import Instances
 from lerobot_openspm.types import ContactCue, Mask, Scene, Segmentation, Segmenter, View
 
-# By camera: what a segmenter found of one phrase.
-Instances = Mapping[str, Sequence[Segmentation]]
 # By camera: one object's mask.
-Sighting = dict[str, Segmentation]
+ObjectMasks = dict[str, Segmentation]
 
-# The hand touches an object within this distance of its mask.
+# A cue belongs to an instance within this distance of its mask.
 TOUCH_M = 0.04
 MIN_PIXELS = 12
 # Pieces of a mask smaller than this share of its largest are specks.
 SPECK_SHARE = 0.1
-MAX_SIGHTINGS = 3
+MAX_OBJECTS = 3
 # So many demonstrations are enough to learn one object from.
 MAX_SCENES = 30
+
+
+def column(hint: ContactCue, floor: float) -> list[Array]:
+    """Points ``(3,)`` every 2 cm from a contact cue straight down to the world height ``floor``."""
+    heights = np.arange(hint.point_world[2], floor - 1e-9, -0.02)
+    return [np.array([*hint.point_world[:2], z], dtype=np.float64) for z in heights]
 
 
 def whole_mask(mask: Mask) -> Blob | None:
@@ -44,7 +48,7 @@ def whole_mask(mask: Mask) -> Blob | None:
 
 def touched(
     views: Mapping[str, View], instances: Instances, hints: Sequence[ContactCue], floor: float
-) -> Sighting:
+) -> ObjectMasks:
     """Per camera, the instance that is nearest to where the hand touched the object.
 
     Args:
@@ -105,9 +109,9 @@ def _distance(view: View, mask: Mask, points_world: Array) -> float:
     return best
 
 
-def sightings(
+def associate(
     views: Mapping[str, View], instances: Instances, middle_height: float, radius: float
-) -> list[Sighting]:
+) -> list[ObjectMasks]:
     """Instances of all views that lie at one place, the most confident places first.
 
     Args:
@@ -128,7 +132,7 @@ def sightings(
                 clean = Segmentation(blob.mask, one.confidence)
                 rays.append((not blob.whole, -one.confidence, camera, point, clean))
     rays.sort(key=lambda ray: ray[:3])
-    groups: list[tuple[Array, Sighting]] = []
+    groups: list[tuple[Array, ObjectMasks]] = []
     for is_cut, _, camera, point, one in rays:
         reach = (2.0 if is_cut else 1.0) * radius
         near = [
@@ -143,4 +147,4 @@ def sightings(
             groups.append((point, {camera: one}))
     found = [group for _, group in groups]
     found.sort(key=lambda group: -sum(one.confidence for one in group.values()))
-    return found[:MAX_SIGHTINGS]
+    return found[:MAX_OBJECTS]

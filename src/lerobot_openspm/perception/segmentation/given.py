@@ -37,7 +37,7 @@ class GivenSegmenter:
             PerceptionError: A phrase without a number, or a view without labels of the image's size.
             ObservationError: A view is malformed.
         """
-        _, wanted = check_query(views, phrases)
+        wanted = check_query(views, phrases)
         for phrase in wanted:
             if phrase not in self._labels:
                 raise PerceptionError(

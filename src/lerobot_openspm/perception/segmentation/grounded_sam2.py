@@ -87,7 +87,7 @@ class GroundedSam2Segmenter:
         """
         import torch
 
-        _, wanted = check_query(views, phrases)
+        wanted = check_query(views, phrases)
         found: dict[str, dict[str, tuple[Segmentation, ...]]] = {phrase: {} for phrase in wanted}
         with torch.inference_mode():
             for camera, view in views.items():

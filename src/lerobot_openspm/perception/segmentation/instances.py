@@ -9,17 +9,15 @@ from numpy.typing import NDArray
 
 from lerobot_openspm.errors import PerceptionError
 from lerobot_openspm.geometry.se3 import Array
-from lerobot_openspm.perception.objects.localise import Prepared, prepare
+from lerobot_openspm.perception.objects.base import check_view
 from lerobot_openspm.types import Segmentation, View
 
 # Intersection over union from which on two masks of one phrase are the same instance.
 DUPLICATE_OVERLAP = 0.7
 
 
-def check_query(
-    views: Mapping[str, View], phrases: Sequence[str]
-) -> tuple[dict[str, Prepared], tuple[str, ...]]:
-    """Views by camera, ready for colour evidence, and the phrases without repetitions.
+def check_query(views: Mapping[str, View], phrases: Sequence[str]) -> tuple[str, ...]:
+    """The phrases without repetitions.
 
     Raises:
         PerceptionError: A phrase is empty, or all phrases came as one text.
@@ -32,7 +30,9 @@ def check_query(
             raise PerceptionError(
                 f"a phrase to look for is {phrase!r}, expected a noun such as 'bowl'; name every object"
             )
-    return {camera: prepare(view) for camera, view in views.items()}, tuple(dict.fromkeys(phrases))
+    for view in views.values():
+        check_view(view)
+    return tuple(dict.fromkeys(phrases))
 
 
 def distinct_instances(masks: NDArray[np.bool_], confidences: Array) -> tuple[Segmentation, ...]:

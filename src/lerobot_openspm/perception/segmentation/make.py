@@ -2,61 +2,63 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 
 from lerobot_openspm.errors import PerceptionError
-from lerobot_openspm.perception.objects.model import KnownObject
+from lerobot_openspm.perception.segmentation import grounded_sam2, sam3
 from lerobot_openspm.perception.segmentation.given import GivenSegmenter
-from lerobot_openspm.perception.segmentation.grounded_sam2 import (
-    DETECTOR_WEIGHTS,
-    MASK_WEIGHTS,
-    GroundedSam2Segmenter,
-)
-from lerobot_openspm.perception.segmentation.learned import LearnedSegmenter
-from lerobot_openspm.perception.segmentation.sam3 import WEIGHTS, Sam3Segmenter
 from lerobot_openspm.types import Segmenter
 
-# What each backend loads if nothing else is asked for.
-DEFAULT_WEIGHTS: dict[str, tuple[str, ...]] = {
-    "demonstrations": (),
-    "sam3": (WEIGHTS,),
-    "grounded_sam2": (DETECTOR_WEIGHTS, MASK_WEIGHTS),
-    "given": (),
+
+@dataclass(frozen=True)
+class Backend:
+    """One way to find the masks of phrases.
+
+    Attributes:
+        make: Makes it from names of weights, the numbers of phrases in given masks, and a device.
+        weights: What it loads if nothing else is asked for: names on the Hugging Face Hub, or folders.
+    """
+
+    make: Callable[[Sequence[str], Mapping[str, int], str], Segmenter]
+    weights: tuple[str, ...] = ()
+
+
+BACKENDS = {
+    "sam3": Backend(
+        lambda names, _, device: sam3.Sam3Segmenter.from_pretrained(*names, device=device), (sam3.WEIGHTS,)
+    ),
+    "grounded_sam2": Backend(
+        lambda names, _, device: grounded_sam2.GroundedSam2Segmenter.from_pretrained(*names, device=device),
+        (grounded_sam2.DETECTOR_WEIGHTS, grounded_sam2.MASK_WEIGHTS),
+    ),
+    "given": Backend(lambda _, labels, __: GivenSegmenter(labels)),
 }
-SEGMENTERS = tuple(DEFAULT_WEIGHTS)
+# With "demonstrations" nothing is segmented: they teach what the objects look like.
+SEGMENTERS = ("demonstrations", *BACKENDS)
 
 
 def make_segmenter(
-    kind: str,
-    objects: Mapping[str, KnownObject],
-    labels: Mapping[str, int],
-    weights: Sequence[str] = (),
-    device: str = "cpu",
+    name: str, labels: Mapping[str, int], weights: Sequence[str] = (), device: str = "cpu"
 ) -> Segmenter:
     """Make a segmentation backend.
 
     Args:
-        kind: One of :data:`SEGMENTERS`.
-        objects: What the demonstrations taught, by phrase; for ``"demonstrations"``.
+        name: One of :data:`BACKENDS`.
         labels: Number of each phrase in the observation's masks; for ``"given"``.
-        weights: Names on the Hugging Face Hub, or folders: one for ``"sam3"``; those of the detector and of
-            the mask model for ``"grounded_sam2"``. None: :data:`DEFAULT_WEIGHTS`.
+        weights: Names on the Hugging Face Hub, or folders; none for the backend's own.
         device: As PyTorch names it, for the backends with weights.
 
     Raises:
         PerceptionError: There is no such backend, or it cannot be used: see their ``from_pretrained``.
     """
-    if kind not in DEFAULT_WEIGHTS:
-        raise PerceptionError(f"there is no segmenter {kind!r}; choose one of {', '.join(SEGMENTERS)}")
-    names = tuple(weights) or DEFAULT_WEIGHTS[kind]
-    if len(names) != len(DEFAULT_WEIGHTS[kind]):
-        usual = ", ".join(DEFAULT_WEIGHTS[kind]) or "none"
+    if name not in BACKENDS:
+        raise PerceptionError(f"there is no segmenter {name!r}; choose one of {', '.join(BACKENDS)}")
+    backend = BACKENDS[name]
+    if weights and len(weights) != len(backend.weights):
+        usual = ", ".join(backend.weights) or "none"
         raise PerceptionError(
-            f"the segmenter {kind!r} takes {len(DEFAULT_WEIGHTS[kind])} names of weights, got {len(names)}: "
-            f"{', '.join(names)}; give as many as by default: {usual}"
+            f"the segmenter {name!r} takes {len(backend.weights)} names of weights, got {len(weights)}: "
+            f"{', '.join(weights)}; give as many as by default: {usual}"
         )
-    if kind == "sam3":
-        return Sam3Segmenter.from_pretrained(names[0], device)
-    if kind == "grounded_sam2":
-        return GroundedSam2Segmenter.from_pretrained(*names, device=device)
-    return LearnedSegmenter(objects) if kind == "demonstrations" else GivenSegmenter(labels)
+    return backend.make(tuple(weights) or backend.weights, labels, device)

@@ -14,6 +14,26 @@ INSTALL = "pip install 'lerobot_policy_openspm[perception]'"
 TESTED_RELEASE = "5.5.4"
 # Publishers put the same weights beside them in other formats, among them pickles, which are never read.
 FILES = ("*.json", "*.txt", "*.safetensors")
+INCLUDE = " ".join(f"--include '{pattern}'" for pattern in FILES)
+NOT_CACHED = "{name!r} is not or not wholly in the cache, and "
+UNREACHABLE = (
+    NOT_CACHED + "the Hugging Face Hub cannot be reached. Once, with a network: hf download {name} {include}"
+)
+# By exceptions of huggingface_hub and httpx, the first of them that is among the causes: what to do.
+REMEDIES = {
+    "GatedRepoError": "the weights {name!r} are given on request only. Ask for access at "
+    "https://huggingface.co/{name}, then log in with a token: hf auth login",
+    "RepositoryNotFoundError": "there is no model {name!r} on the Hugging Face Hub that you may see. Check "
+    "the name at https://huggingface.co/{name}; if it is private, log in: hf auth login",
+    "OfflineModeIsEnabled": NOT_CACHED + "HF_HUB_OFFLINE forbids to download it. Once, with a network: "
+    "HF_HUB_OFFLINE=0 hf download {name} {include}",
+    "LocalEntryNotFoundError": UNREACHABLE,
+    "TransportError": UNREACHABLE,
+}
+NO_CHECKPOINT = (
+    "{name!r} is no checkpoint of {class_name}: {error}. Give the name of one on the Hugging Face Hub, or a "
+    "folder with its config.json and *.safetensors"
+)
 
 
 @dataclass(frozen=True)
@@ -27,11 +47,6 @@ class Checkpoint:
 
     name: str
     folder: Path
-
-    @property
-    def download_command(self) -> str:
-        """What to type to have its files in the cache."""
-        return f"hf download {self.name} " + " ".join(f"--include '{pattern}'" for pattern in FILES)
 
 
 def fetch(name: str, class_name: str, device: str) -> Checkpoint:
@@ -149,49 +164,12 @@ def _explained(checkpoint: Checkpoint, class_name: str) -> Generator[None]:
     except (
         OSError, ValueError, RuntimeError, ImportError, KeyError, SafetensorError, TransportError
     ) as error:  # fmt: skip
-        raise PerceptionError(_explanation(error, checkpoint, class_name)) from error
-
-
-def _explanation(error: Exception, checkpoint: Checkpoint, class_name: str) -> str:
-    from httpx import TransportError
-    from huggingface_hub import constants
-    from huggingface_hub.errors import (
-        GatedRepoError,
-        LocalEntryNotFoundError,
-        OfflineModeIsEnabled,
-        RepositoryNotFoundError,
-    )
-
-    causes = tuple(_causes(error))
-    name, page = checkpoint.name, f"https://huggingface.co/{checkpoint.name}"
-    # First, for to huggingface_hub a repository that is given on request is a special case of one not found.
-    if any(isinstance(cause, GatedRepoError) for cause in causes):
-        return (
-            f"the weights {name!r} are given on request only. Ask for access at {page}, then log in with a "
-            "token: hf auth login"
-        )
-    if any(isinstance(cause, RepositoryNotFoundError) for cause in causes):
-        return (
-            f"there is no model {name!r} on the Hugging Face Hub that you may see. Check the name at {page}; "
-            "if it is private, log in: hf auth login"
-        )
-    unreachable = (LocalEntryNotFoundError, OfflineModeIsEnabled, TransportError)
-    if any(isinstance(cause, unreachable) for cause in causes):
-        why, prefix = "the Hugging Face Hub cannot be reached", ""
-        if constants.HF_HUB_OFFLINE:
-            why, prefix = "HF_HUB_OFFLINE forbids to download it", "HF_HUB_OFFLINE=0 "
-        return (
-            f"{name!r} is not or not wholly in the cache, and {why}. Once, with a network: "
-            f"{prefix}{checkpoint.download_command}"
-        )
-    return (
-        f"{name!r} is no checkpoint of {class_name}: {_first_line(error)}. Give the name of one on the "
-        "Hugging Face Hub, or a folder with its config.json and *.safetensors"
-    )
-
-
-def _first_line(error: Exception) -> str:
-    return (str(error).splitlines() or [type(error).__name__])[0]
+        first_line = (str(error).splitlines() or [type(error).__name__])[0]
+        known = {kind.__name__ for cause in _causes(error) for kind in type(cause).__mro__}
+        remedy = next((text for name, text in REMEDIES.items() if name in known), NO_CHECKPOINT)
+        raise PerceptionError(
+            remedy.format(name=checkpoint.name, include=INCLUDE, class_name=class_name, error=first_line)
+        ) from error
 
 
 def _causes(error: BaseException | None) -> Iterator[BaseException]:

@@ -63,7 +63,7 @@ class Sam3Segmenter:
         """
         import torch
 
-        _, wanted = check_query(views, phrases)
+        wanted = check_query(views, phrases)
         if not wanted:
             return {}
         found: dict[str, dict[str, tuple[Segmentation, ...]]] = {phrase: {} for phrase in wanted}

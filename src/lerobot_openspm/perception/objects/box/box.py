@@ -15,11 +15,11 @@ import numpy as np
 
 from lerobot_openspm.geometry import se3
 from lerobot_openspm.geometry.se3 import Array
-from lerobot_openspm.perception.objects.shape import shape
+from lerobot_openspm.perception.objects.shape import hull
 
-# Corners of a box of unit size, and points on the rims of the cylinder inscribed in it.
+# Corners of a box of unit size that stands on its origin, and points on the rims of the cylinder in it.
 _SIGNS = np.array([-0.5, 0.5])
-_CORNERS = np.stack(np.meshgrid(_SIGNS, _SIGNS, [0.0, 1.0], indexing="ij"), axis=-1).reshape(-1, 3)
+CORNERS = np.stack(np.meshgrid(_SIGNS, _SIGNS, [0.0, 1.0], indexing="ij"), axis=-1).reshape(-1, 3)
 _ANGLES = np.arange(32) * 2 * np.pi / 32
 _RIMS = np.concatenate([
     np.stack([np.cos(_ANGLES) / 2, np.sin(_ANGLES) / 2, np.full(len(_ANGLES), z)], axis=1) for z in (0.0, 1.0)
@@ -43,7 +43,7 @@ class Box:
 
     def vertices(self) -> Array:
         """Points in the world ``(n, 3)`` whose convex hull the body is."""
-        return se3.apply(self.T_world_obj, (_RIMS if self.is_round else _CORNERS) * self.size)
+        return se3.apply(self.T_world_obj, (_RIMS if self.is_round else CORNERS) * self.size)
 
 
 # Rectangles turned by more than this, and not larger than by this factor, are rivals.
@@ -52,7 +52,7 @@ RIVAL_RAD, RIVAL_AREA = np.deg2rad(15), 1.15
 
 def oriented_box(points_world: Array, height: float) -> Box:
     """The box on the plane ``z = height`` with the smallest footprint around points ``(n, 3)``."""
-    centre, yaw, sides = shape.footprint(points_world)
+    centre, yaw, sides = hull.footprint(points_world)
     rival = _rival(points_world[:, :2], yaw, sides)
     if rival is not None and _hollowness(points_world, *rival) < _hollowness(
         points_world, centre, yaw, sides

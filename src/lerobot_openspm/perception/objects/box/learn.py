@@ -4,35 +4,31 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from lerobot_openspm.errors import DatasetError
 from lerobot_openspm.geometry import se3
-from lerobot_openspm.perception.objects.box.box import Box, oriented_box
-from lerobot_openspm.perception.objects.box.localise import place
-from lerobot_openspm.perception.objects.box.outline import OutlineFit, fit_outlines, outline
-from lerobot_openspm.perception.objects.lifting import Lifted, lift, support_height
-from lerobot_openspm.perception.objects.mask_association import (
+from lerobot_openspm.perception.objects.base import (
+    Appearance,
     Instances,
-    Sighting,
-    segmented,
-    touched,
-    whole_mask,
+    Kind,
+    Lesson,
+    ObjectShape,
+    ShapeBackend,
 )
-from lerobot_openspm.perception.objects.model import BoxModel, box_period
-from lerobot_openspm.perception.objects.object_shape import ShapeBackend
+from lerobot_openspm.perception.objects.box.box import Box, oriented_box
+from lerobot_openspm.perception.objects.box.lifting import Lifted, lift, support_height
+from lerobot_openspm.perception.objects.box.model import BoxModel, box_period, from_record, place
+from lerobot_openspm.perception.objects.box.outline import OutlineFit, fit_outlines, outline
+from lerobot_openspm.perception.objects.mask_association import ObjectMasks, segmented, touched, whole_mask
 from lerobot_openspm.perception.objects.yaw import yaw_range
-from lerobot_openspm.types import Scene, Segmentation, Segmenter, View
+from lerobot_openspm.types import Scene, Segmentation, View
 
 log = logging.getLogger(__name__)
 
 # Rays through the centres of one object's masks miss each other by less than this, metres.
 MAX_RAY_GAP = 0.05
-# Fingers close above the plane that objects stand on; where nothing else tells it, it is taken to lie this
-# far below the lowest point that they ever went to, metres.
-BELOW_HINTS_M = 0.02
 
 
 @dataclass(frozen=True)
@@ -41,98 +37,83 @@ class Seen:
 
     Attributes:
         views: The first frame's views.
-        sighting: The mask that the hand touched, by camera.
+        masks: The mask that the hand touched, by camera.
         lifted: Its points.
     """
 
     views: Mapping[str, View]
-    sighting: Sighting
+    masks: ObjectMasks
     lifted: Lifted
+
+    def appearances(self) -> list[Appearance]:
+        """The object in every view that shows it."""
+        points = self.lifted.points_world
+        return [Appearance(self.views[camera], one, points) for camera, one in self.masks.items()]
 
     @property
     def shows_plane(self) -> bool:
         """Whether the masks tell at which height the object stands: rays from several places do."""
-        return len(self.sighting) >= 2
+        return len(self.masks) >= 2
 
     def plane(self, floor: float) -> float:
         """World height to look for the object at, metres: as the depths around it show, else the floor."""
         found = [
             support_height(self.views[camera], one.mask)
-            for camera, one in self.sighting.items()
+            for camera, one in self.masks.items()
             if self.views[camera].depth is not None
         ]
         heights = [height for height in found if height is not None]
         return float(np.median(heights)) if heights else floor
 
 
-def learn_boxes(
-    phrases: Sequence[str],
-    scenes: Sequence[Scene],
-    segmenter: Segmenter,
-    shapes: ShapeBackend | None = None,
-) -> dict[str, BoxModel]:
+def learn_boxes(lesson: Lesson) -> dict[str, BoxModel]:
     """Learn the boxes of objects from where their demonstrations' first frames show them.
 
-    Args:
-        phrases: Names of the objects.
-        scenes: First frames and hints of the demonstrations of all tasks.
-        segmenter: Finds the instances of a phrase; of several, the one that the hand touched is meant.
-        shapes: Tells the size of each object, once, from the view that shows it largest; by default the
-            outlines of all its masks do.
-
-    Returns:
-        Models by phrase. One that is seen in no demonstration is left out, and the log says so.
-
-    Raises:
-        DatasetError: There are no phrases.
-        PerceptionError: The segmenter cannot know a phrase, a view lacks what it needs, or the shape backend
-            cannot be used.
+    The outlines of all an object's masks tell its size; for source "sam3d" the shape backend does, from the
+    view that shows the object largest. One that is seen in no demonstration is left out, and the log says so.
     """
-    if not phrases:
-        raise DatasetError(
-            "no object to learn the box of; give the phrases that the demonstrations' hints name"
-        )
-    floor = floor_of(scenes)
-    models = {}
-    for phrase, pairs in segmented(phrases, scenes, segmenter).items():
-        seen = [_see(scene, phrase, found, floor) for scene, found in pairs]
-        ones = [one for one in seen if one is not None]
-        if ones:
-            models[phrase] = _learn(phrase, ones, floor, shapes)
+    if lesson.segmenter is None or lesson.source == "demonstrations":
+        return {}
+    floor, seen = lesson.floor, dict[str, list[Seen]]()
+    for name, pairs in segmented(lesson.names, lesson.scenes, lesson.segmenter).items():
+        ones = [_see(scene, name, found, floor) for scene, found in pairs]
+        if kept := [one for one in ones if one is not None]:
+            seen[name] = kept
         else:
-            log.warning("perception: no mask of %r near where the hand touched it", phrase)
-    return models
+            log.warning("perception: no mask of %r near where the hand touched it", name)
+    if lesson.shapes is None:
+        trials = {name: _from_outlines(name, ones, floor) for name, ones in seen.items()}
+    else:
+        trials = _described(seen, lesson.shapes)
+    return {name: _learn(trial, seen[name]) for name, trial in trials.items()}
 
 
-def floor_of(scenes: Sequence[Scene]) -> float:
-    """World height, metres, below which nothing that the hand touched can stand."""
-    heights = [float(hint.point_world[2]) for scene in scenes for hint in scene.hints]
-    return min(heights, default=0.0) - BELOW_HINTS_M
+BOX = Kind(BoxModel.kind, learn_boxes, from_record)
 
 
 def _see(scene: Scene, name: str, instances: Instances, floor: float) -> Seen | None:
     hints = [hint for hint in scene.hints if hint.name == name]
-    sighting = {
+    masks = {
         camera: Segmentation(blob.mask, one.confidence)
         for camera, one in touched(scene.views, instances, hints, floor).items()
         if (blob := whole_mask(one.mask)) is not None
     }
-    lifted = lift(scene.views, {camera: one.mask for camera, one in sighting.items()}, floor)
+    lifted = lift(scene.views, {camera: one.mask for camera, one in masks.items()}, floor)
     if lifted is None or lifted.ray_gap_m > MAX_RAY_GAP:
         return None
-    return Seen(scene.views, sighting, lifted)
+    return Seen(scene.views, masks, lifted)
 
 
-def _learn(name: str, seen: Sequence[Seen], floor: float, shapes: ShapeBackend | None) -> BoxModel:
-    trial = _from_outlines(name, seen, floor) if shapes is None else _described(name, seen, shapes)
-    size, height, period = trial.size, trial.height, trial.yaw_period
-    placed = [place(one.views, one.sighting, trial) for one in seen]
+def _learn(trial: BoxModel, seen: Sequence[Seen]) -> BoxModel:
+    """A first model with the yaws and the overlap of its demonstrations."""
+    period = trial.yaw_period
+    placed = [place(one.views, one.masks, trial) for one in seen]
     yaws = np.array([float(se3.yaw_of(one.fit.body.T_world_obj)) for one in placed])
     centre, halfwidth = yaw_range(yaws, period)
     # Where the yaws keep to a part of the circle nothing shows a symmetry, and nothing needs it.
     shown = period if halfwidth >= period / 2 else 2 * np.pi
     overlap = float(np.median([one.score for one in placed]))
-    return BoxModel(name, size, height, float(shown), centre, overlap)
+    return replace(trial, yaw_period=float(shown), yaw_centre=centre, typical_overlap=overlap)
 
 
 def _from_outlines(name: str, seen: Sequence[Seen], floor: float) -> BoxModel:
@@ -148,19 +129,27 @@ def _from_outlines(name: str, seen: Sequence[Seen], floor: float) -> BoxModel:
     return BoxModel(name, size, height, 0.0 if is_round else box_period(size), 0.0, 1.0)
 
 
-def _described(name: str, seen: Sequence[Seen], shapes: ShapeBackend) -> BoxModel:
-    """A first model, of the size that a shape backend tells from the view that shows the object largest."""
-    one, camera = max(
-        ((one, camera) for one in seen for camera in one.sighting),
-        key=lambda pair: int(pair[0].sighting[pair[1]].mask.sum()),
-    )
-    shape = shapes.describe(one.views[camera], one.sighting[camera], one.lifted.points_world)
+def _described(seen: Mapping[str, Sequence[Seen]], shapes: ShapeBackend) -> dict[str, BoxModel]:
+    """First models, of the sizes that a shape backend tells from the views that show the objects largest."""
+    best = [max((view for one in ones for view in one.appearances()), key=_area) for ones in seen.values()]
+    return {
+        name: _sized(name, ones, shape)
+        for (name, ones), shape in zip(seen.items(), shapes.describe(best), strict=True)
+    }
+
+
+def _area(appearance: Appearance) -> int:
+    return int(appearance.segmentation.mask.sum())
+
+
+def _sized(name: str, seen: Sequence[Seen], shape: ObjectShape) -> BoxModel:
+    """A first model of a known size: round or not, whichever fits the masks better."""
     log.info("perception: %r is %s m, quality %.2f", name, np.round(shape.extents, 3), shape.quality)
     height = float(shape.T_world_obj[2, 3])
     trials = [
         BoxModel(name, shape.extents, height, period, 0.0, 1.0) for period in (0.0, box_period(shape.extents))
     ]
-    return min(trials, key=lambda trial: _residual([place(s.views, s.sighting, trial).fit for s in seen]))
+    return min(trials, key=lambda trial: _residual([place(s.views, s.masks, trial).fit for s in seen]))
 
 
 def _free_fit(seen: Seen, floor: float, is_round: bool) -> OutlineFit:
@@ -168,9 +157,7 @@ def _free_fit(seen: Seen, floor: float, is_round: bool) -> OutlineFit:
     height = seen.plane(floor)
     start = oriented_box(seen.lifted.points_world, height)
     size = np.maximum(start.size, 2 * seen.lifted.spacing)
-    outlines = [
-        outline(seen.views[camera], one.mask, one.confidence) for camera, one in seen.sighting.items()
-    ]
+    outlines = [outline(seen.views[camera], one.mask, one.confidence) for camera, one in seen.masks.items()]
     turns = [0.0] if is_round else [0.0, np.pi / 4]
     fits = [
         fit_outlines(

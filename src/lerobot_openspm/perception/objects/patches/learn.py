@@ -7,31 +7,24 @@ of other tasks. What really follows the object is followed alike by patches of s
 tracks that belong to other objects disagree. Where the hand touched a place of the object more than once,
 where it went has to agree; and two objects do not move alike, so a group belongs to one object alone. One
 demonstration of each of several tasks is enough.
-
-That an object hardly moves is never taken from a few scenes that happen to agree. The hand's repeated
-touches tell how likely it is, all places and both axes taken together. So do the other objects' touches, and
-how the objects are known that were learned before: in one place most objects stand still, in another most
-are moved about.
 """
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
-from scipy.stats import chi2
 
 from lerobot_openspm.geometry.camera import project
 from lerobot_openspm.geometry.se3 import Array
-from lerobot_openspm.perception.objects.model import KnownObject, Patch, PatchModel, Probe
-from lerobot_openspm.perception.objects.patches.patches import as_seen, cut, localise_patches, match
+from lerobot_openspm.perception.objects.base import Kind, KnownObject, Lesson, Look
+from lerobot_openspm.perception.objects.patches.match import Patch, Probe, as_seen, cut, match
+from lerobot_openspm.perception.objects.patches.model import PatchModel, from_record
+from lerobot_openspm.perception.objects.patches.stillness import hardly_moving, places_of
 from lerobot_openspm.types import ContactCue, Scene, View
 
-# The hand's target moves with the object; if its standard deviation along an axis is below this, patches do.
-# It is that of a uniform distribution within 3 cm of the middle, about as far as a patch is sought.
-MAX_STD_M = 0.03 / np.sqrt(3)
 # A place touched less often says nothing of how far its object moves.
 MIN_TOUCHES = 2
 RADII_M = (0.025, 0.035, 0.05, 0.07, 0.10)
@@ -103,23 +96,17 @@ class _Candidate:
     groups: list[list[_Trail]]
 
 
-def learn_patches(
-    names: Sequence[str], scenes: Sequence[Scene], known: Collection[KnownObject] = ()
-) -> dict[str, PatchModel]:
-    """Learn the objects that hardly move; the others are left out.
-
-    Args:
-        names: The objects.
-        scenes: First frames of all demonstrations, with hints at the objects.
-        known: Other objects, whose motions are not theirs.
-    """
-    still = hardly_moving(names, scenes, known)
-    candidates = [_candidate(name, scenes) for name in names if still[name] >= 0.5]
+def learn_patches(lesson: Lesson) -> dict[str, PatchModel]:
+    """Learn the objects that hardly move; where a segmenter finds the objects, none."""
+    if lesson.segmenter is not None:
+        return {}
+    scenes, still = lesson.scenes, hardly_moving(lesson.names, lesson.scenes, lesson.known)
+    candidates = [_candidate(name, scenes) for name in lesson.names if still[name] >= 0.5]
     # What many patches agree on is claimed first: what they follow is not another object.
     candidates.sort(key=lambda one: -max((len(group) for group in one.groups), default=0))
     learned: dict[str, PatchModel] = {}
     for one in candidates:
-        claimants = [*known, *learned.values()]
+        claimants = [*lesson.known, *learned.values()]
         free = (group for group in one.groups if not _claimed(group[0], one.scenes, claimants))
         models = (_model(one.name, group, one.scenes) for group in free)
         if model := next((model for model in models if model is not None), None):
@@ -127,52 +114,7 @@ def learn_patches(
     return learned
 
 
-def hardly_moving(
-    names: Sequence[str], scenes: Sequence[Scene], known: Collection[KnownObject] = ()
-) -> dict[str, float]:
-    """Probability by name that an object hardly moves between demonstrations, given all touches.
-
-    Two or three places that agree are weak evidence, so each object begins with what the others tell: of a
-    beta distribution, counting every other object that tells anything, and one of either kind.
-
-    Args:
-        names: The objects.
-        scenes: First frames of all demonstrations, with hints at the objects.
-        known: Other objects, which are known by patches where they hardly moved.
-    """
-    told = {name: p for name in names if (p := _hardly_moves(scenes, name)) is not None}
-    before = [float(isinstance(model, PatchModel)) for model in known if model.name not in names]
-    found = {}
-    for name in names:
-        others = [*before, *(p for other, p in told.items() if other != name)]
-        prior = (1 + sum(others)) / (2 + len(others))
-        own = told.get(name, 0.5)
-        found[name] = own * prior / (own * prior + (1 - own) * (1 - prior))
-    return found
-
-
-def _hardly_moves(scenes: Sequence[Scene], name: str) -> float | None:
-    """Probability, by the touches of one object alone, that its standard deviation is small.
-
-    The variance's posterior given n independent deviations is an inverse chi-squared distribution, where
-    nothing is known of its scale beforehand (Gelman et al., Bayesian Data Analysis, section 2.6). Kept
-    strictly between 0 and 1; None where no place was touched twice.
-    """
-    places = _places(hint for scene in scenes for hint in scene.hints if hint.name == name)
-    points = [np.stack([hint.point_world[:2] for hint in place]) for place in places]
-    degrees = 2 * sum(len(own) - 1 for own in points)
-    if degrees == 0:
-        return None
-    squares = sum(float(((own - own.mean(axis=0)) ** 2).sum()) for own in points)
-    return float(np.clip(chi2.sf(squares / MAX_STD_M**2, degrees), 1e-6, 1 - 1e-6))
-
-
-def _places(hints: Iterable[ContactCue]) -> list[list[ContactCue]]:
-    """Hints grouped by the place on the object that they touch."""
-    groups: dict[tuple[str, str], list[ContactCue]] = {}
-    for hint in hints:
-        groups.setdefault((hint.kind, hint.place), []).append(hint)
-    return list(groups.values())
+PATCHES = Kind(PatchModel.kind, learn_patches, from_record)
 
 
 def _candidate(name: str, scenes: Sequence[Scene]) -> _Candidate:
@@ -183,7 +125,7 @@ def _candidate(name: str, scenes: Sequence[Scene]) -> _Candidate:
     looked_at = own + _spaced(others, MAX_SCENES - len(own))
     hints = [next(hint for hint in scene.hints if hint.name == name) for scene in own]
     trails = []
-    for number, place in enumerate(_places(hints)):
+    for number, place in enumerate(places_of(hints)):
         first = next(i for i, hint in enumerate(hints) if hint is place[0])
         for camera in own[first].views:
             for drop in DROPS_M:
@@ -255,7 +197,7 @@ def _difference(motion: Array, other: Array) -> float:
 def _believable(groups: Sequence[list[_Trail]], hints: Sequence[ContactCue]) -> list[list[_Trail]]:
     """The groups that are large enough and agree with where the hand went, or else, untold, move at all."""
     large = [group for group in groups if len(group) >= MIN_AGREEING]
-    places = [place for place in _places(hints) if len(place) >= MIN_TOUCHES]
+    places = [place for place in places_of(hints) if len(place) >= MIN_TOUCHES]
     if not places:
         return [group for group in large if _moves(group[0])]
     residuals = [_residual(group[0].points, hints, places) for group in large]
@@ -291,7 +233,7 @@ def _claimed(trail: _Trail, scenes: Sequence[Scene], known: Iterable[KnownObject
     for model in known:
         if not isinstance(model, PatchModel):
             continue
-        found = [localise_patches(scene.views, model) for scene in scenes]
+        found = [model.localise(Look(scene.views)) for scene in scenes]
         points = np.stack(
             [one.T_world_obj[:2, 3] if one.status == "found" else np.full(2, np.nan) for one in found]
         )

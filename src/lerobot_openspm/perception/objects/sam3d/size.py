@@ -1,16 +1,22 @@
 """The shape backend "SAM 3D Objects": the model runs in its own environment, this is the client.
 
-SAM 3D works in PyTorch3D's camera frame: x left, y up, z forward, points as rows, so that
-`p_cam = (p_obj * scale) @ R + translation`. Everything is brought into this project's frames here: OpenCV's
-camera (x right, y down, z forward), points as columns. Source: the paper, section "Semantically Conditioned
-3D Perception": reconstruction of single objects gives local shape and principal-axis directions.
+Source: the paper, section "Semantically Conditioned 3D Perception": reconstruction of single objects gives
+local shape and principal-axis directions.
 """
 
 from __future__ import annotations
 
+import contextlib
+import os
+import shlex
+import signal
+import subprocess
+import tempfile
+import zipfile
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
+from typing import IO
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,109 +25,121 @@ from scipy.spatial import KDTree
 from lerobot_openspm.errors import PerceptionError
 from lerobot_openspm.geometry import se3
 from lerobot_openspm.geometry.se3 import Array
-from lerobot_openspm.perception.objects.object_shape import ObjectShape, make_upright
-from lerobot_openspm.perception.objects.sam3d import worker as sam3d_worker
-from lerobot_openspm.perception.objects.sam3d.process import WorkerProcess
-from lerobot_openspm.perception.objects.sam3d.worker import Arrays, Message
+from lerobot_openspm.perception.objects.base import Appearance, ObjectShape
+from lerobot_openspm.perception.objects.sam3d import worker
+from lerobot_openspm.perception.objects.sam3d.reconstruction import (
+    FLIP,
+    Arrays,
+    Reconstruction,
+    expect,
+    factor_by_points,
+    make_upright,
+    reconstruction_from,
+)
 from lerobot_openspm.perception.objects.shape import silhouette
 from lerobot_openspm.types import Segmentation, View
 
-# Turns PyTorch3D's camera frame into OpenCV's and back.
-FLIP = np.diag([-1.0, -1.0, 1.0])
-ANSWER = {"rotation_wxyz": (4,), "translation": (3,), "scale": (3,), "centre": (3,), "extents": (3,)}
-# A quaternion that went through half precision is off by less.
-UNIT_TOLERANCE = 0.01
+# Variables of our own environment that would lead another Python to our packages.
+OURS = ("PYTHONPATH", "PYTHONHOME", "PYTHONSTARTUP", "VIRTUAL_ENV", "CONDA_PREFIX")
+LOG_BYTES, LOG_LINES = 8192, 15
 LARGEST_M = 10.0
 MIN_DEPTH_PIXELS = 16
 
 
-@dataclass(frozen=True)
-class Reconstruction:
-    """An object as SAM 3D found it, in our frames; lengths are in metres if the point map was.
-
-    Attributes:
-        T_cam_box: Pose ``(4, 4)`` of the object's box, its origin at the box's centre, in OpenCV's frame.
-        extents: Of the box along its axes ``(3,)``.
-        points_cam: Points ``(n, 3)`` of its surface in the camera frame.
-    """
-
-    T_cam_box: Array
-    extents: Array
-    points_cam: Array
-
-    def scaled(self, factor: float) -> Reconstruction:
-        """The same picture of an object that is so many times as large and as far away."""
-        T = self.T_cam_box.copy()
-        T[:3, 3] *= factor
-        return Reconstruction(T, self.extents * factor, self.points_cam * factor)
-
-
 class Sam3dShape:
-    """Shapes by SAM 3D Objects, one object a call; a :class:`ShapeBackend`. Use it in a `with` statement.
+    """Shapes by SAM 3D Objects; a :class:`ShapeBackend`.
 
-    The model knows sizes only from depth. Where the view has none, points of the object in the world tell the
-    size, or else the plane it stands on.
+    All objects are described in one run of the worker, which loads the model, reads one file of questions and
+    writes one of answers. The model knows sizes only from depth. Where a view has none, points of the object
+    in the world tell its size.
 
     Args:
-        command: The worker's command, from :func:`worker_command`. It is started at the first call.
-        support_height: World z in metres of the plane that objects stand on, for views without depth.
-        seed: Where the model's random numbers start, for each object anew.
-        start_timeout_s: Until the worker must have loaded the model.
-        timeout_s: Until it must have answered.
+        command: The worker's command, from :func:`worker_command`.
+        start_timeout_s: Until the worker must have loaded the model ...
+        timeout_s: ... and, for each object, until it must have described it.
     """
 
-    def __init__(
-        self,
-        command: Sequence[str],
-        *,
-        support_height: float | None = None,
-        seed: int = 42,
-        start_timeout_s: float = 600.0,
-        timeout_s: float = 120.0,
-    ):
-        self._worker = WorkerProcess(command, start_timeout_s, timeout_s)
-        self._support_height, self._seed = support_height, seed
+    def __init__(self, command: Sequence[str], *, start_timeout_s: float = 600.0, timeout_s: float = 120.0):
+        self._command = tuple(command)
+        self._start_timeout_s, self._timeout_s = start_timeout_s, timeout_s
 
-    def __enter__(self) -> Sam3dShape:
-        return self
-
-    def __exit__(self, *exception: object) -> None:
-        self.close()
-
-    def close(self) -> None:
-        """End the worker; a later call starts another."""
-        self._worker.close()
-
-    def describe(
-        self, view: View, segmentation: Segmentation, points_world: Array | None = None
-    ) -> ObjectShape:
-        """The object's upright box. See :class:`ShapeBackend`; quality is the overlap of shape and mask.
+    def describe(self, objects: Sequence[Appearance]) -> list[ObjectShape]:
+        """The objects' upright boxes. Quality is the overlap of shape and mask.
 
         Raises:
-            PerceptionError: The worker cannot be used, its answer makes no sense, or nothing tells the size.
+            PerceptionError: The worker cannot be used, its answer makes no sense, or nothing tells a size.
         """
-        _check_view(view, segmentation)
-        metric = _has_depth(view, segmentation)
-        if not metric and points_world is None and self._support_height is None:
-            raise PerceptionError(
-                f"SAM 3D needs to know the size: got fewer than {MIN_DEPTH_PIXELS} pixels of the object with "
-                "depth, no points of it and no support height; expected one of them; pass support_height=Z"
-            )
-        reply = self._worker.ask(Message("request", 0, request_arrays(view, segmentation), self._seed))
-        found = reconstruction_from(reply.arrays)
-        if not metric:
-            found = found.scaled(self._factor(found, view, points_world))
-        _expect(
-            found.extents.max() < LARGEST_M, "extents", reply.arrays, f"less than {LARGEST_M:g} m, scaled"
-        )
-        box = make_upright(view.T_world_cam @ found.T_cam_box, found.extents)
-        return ObjectShape(box.T_world_obj, box.extents, _quality(found, view, segmentation), box.tilt)
+        for one in objects:
+            _check(one)
+        if not objects:
+            return []
+        answers = self._ask([request_arrays(one.view, one.segmentation) for one in objects])
+        return [_shape(one, arrays) for one, arrays in zip(objects, answers, strict=True)]
 
-    def _factor(self, found: Reconstruction, view: View, points_world: Array | None) -> float:
-        if points_world is not None:
-            return factor_by_points(found, se3.apply(se3.inverse(view.T_world_cam), points_world))
-        assert self._support_height is not None
-        return factor_by_plane(found, view.T_world_cam, self._support_height)
+    def _ask(self, questions: Sequence[Arrays]) -> list[Arrays]:
+        """The worker's answers to arrays, by a run of it that ends by a deadline."""
+        limit_s = self._start_timeout_s + self._timeout_s * len(questions)
+        with tempfile.TemporaryDirectory() as folder, tempfile.TemporaryFile() as log:
+            asked, answered = Path(folder) / "questions.npz", Path(folder) / "answers.npz"
+            arrays = {f"{i}.{key}": a for i, one in enumerate(questions) for key, a in one.items()}
+            np.savez(asked, **arrays)  # pyright: ignore[reportArgumentType]  (typed as its other options)
+            code = self._run((*self._command, str(asked), str(answered)), log, limit_s)
+            if code != 0:
+                got = f"nothing after {limit_s:g} s" if code is None else f"its end with exit code {code}"
+                raise self._failed(got, "answers", log)
+            try:
+                with np.load(answered, allow_pickle=False) as stored:
+                    told = dict(stored)
+            except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:
+                raise self._failed(f"no answers that can be read ({error})", "answers", log) from error
+            found: list[Arrays] = [
+                {key.removeprefix(f"{i}."): a for key, a in told.items() if key.startswith(f"{i}.")}
+                for i in range(len(questions))
+            ]
+            if errors := [str(one["error"]) for one in found if "error" in one]:
+                raise self._failed(f"the error {errors[0]!r}", "an answer", log)
+            return found
+
+    def _run(self, command: Sequence[str], log: IO[bytes], limit_s: float) -> int | None:
+        """Run a command until it ends, or None if it takes too long; what it started ends with it."""
+        environment = {name: value for name, value in os.environ.items() if name not in OURS}
+        try:
+            process = subprocess.Popen(
+                command,
+                stdin=subprocess.DEVNULL,
+                stdout=log,
+                stderr=log,
+                env=environment,
+                start_new_session=True,  # a group of its own, so that what it starts can be ended with it
+            )
+        except OSError as error:
+            raise PerceptionError(
+                f"{self._name}: cannot be started: {error}; expected the Python that SAM 3D Objects is "
+                "installed in and the worker's script; see docs/sam3d.md"
+            ) from error
+        try:
+            return process.wait(limit_s)
+        except subprocess.TimeoutExpired:
+            return None
+        finally:
+            # Where the whole group has ended, there is nothing to kill; macOS says so by a PermissionError.
+            with contextlib.suppress(ProcessLookupError, PermissionError):
+                os.killpg(process.pid, signal.SIGKILL)
+            process.wait()
+
+    @property
+    def _name(self) -> str:
+        return f"SAM 3D worker ({shlex.join(self._command)})"
+
+    def _failed(self, got: str, expected: str, log: IO[bytes]) -> PerceptionError:
+        """What the worker did instead of its task, with the last lines that it printed."""
+        log.seek(max(0, log.seek(0, os.SEEK_END) - LOG_BYTES))
+        words = "\n".join(log.read().decode(errors="replace").splitlines()[-LOG_LINES:])
+        check = shlex.join((*self._command, "--check"))
+        return PerceptionError(
+            f"{self._name}: got {got}, expected {expected}; try {check!r}, or give it more time. "
+            + (f"Its last lines:\n{words}" if words else "It printed nothing.")
+        )
 
 
 def worker_command(python: Path, checkout: Path, checkpoint: Path | None = None) -> tuple[str, ...]:
@@ -133,8 +151,7 @@ def worker_command(python: Path, checkout: Path, checkpoint: Path | None = None)
         checkpoint: Folder of the weights with `pipeline.yaml`; `checkpoints/hf` of the checkout by default.
     """
     where = () if checkpoint is None else ("--checkpoint", str(checkpoint))
-    # -P: the script's folder, with its `types.py`, must not come before the standard library.
-    return (str(python), "-P", sam3d_worker.__file__, "--checkout", str(checkout), *where)
+    return (str(python), "-P", worker.__file__, "--checkout", str(checkout), *where)
 
 
 def request_arrays(view: View, segmentation: Segmentation) -> Arrays:
@@ -151,76 +168,18 @@ def request_arrays(view: View, segmentation: Segmentation) -> Arrays:
     return {name: array[:, ::-1] for name, array in arrays.items()} if view.camera.fx < 0 else arrays
 
 
-def reconstruction_from(arrays: Arrays) -> Reconstruction:
-    """Check an answer and bring it into our frames.
-
-    Raises:
-        PerceptionError: Something is missing, not finite, of another shape, not a rotation, or no object.
-    """
-    for name, shape in ANSWER.items():
-        _expect(name in arrays and arrays[name].shape == shape, name, arrays, f"shape {shape}")
-    many = np.ndim(arrays.get("points", 0)) == 2 and arrays["points"].shape[1] == 3
-    most = sam3d_worker.MAX_POINTS
-    fits = many and 8 <= len(arrays["points"]) <= most
-    _expect(fits, "points", arrays, f"shape (n, 3) with n at least 8 and at most {most}")
-    for name in (*ANSWER, "points"):
-        _expect(bool(np.isfinite(arrays[name]).all()), name, arrays, "finite numbers")
-    values = {name: np.asarray(arrays[name], float) for name in (*ANSWER, "points")}
-    quat_wxyz, scale, extents = values["rotation_wxyz"], values["scale"], values["extents"]
-    norm = float(np.linalg.norm(quat_wxyz))
-    _expect(abs(norm - 1) < UNIT_TOLERANCE, "rotation_wxyz", arrays, "a unit quaternion")
-    _expect(bool((scale > 0).all()), "scale", arrays, "positive numbers")
-    size = extents * scale
-    _expect(bool((extents >= 0).all()) and size.max() > 0, "extents", arrays, "the sizes of a box")
-    slack = 0.01 * extents.max()
-    inside = bool((np.abs(values["points"] - values["centre"]) <= extents / 2 + slack).all())
-    _expect(inside, "points", arrays, "points within the box")
-    R_cam_obj = FLIP @ se3.matrix_from_quat_xyzw(quat_wxyz[[1, 2, 3, 0]]).T
-    T_cam_obj = se3.transform(R_cam_obj, FLIP @ values["translation"])
-    centre = se3.apply(T_cam_obj, (values["centre"] * scale)[None])[0]
-    points_cam = se3.apply(T_cam_obj, values["points"] * scale)
-    _expect(bool((points_cam[:, 2] > 0).all()), "translation", arrays, "an object in front of the camera")
-    return Reconstruction(se3.transform(R_cam_obj, centre), size, points_cam)
+def _shape(one: Appearance, arrays: Arrays) -> ObjectShape:
+    found = reconstruction_from(arrays)
+    if one.points_world is not None and not _has_depth(one.view, one.segmentation):
+        points_cam = se3.apply(se3.inverse(one.view.T_world_cam), one.points_world)
+        found = found.scaled(factor_by_points(found, points_cam))
+    expect(found.extents.max() < LARGEST_M, "extents", arrays, f"less than {LARGEST_M:g} m, scaled")
+    T_world_obj, extents, tilt = make_upright(one.view.T_world_cam @ found.T_cam_box, found.extents)
+    return ObjectShape(T_world_obj, extents, _quality(found, one.view, one.segmentation), tilt)
 
 
-def factor_by_points(found: Reconstruction, points_cam: Array) -> float:
-    """How many times as far as found the object is, from points ``(n, 3)`` of its visible surface.
-
-    Raises:
-        PerceptionError: No point lies in front of the camera.
-    """
-    ahead = points_cam[np.isfinite(points_cam).all(axis=1) & (points_cam[:, 2] > 0.01)]
-    if not len(ahead):
-        raise PerceptionError(
-            f"SAM 3D needs points to know the size: got none of {len(points_cam)} before the camera, "
-            "expected at least one; check the camera's calibration"
-        )
-    cloud = found.points_cam
-    near = min(8, len(cloud))
-    # In the picture next to each other, the front one is the one that is seen.
-    _, index = KDTree(cloud[:, :2] / cloud[:, 2:]).query(ahead[:, :2] / ahead[:, 2:], k=near)
-    front = cloud[:, 2][index].min(axis=1)
-    return float(np.median(ahead[:, 2] / front))
-
-
-def factor_by_plane(found: Reconstruction, T_world_cam: Array, support_height: float) -> float:
-    """How many times as far as found the object is, if its lowest point is at a height of the world, metres.
-
-    Raises:
-        PerceptionError: The camera is not above the plane or does not look down on the object.
-    """
-    lowest = float((found.points_cam @ T_world_cam[:3, :3].T)[:, 2].min())
-    drop = float(support_height - T_world_cam[2, 3])
-    if drop >= 0 or lowest >= -1e-6:
-        raise PerceptionError(
-            f"SAM 3D needs the plane under the object to know the size: got a plane {-drop:.3f} m below the "
-            f"camera and an object that reaches {-lowest:.3f} below it, expected both below; check the "
-            "camera's calibration and support_height"
-        )
-    return drop / lowest
-
-
-def _check_view(view: View, segmentation: Segmentation) -> None:
+def _check(one: Appearance) -> None:
+    view, segmentation = one.view, one.segmentation
     shape, n_pixels = view.image.shape[:2], np.count_nonzero(segmentation.mask)
     if segmentation.mask.shape != shape or not n_pixels:
         raise PerceptionError(
@@ -231,6 +190,11 @@ def _check_view(view: View, segmentation: Segmentation) -> None:
         raise PerceptionError(
             f"SAM 3D: got depth of shape {view.depth.shape}, expected {shape}; "
             "pass depth aligned with the image"
+        )
+    if one.points_world is None and not _has_depth(view, segmentation):
+        raise PerceptionError(
+            f"SAM 3D needs to know the size: got fewer than {MIN_DEPTH_PIXELS} pixels of the object with "
+            "depth and no points of it, expected one of them; give the view's depth or points_world"
         )
 
 
@@ -261,13 +225,3 @@ def _quality(found: Reconstruction, view: View, segmentation: Segmentation) -> f
     mask = np.asarray(segmentation.mask, np.float32)
     common, model, _ = silhouette.overlap(drawing, mask, None)
     return min(1.0, common / (model + np.count_nonzero(segmentation.mask) - common))
-
-
-def _expect(fine: bool, name: str, arrays: Arrays, expected: str) -> None:
-    if not fine:
-        got = arrays.get(name)
-        what = "nothing" if got is None else f"shape {got.shape}: {np.asarray(got).ravel()[:6]}"
-        raise PerceptionError(
-            f"SAM 3D worker: its answer's {name!r}: got {what}, expected {expected}; see docs/sam3d.md for "
-            "the messages"
-        )

@@ -1,157 +1,46 @@
-r"""The other end of `sam3d.py`: runs SAM 3D Objects in that model's own Python environment.
+r"""The other end of `size.py`: runs SAM 3D Objects in that model's own Python environment.
 
 This file is started as a script by the Python (3.11) that SAM 3D Objects is installed in, so it imports
-nothing but the standard library, NumPy and SAM 3D itself. It also defines the messages of both ends:
+nothing but the standard library, NumPy and SAM 3D itself. It reads one `.npz` file of questions and writes
+one of answers, neither with pickled objects. The arrays of object number i are
 
-    8 bytes    b"OPENSPM\n"
-    4 bytes    length of the header, unsigned, little-endian
-    header     JSON: version, kind, id, seed, text, arrays (name, dtype and shape of each)
-    body       the arrays' bytes one after another: little-endian, last index first, nothing between them
-
-The worker says `ready` when the model is loaded, then answers every `request` by an `answer` or an `error`
-with the same id, until its input ends. Everything else that is printed goes to the standard error.
+    questions   `i.image` (H, W, 3) uint8, `i.mask` (H, W) uint8, perhaps `i.pointmap` (H, W, 3) float32
+    answers     those of :func:`reconstruct` after `i.`, or `i.error`, a text
 """
 
 from __future__ import annotations
 
 import argparse
-import json
-import math
 import os
-import struct
 import sys
 import traceback
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 Arrays = Mapping[str, NDArray[Any]]
 
-VERSION = 1
-MAGIC = b"OPENSPM\n"
-PREFIX = struct.Struct("<8sI")
-MAX_HEADER_BYTES = 1 << 16
-MAX_BODY_BYTES = 1 << 28
-DTYPES = {"uint8": "|u1", "float32": "<f4", "float64": "<f8"}
 MAX_POINTS = 8192
+# Where the model's random numbers start, for each object anew.
+SEED = 42
 
 
-class WireError(ValueError):
-    """Bytes that are no message of this version."""
-
-
-@dataclass(frozen=True)
-class Message:
-    """One message.
-
-    Attributes:
-        kind: ``"ready"``, ``"request"``, ``"answer"`` or ``"error"``.
-        id: Of a request, and of the answer or error that belongs to it.
-        arrays: By name, of the types in :data:`DTYPES`.
-        seed: Of a request: where the model's random numbers start.
-        text: Of an error: what happened.
-    """
-
-    kind: str
-    id: int
-    arrays: Arrays
-    seed: int = 0
-    text: str = ""
-
-
-def pack(message: Message) -> bytes:
-    """The bytes of a message. Raises WireError on a type of array that does not travel, or one too large."""
-    listed, body = [], []
-    for name, array in message.arrays.items():
-        if array.dtype.name not in DTYPES:
-            raise WireError(f"array {name!r} has dtype {array.dtype}, expected one of {sorted(DTYPES)}")
-        listed.append({"name": name, "dtype": array.dtype.name, "shape": list(array.shape)})
-        body.append(np.ascontiguousarray(array, DTYPES[array.dtype.name]).tobytes())
-    size = sum(map(len, body))
-    if size > MAX_BODY_BYTES:
-        raise WireError(f"arrays of {size} bytes, expected at most {MAX_BODY_BYTES}")
-    fields = {"kind": message.kind, "id": message.id, "seed": message.seed, "text": message.text[:4000]}
-    header = json.dumps({"version": VERSION, **fields, "arrays": listed}).encode()
-    return b"".join([PREFIX.pack(MAGIC, len(header)), header, *body])
-
-
-def read_message(read: Callable[[int], bytes]) -> Message | None:
-    """Read one message; None where the stream ends before it.
-
-    Args:
-        read: Gives so many bytes, and fewer only at the end of the stream.
-
-    Raises:
-        WireError: Not a message, one of another version, one too large, or one that breaks off.
-    """
-    prefix = read(PREFIX.size)
-    if not prefix:
-        return None
-    if len(prefix) < PREFIX.size or not prefix.startswith(MAGIC):
-        raise WireError(f"bytes {prefix!r}, expected a message that begins with {MAGIC!r}")
-    length = PREFIX.unpack(prefix)[1]
-    if length > MAX_HEADER_BYTES:
-        raise WireError(f"a header of {length} bytes, expected at most {MAX_HEADER_BYTES}")
-    header, listed = _header(_whole(read, length))
-    try:
-        sizes = [math.prod(shape) * np.dtype(DTYPES[dtype]).itemsize for _, dtype, shape in listed]
-        if sum(sizes) > MAX_BODY_BYTES:
-            raise WireError(f"arrays of {sum(sizes)} bytes, expected at most {MAX_BODY_BYTES}")
-        arrays = {
-            name: np.frombuffer(_whole(read, size), DTYPES[dtype]).reshape(shape)
-            for (name, dtype, shape), size in zip(listed, sizes, strict=True)
-        }
-    except KeyError as error:
-        raise WireError(f"dtype {error}, expected one of {sorted(DTYPES)}") from error
-    return Message(header["kind"], header["id"], arrays, header["seed"], header["text"])
-
-
-def _header(data: bytes) -> tuple[dict[str, Any], list[tuple[str, str, list[int]]]]:
-    """Fields and arrays (name, dtype, shape) of a header; every type is checked, no value is."""
-    try:
-        header = json.loads(data)
-    except (ValueError, RecursionError) as error:
-        raise WireError(f"a header that is no JSON: {error}") from error
-    if not isinstance(header, dict) or header.get("version") != VERSION:
-        found = header.get("version") if isinstance(header, dict) else type(header).__name__
-        raise WireError(f"version {found!r}, expected {VERSION}")
-    for name, kind in {"kind": str, "id": int, "seed": int, "text": str, "arrays": list}.items():
-        if type(header.get(name)) is not kind:
-            raise WireError(f"header field {name!r} is {header.get(name)!r}, expected {kind.__name__}")
-    listed = []
-    for entry in header["arrays"]:
-        fields = entry if isinstance(entry, dict) else {}
-        name, dtype, shape = (fields.get(field) for field in ("name", "dtype", "shape"))
-        whole = isinstance(shape, list) and len(shape) <= 8 and all(type(n) is int and n >= 0 for n in shape)
-        if not (isinstance(name, str) and isinstance(dtype, str) and whole):
-            raise WireError(f"array {entry!r}, expected a name, a dtype and a shape")
-        listed.append((name, dtype, cast("list[int]", shape)))
-    return header, listed
-
-
-def _whole(read: Callable[[int], bytes], size: int) -> bytes:
-    data = read(size) if size else b""
-    if len(data) < size:
-        raise WireError(f"a message that breaks off after {len(data)} of {size} bytes")
-    return data
-
-
-def serve(
-    read: Callable[[int], bytes], write: Callable[[bytes], object], answer: Callable[[Message], Arrays]
-) -> None:
-    """Say `ready`, then answer requests until the input ends. What `answer` raises concerns one object."""
-    write(pack(Message("ready", 0, {})))
-    while (request := read_message(read)) is not None:
+def answer(inference: Callable[..., Mapping[str, Any]], asked: Path, answered: Path) -> None:
+    """Read questions and write answers. What goes wrong with one object is the answer for that object."""
+    with np.load(asked, allow_pickle=False) as stored:
+        arrays = dict(stored)
+    answers: dict[str, NDArray[Any]] = {}
+    for i in sorted({key.split(".")[0] for key in arrays}, key=int):
+        question = {key.removeprefix(f"{i}."): a for key, a in arrays.items() if key.startswith(f"{i}.")}
         try:
-            reply = pack(Message("answer", request.id, answer(request)))
+            answers |= {f"{i}.{key}": array for key, array in reconstruct(inference, question).items()}
         except Exception as error:
             traceback.print_exc()
-            reply = pack(Message("error", request.id, {}, text=f"{type(error).__name__}: {error}"))
-        write(reply)
+            answers[f"{i}.error"] = np.array(f"{type(error).__name__}: {error}")
+    np.savez(answered, **answers)  # pyright: ignore[reportArgumentType]  (typed as its other options)
 
 
 def load(checkout: Path, checkpoint: Path) -> Callable[..., Mapping[str, Any]]:
@@ -176,7 +65,7 @@ def load(checkout: Path, checkpoint: Path) -> Callable[..., Mapping[str, Any]]:
     return Inference(str(config), compile=False)
 
 
-def reconstruct(inference: Callable[..., Mapping[str, Any]], request: Message) -> Arrays:
+def reconstruct(inference: Callable[..., Mapping[str, Any]], question: Arrays) -> dict[str, NDArray[Any]]:
     """Pose, size and surface of the object in a picture, all as SAM 3D says them.
 
     Read in the same repository, not run here: `Inference.__call__(image, mask, seed, pointmap)` takes arrays
@@ -188,7 +77,7 @@ def reconstruct(inference: Callable[..., Mapping[str, Any]], request: Message) -
 
     Args:
         inference: From :func:`load`.
-        request: With arrays `image`, `mask` and perhaps `pointmap`.
+        question: Arrays `image`, `mask` and perhaps `pointmap`.
 
     Returns:
         `rotation_wxyz` (4,), `translation` (3,) and `scale` (3,) from the object's canonical frame to
@@ -198,13 +87,13 @@ def reconstruct(inference: Callable[..., Mapping[str, Any]], request: Message) -
     Raises:
         ValueError: The model found no surface, or its pose has another shape than expected.
     """
-    pointmap = request.arrays.get("pointmap")
+    pointmap = question.get("pointmap")
     if pointmap is not None:
         import torch  # of SAM 3D's environment
 
         pointmap = torch.from_numpy(np.array(pointmap, np.float32))
-    image, mask = np.array(request.arrays["image"]), request.arrays["mask"] > 0
-    output = inference(image, mask, seed=request.seed, pointmap=pointmap)
+    image, mask = np.array(question["image"]), question["mask"] > 0
+    output = inference(image, mask, seed=SEED, pointmap=pointmap)
     low, high, points = _surface(output["gaussian"][0])
     return {
         "rotation_wxyz": _numpy(output["rotation"]).reshape(4),
@@ -234,26 +123,20 @@ def _numpy(tensor: Any) -> NDArray[np.float64]:
 
 
 def main() -> None:
-    """Load SAM 3D Objects and serve, or with ``--check`` only load it."""
+    """Load SAM 3D Objects and answer questions, or with ``--check`` only load it."""
     parser = argparse.ArgumentParser(description=main.__doc__)
     parser.add_argument("--checkout", type=Path, required=True, help="folder of sam-3d-objects")
     parser.add_argument("--checkpoint", type=Path, help="folder of pipeline.yaml; CHECKOUT/checkpoints/hf")
     parser.add_argument("--check", action="store_true", help="load the model, say so and stop")
+    parser.add_argument("files", type=Path, nargs="*", help="questions.npz to read and answers.npz to write")
     options = parser.parse_args()
-    # SAM 3D and its libraries print; the pipe is for messages only.
-    pipe = os.fdopen(os.dup(1), "wb", buffering=0)
-    os.dup2(2, 1)
+    if not options.check and len(options.files) != 2:
+        parser.error("expected a file of questions and one for the answers, or --check")
     inference = load(options.checkout, options.checkpoint or options.checkout / "checkpoints" / "hf")
     if options.check:
-        print(f"SAM 3D Objects is loaded; messages of version {VERSION}", file=sys.stderr)
+        print("SAM 3D Objects is loaded")
         return
-
-    def write(data: bytes) -> None:
-        view = memoryview(data)
-        while view:
-            view = view[pipe.write(view) :]
-
-    serve(sys.stdin.buffer.read, write, lambda request: reconstruct(inference, request))
+    answer(inference, *options.files)
 
 
 if __name__ == "__main__":

@@ -14,8 +14,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from lerobot_openspm.perception import colour
-from lerobot_openspm.perception.blobs import Blob, disc, find_blobs, grow
+from lerobot_openspm.perception import foreground
+from lerobot_openspm.perception.foreground import Blob, disc, find_blobs, grow
+from lerobot_openspm.perception.objects.mask_association import column
 from lerobot_openspm.types import ContactCue, Mask, View
 
 SEED_RADIUS = 0.03
@@ -46,7 +47,7 @@ class Picture:
     scene: int
     camera: str
     view: View
-    bins: colour.Bins
+    bins: foreground.Bins
     changed: Mask | None
     hints: tuple[ContactCue, ...]
     floor: float
@@ -72,12 +73,6 @@ class Picture:
             for point in column(hint, self.floor) if hint.kind == "release" else [hint.point_world]:
                 mask |= disc(self.view, point, NEUTRAL_RADIUS)
         return mask
-
-
-def column(hint: ContactCue, floor: float) -> list[NDArray[np.float64]]:
-    """Points ``(3,)`` every 2 cm from a hint straight down to the world height ``floor``."""
-    heights = np.arange(hint.point_world[2], floor - 1e-9, -0.02)
-    return [np.array([*hint.point_world[:2], z], dtype=np.float64) for z in heights]
 
 
 def changed_pixels(first: View, later: View) -> Mask | None:
@@ -110,7 +105,7 @@ def learn_colours(pictures: Sequence[Picture]) -> NDArray[np.float32]:
 
 def hinted_blob(picture: Picture, log_odds: NDArray[np.float32]) -> Blob | None:
     """The patch of the object's colours that a picture's hints point at; None if there is none."""
-    blobs = find_blobs(colour.foreground(picture.bins, log_odds), 8, 6)
+    blobs = find_blobs(foreground.probability(picture.bins, log_odds), 8, 6)
     seed = picture.seed()
     near = grow(seed, 4) if seed.any() else seed
     touched = [(float((blob.mask & near).sum()), blob) for blob in blobs]
@@ -134,7 +129,7 @@ def hiding_pixels(
             continue
         hull = np.zeros(picture.bins.shape, np.uint8)
         cv2.fillConvexPoly(hull, cv2.convexHull(np.argwhere(blob.mask)[:, ::-1].astype(np.int32)), 1)
-        colours = colour.foreground(picture.bins, log_odds) > 0.5
+        colours = foreground.probability(picture.bins, log_odds) > 0.5
         enclosed[picture.camera] = enclosed.get(picture.camera, 0) + hull.astype(np.float32)
         shown[picture.camera] = shown.get(picture.camera, 0) + (hull & colours).astype(np.float32)
     visible = {}
@@ -149,11 +144,11 @@ def _evidence(
     pictures: Sequence[Picture], regions: Sequence[Mask], outsides: Sequence[Mask]
 ) -> NDArray[np.float32]:
     inside = [
-        colour.histogram(p.bins[region])
+        foreground.histogram(p.bins[region])
         for p, region in zip(pictures, regions, strict=True)
         if region.sum() >= 6
     ]
-    outside = sum(colour.histogram(p.bins[mask]) for p, mask in zip(pictures, outsides, strict=True))
+    outside = sum(foreground.histogram(p.bins[mask]) for p, mask in zip(pictures, outsides, strict=True))
     if not inside:
-        return np.full(colour.N_BINS, -colour.MAX_LOG_ODDS, np.float32)
-    return colour.evidence(inside, np.asarray(outside), PRESENCE)
+        return np.full(foreground.N_BINS, -foreground.MAX_LOG_ODDS, np.float32)
+    return foreground.evidence(inside, np.asarray(outside), PRESENCE)

@@ -10,14 +10,14 @@ from numpy.typing import NDArray
 from lerobot_openspm.geometry import se3
 from lerobot_openspm.geometry.camera import intersect_plane
 from lerobot_openspm.geometry.se3 import Array
-from lerobot_openspm.perception import colour
-from lerobot_openspm.perception.blobs import Blob, reach, triangulate
-from lerobot_openspm.perception.objects.localise import prepare
-from lerobot_openspm.perception.objects.mask_association import Instances, touched, whole_mask
-from lerobot_openspm.perception.objects.shape import colour_bootstrap as seeding
+from lerobot_openspm.perception import foreground
+from lerobot_openspm.perception.foreground import Blob, reach, triangulate
+from lerobot_openspm.perception.objects.base import Instances, Look
+from lerobot_openspm.perception.objects.mask_association import touched, whole_mask
+from lerobot_openspm.perception.objects.shape import colour_bootstrap
 from lerobot_openspm.perception.objects.shape.colour_bootstrap import Picture
 from lerobot_openspm.perception.objects.shape.fitting import Evidence
-from lerobot_openspm.perception.objects.shape.shape import Posed
+from lerobot_openspm.perception.objects.shape.hull import Posed
 from lerobot_openspm.types import Scene, View
 
 # Two rays that are to meet in an object may miss each other by this much, metres.
@@ -30,11 +30,11 @@ Patched = tuple[Evidence, Blob | None]
 def pictures_of(index: int, name: str, scene: Scene, floor: float) -> list[Picture]:
     """A scene's views with the hints for one object and what changed when it was carried off."""
     hints = tuple(hint for hint in scene.hints if hint.name == name)
-    later = scene.later_views or {}
+    look, later = Look(scene.views), scene.later_views or {}
     return [
         Picture(
-            index, key, view, prepare(view).bins,
-            seeding.changed_pixels(view, later[key]) if key in later else None, hints, floor,
+            index, key, view, look.bins(key),
+            colour_bootstrap.changed_pixels(view, later[key]) if key in later else None, hints, floor,
         )
         for key, view in scene.views.items()
     ]  # fmt: skip
@@ -42,12 +42,14 @@ def pictures_of(index: int, name: str, scene: Scene, floor: float) -> list[Pictu
 
 def coloured(pictures: Sequence[Picture], log_odds: NDArray[np.float32]) -> dict[int, list[Patched]]:
     """By scene, each view's foreground by colour and the patch that the hints point at."""
-    visible = seeding.hiding_pixels(pictures, log_odds)
+    visible = colour_bootstrap.hiding_pixels(pictures, log_odds)
     groups: dict[int, list[Patched]] = {}
     for picture in pictures:
-        probability = colour.foreground(picture.bins, log_odds)
+        probability = foreground.probability(picture.bins, log_odds)
         evidence = Evidence(picture.view, probability, visible.get(picture.camera), picture.camera)
-        groups.setdefault(picture.scene, []).append((evidence, seeding.hinted_blob(picture, log_odds)))
+        groups.setdefault(picture.scene, []).append(
+            (evidence, colour_bootstrap.hinted_blob(picture, log_odds))
+        )
     return groups
 
 

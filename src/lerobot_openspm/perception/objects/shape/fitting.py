@@ -16,6 +16,9 @@ from lerobot_openspm.types import UNKNOWN_YAW_STD, View
 
 LIMIT_PX = 40.0
 COARSE_PX, FINE_PX = 64.0, 160.0
+# Cuts of the residuals, one Gauss-Newton step each: from far off, and from nearby.
+COARSE_CUTS_PX = (30.0, 30.0, 20.0, 12.0)
+FINE_CUTS_PX = (6.0, 4.0, 3.0, 3.0)
 # Residuals along a contour are alike over several pixels: so many of them count as one observation.
 CORRELATED_PX = 4.0
 MIN_RESIDUAL_PX = 0.4
@@ -126,7 +129,8 @@ def fit(
         step = np.clip(step, [-0.04, -0.04, -0.04, -0.5], [0.04, 0.04, 0.04, 0.5])
         offset += step
         T = se3.from_yaw(T[:3, 3] + step[:3], se3.yaw_of(T) + step[3])
-    overlaps = measure(evidence, cloud, T, detail_px)
+    drawings = [silhouette.draw(cloud.points, cloud.spacing, T, one.view, detail_px) for one in evidence]
+    overlaps = _overlaps(evidence, drawings)
     return Fit(T, _covariance(hessian / scale, prior), overlaps, score(overlaps))
 
 
@@ -134,9 +138,14 @@ def measure(
     evidence: Sequence[Evidence], cloud: Cloud, T_world_obj: Array, detail_px: float = COARSE_PX
 ) -> Array:
     """Intersection over union of drawing and mask per view ``(v,)``; NaN where the model is out of sight."""
+    T = T_world_obj
+    drawings = [silhouette.draw(cloud.points, cloud.spacing, T, one.view, detail_px) for one in evidence]
+    return _overlaps(evidence, drawings)
+
+
+def _overlaps(evidence: Sequence[Evidence], drawings: Sequence[silhouette.Drawing | None]) -> Array:
     overlaps = np.full(len(evidence), np.nan)
-    for i, one in enumerate(evidence):
-        drawing = silhouette.draw(cloud.points, cloud.spacing, T_world_obj, one.view, detail_px)
+    for i, (one, drawing) in enumerate(zip(evidence, drawings, strict=True)):
         if drawing is None:
             continue
         common, model, mask = silhouette.overlap(drawing, one.probability, one.visible)

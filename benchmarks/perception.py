@@ -1,0 +1,217 @@
+"""Errors of the poses that the policy follows, at the start and all through episodes, and what they cost.
+
+python -m benchmarks.perception [--env.type=libero]
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+from benchmarks.episodes import IMAGES, load, run_episode
+from benchmarks.harness import Row, checkpoint_files, measured_folder, resume
+from benchmarks.results import run, write
+from benchmarks.stages import CheckpointConfig, DatasetOption, dataset
+from benchmarks.truth import Error, Truth, offsets, pose_error, summary, true_period
+from benchmarks.worlds import WORLDS, World
+from lerobot_openspm.bench.latency import times_ms
+from lerobot_openspm.cli.pipeline import THREADS
+from lerobot_openspm.control.controller import EpisodeController
+from lerobot_openspm.episodes import step_s
+from lerobot_openspm.geometry.se3 import Array
+from lerobot_openspm.modeling_openspm import OpenSPMPolicy
+from lerobot_openspm.perception.objects.base import Look
+from lerobot_openspm.perception.observation import Observation
+from lerobot_openspm.perception.pipeline import Perception
+from lerobot_openspm.perception.tracking import kalman
+from lerobot_openspm.perception.tracking.tracker import Tracker, TrackerSettings
+from lerobot_openspm.types import View
+
+# What the policy follows, each picture's own estimate, what would be followed with the first camera alone.
+VARIANTS = ("filtered", "unfiltered", "one_view")
+COST_RUNS = 50
+# What is timed: the policy's first cameras and objects.
+COST_VIEWS, COST_OBJECTS = 2, 3
+# Of an object at one moment: task, step, object, whether the hand held it, and the error of its pose.
+type Sample = tuple[str, int, str, bool, *Error]
+
+
+@dataclass
+class PerceptionConfig(CheckpointConfig):
+    """Compare a checkpoint's poses with a simulator's.
+
+    Args:
+        dataset: The demonstrations, whose simulator poses tell where on each object its learned frame stands.
+    """
+
+    dataset: DatasetOption = field(default_factory=DatasetOption)
+
+    def demonstrations(self) -> Path:
+        """Folder of the demonstrations, recorded if they are the default ones."""
+        return Path(self.dataset.root) if self.dataset.root else dataset(self.env.type)
+
+
+def main(config: PerceptionConfig) -> dict[str, Any]:
+    """Measure, write and return the result."""
+    checkpoint, root = config.checkpoint(), config.demonstrations()
+    offsets(checkpoint, root)  # what is wrong with them is said here, not by every worker
+    files = [*checkpoint_files(checkpoint), Path(__file__).with_name("truth.py"), root / "meta/info.json"]
+    folder = measured_folder(config.folder("perception"), files, [str(root)], __file__)
+    jobs = {
+        f"{task} {seed}": (config.env.type, checkpoint, root, task, seed) for task, seed in config.turns()
+    }
+    rows = resume(folder / "episodes.jsonl", jobs, compared_episode, config.workers)
+    figures = {**summarise(rows), **costs(config.env, checkpoint), "episodes": len(rows)}
+    name = config.env.type.removeprefix("openspm_")
+    return write(f"perception_{name}", {"seed": config.seed, **figures}, THREADS)
+
+
+def compared_episode(env_type: str, checkpoint: Path, root: Path, task: str, seed: int) -> Row:
+    """Run one episode and compare poses with the truth at every step; see :func:`measure_episode`."""
+    policy = load(str(checkpoint))
+    with WORLDS[env_type](task, seed) as world:
+        success, samples = measure_episode(policy, world, env_type, task, offsets(checkpoint, root))
+    return {"success": success, "samples": samples}
+
+
+def measure_episode(
+    policy: OpenSPMPolicy, world: World, env_type: str, task: str, T_sim_obj: Mapping[str, Array]
+) -> tuple[bool, dict[str, list[Sample]]]:
+    """Run one episode and compare poses with the truth at every step.
+
+    All variants see the same pictures at the same moments; only the first one is acted on.
+
+    Returns:
+        Whether it succeeded, and the samples by variant.
+    """
+    truth, shadow = Truth(world.object_poses(), T_sim_obj), _Shadow(policy)
+    samples: dict[str, list[Sample]] = {variant: [] for variant in VARIANTS}
+
+    def compare(step: int, observation: Observation, controller: EpisodeController) -> None:
+        if not controller.state.ranked:
+            return
+        T_world_ee = observation.hand.T_world_ee
+        true = truth.now(world.object_poses())
+        shadow.follow(observation, controller)
+        known = {
+            "filtered": controller.scene.tracker.poses(T_world_ee),
+            "unfiltered": shadow.seen,
+            "one_view": shadow.tracker.poses(T_world_ee),
+        }
+        for name in (name for name in controller.state.ranked[0].entry.objects if name in T_sim_obj):
+            held = name in controller.scene.tracker.held
+            for variant, poses in known.items():
+                error: Error = (None, None)
+                if name in poses:
+                    error = pose_error(true[name], poses[name], true_period(name, env_type))
+                samples[variant].append((task, step, name, held, *error))
+
+    return run_episode(policy, world, note=compare).success, samples
+
+
+class _Shadow:
+    """What each picture alone tells, and what would be followed with the first camera alone."""
+
+    def __init__(self, policy: OpenSPMPolicy) -> None:
+        memory = policy.require_memory()
+        first = next(iter(memory.cameras))
+        one_camera = replace(memory, cameras={first: memory.cameras[first]})
+        self._perception = Perception(one_camera, policy.config.hand_radius_m, policy.segmenter)
+        self._step_s = step_s(policy.config)
+        self.tracker = Tracker(memory.yaw_periods, TrackerSettings())
+        self.seen: dict[str, Array] = {}
+        self._time_s = self._looked_at_s = 0.0
+
+    def follow(self, observation: Observation, controller: EpisodeController) -> None:
+        """Look when the policy has looked, hold what it holds."""
+        self._time_s += self._step_s
+        self.tracker.predict(self._step_s)
+        hand, scene = observation.hand.T_world_ee, controller.scene
+        if scene.has_just_looked:
+            estimates = scene.detections.estimates
+            self.seen |= {name: e.T_world_obj for name, e in estimates.items() if e.status == "found"}
+            expected = self.tracker.poses(hand)
+            seen = self._perception.detect(observation, list(estimates), expected, self._time_s)
+            self.tracker.look(seen.estimates, hand, self._time_s - self._looked_at_s)
+            self._looked_at_s = self._time_s
+        for name in scene.tracker.held - self.tracker.held:
+            self.tracker.hold(name, hand)
+        self.tracker.release(self.tracker.held - scene.tracker.held, hand)
+
+
+def summarise(rows: Sequence[Row]) -> dict[str, Any]:
+    """All variants; of the first one also by task, by object, at the start and in the hand."""
+    samples = {variant: [s for row in rows for s in row["samples"][variant]] for variant in VARIANTS}
+    own = samples[VARIANTS[0]]
+    overall = _summary(own)
+    return {
+        **{key: overall[key] for key in ("position_mm_mean", "position_mm_p95", "orientation_deg_mean")},
+        "n": overall["poses"],
+        "variants": {variant: _summary(found) for variant, found in samples.items()},
+        "start": _summary([s for s in own if s[1] == 0]),
+        "held": _summary([s for s in own if s[3]]),
+        "tasks": _grouped(own, 0),
+        "objects": _grouped(own, 2),
+    }
+
+
+def _summary(samples: Sequence[Sample]) -> dict[str, Any]:
+    return summary([sample[4:] for sample in samples])
+
+
+def _grouped(samples: Sequence[Sample], by: int) -> dict[str, Any]:
+    keys = dict.fromkeys(str(sample[by]) for sample in samples)
+    return {key: _summary([sample for sample in samples if sample[by] == key]) for key in keys}
+
+
+def costs(env: Any, checkpoint: Path) -> dict[str, Any]:
+    """What a look at three objects in two views of 256 pixels takes, and a step of the filter; one thread."""
+    cv2.setNumThreads(1)
+    policy = load(str(checkpoint))
+    memory = policy.require_memory()
+    with WORLDS[env.type](env.tasks()[0], 0) as world:
+        T_world_ee = policy.config.layouts()[0].poses(world.state().astype(float))
+        views = {}
+        for key, camera in list(memory.cameras.items())[:COST_VIEWS]:
+            image = world.image(key.removeprefix(IMAGES))
+            image = np.asarray(cv2.resize(image, (256, 256), interpolation=cv2.INTER_AREA), np.uint8)
+            scaled = camera.scaled(256, 256)
+            views[key] = View(image, scaled, scaled.T_world_cam(T_world_ee))
+    spent = look_ms(policy, views, list(memory.objects)[:COST_OBJECTS], COST_RUNS)
+    one, twenty = filter_us(1), filter_us(20)
+    return {
+        "ms_per_observation": spent["first_ms"]["median"],
+        "filter_us": one["median"],
+        "cost": {"perception": spent, "filter_us_1_object": one, "filter_us_20_objects": twenty},
+    }
+
+
+def look_ms(policy: OpenSPMPolicy, views: Mapping[str, View], names: Sequence[str], n: int) -> dict[str, Any]:
+    """Time of `n` times finding objects in the views of one moment, never seen before and then followed."""
+    objects = [policy.require_memory().objects[name] for name in names]
+
+    def find(expected: Mapping[str, Array]) -> dict[str, Array]:
+        look = Look(views, expected=expected)
+        return {one.name: one.localise(look).T_world_obj for one in objects}
+
+    found = find({})
+    first, followed = times_ms(lambda: find({}), n), times_ms(lambda: find(found), n)
+    return {"views": len(views), "objects": len(names), "first_ms": first, "followed_ms": followed}
+
+
+def filter_us(objects: int, n: int = 2000) -> dict[str, float]:
+    """Time of one prediction and update of the Kalman filter."""
+    T, R = np.tile(np.eye(4), (objects, 1, 1)), np.tile(1e-6 * np.eye(6), (objects, 1, 1))
+    belief = kalman.begin(T, R, 0.01, 0.1)
+    step = kalman.motion(0.05, TrackerSettings().linear, TrackerSettings().angular)
+    times = times_ms(lambda: kalman.update(kalman.predict(belief, step), T, R), n)
+    return {name: round(1000 * times[name], 1) for name in ("median", "p99")}
+
+
+if __name__ == "__main__":
+    run(PerceptionConfig, main)

@@ -1,0 +1,180 @@
+"""Which entry an instruction is carried out by in a scene, and what its key poses touch there."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from lerobot_openspm.control.checks import TransferLimits, check_transfer, geometric_score
+from lerobot_openspm.control.strategies import ControlSettings
+from lerobot_openspm.control.transfer import Target, pushed_by_landmark, transfer
+from lerobot_openspm.geometry import se3
+from lerobot_openspm.geometry.se3 import Array
+from lerobot_openspm.language.names import TABLE_NAMES, NameSimilarity
+from lerobot_openspm.memory.compose import Candidate
+from lerobot_openspm.memory.entry import WORLD, MemoryEntry, MemoryKeyPose, Outcome, RetrievalKey
+from lerobot_openspm.memory.retrieval import Scored, ScoreWeights, retrieve
+from lerobot_openspm.memory.robot import RobotModel
+from lerobot_openspm.types import SubTask
+
+# An object this far from where the key poses took it to be takes them along; less is noise.
+MOVED_M, MOVED_RAD = 0.002, 0.05
+# Where an object is that was never seen.
+NOWHERE = se3.transform(np.eye(3), np.full(3, np.inf))
+
+
+@dataclass(frozen=True)
+class PlanningContext:
+    """What every environment shares: the memory, the robot, how to choose and how to follow.
+
+    Attributes:
+        entries: The memory's entries.
+        yaw_periods: Angle by object that turns it into itself, radians.
+        robot: The robot.
+        weights: Of retrieval.
+        limits: Of transferred key poses.
+        settings: How key poses are followed.
+        tracking: Whether objects are looked for again once a plan is made.
+        step_s: Seconds that a control step takes.
+        names: Tells which names in an instruction mean the same thing.
+    """
+
+    entries: Sequence[MemoryEntry]
+    yaw_periods: Mapping[str, float]
+    robot: RobotModel
+    weights: ScoreWeights = field(default_factory=ScoreWeights)
+    limits: TransferLimits = field(default_factory=TransferLimits)
+    settings: ControlSettings = field(default_factory=ControlSettings)
+    tracking: bool = True
+    step_s: float = 0.05
+    names: NameSimilarity = TABLE_NAMES
+
+    def __deepcopy__(self, memo: dict[int, object]) -> PlanningContext:
+        """Itself: nothing here ever changes, and the memory may be large."""
+        return self
+
+    def object_meant(self, name: str) -> str:
+        """The known object that a name in an instruction means; the name itself where there is none."""
+        alike = {known: self.names.similarity(name, known) for known in self.yaw_periods}
+        best = max(alike, key=lambda known: alike[known], default=name)
+        return best if alike.get(best, 0.0) > 0 else name
+
+    @property
+    def surfaces(self) -> dict[str, Array]:
+        """The table under its names, at the middle of where the hand was in the demonstrations."""
+        low, high = self.robot.workspace
+        middle = se3.transform(np.eye(3), [*(low[:2] + high[:2]) / 2, low[2]])
+        return dict.fromkeys(self.names.lexicon.surfaces, middle)
+
+    def rank(
+        self, candidates: Sequence[Candidate], object_poses: Mapping[str, Array], T_world_ee: Array
+    ) -> tuple[Scored, ...]:
+        """Candidates by the paper's score, best first.
+
+        The scene is the poses ``T_world_obj`` ``(4, 4)`` of the objects that were found, and the hand's.
+        """
+        scene = object_poses, self.yaw_periods, T_world_ee, self.robot, self.limits
+        geometric = {id(one.entry): geometric_score(one.entry, *scene) for one in candidates}
+        semantic = [(one.entry, one.semantic) for one in candidates]
+        return tuple(retrieve(semantic, lambda entry: geometric[id(entry)], self.weights, self.names))
+
+
+@dataclass(frozen=True)
+class Plan:
+    """An entry, and the scene that its key poses are carried over to.
+
+    Attributes:
+        entry: What is acted by.
+        object_poses: Poses ``T_world_obj`` ``(4, 4)`` that the key poses are carried over by. For what the
+            hand has touched they are those from before.
+        T_world_ee: The hand's pose ``(4, 4)`` where the plan begins.
+    """
+
+    entry: MemoryEntry
+    object_poses: Mapping[str, Array]
+    T_world_ee: Array
+
+    def problems(self, context: PlanningContext) -> list[str]:
+        """What keeps the hand from following the plan, in words."""
+        targets = transfer(self.entry, self.object_poses, context.yaw_periods, self.T_world_ee)
+        return check_transfer(targets, self.T_world_ee, context.robot, context.limits)
+
+    def moved(self, names: Sequence[str], object_poses: Mapping[str, Array]) -> dict[str, Array]:
+        """The poses of those objects that are elsewhere now than where the plan takes them to be."""
+        moved: dict[str, Array] = {}
+        for name in (name for name in names if name in object_poses):
+            T = object_poses[name]
+            metres, radians = se3.distances(T, self.object_poses.get(name, NOWHERE))
+            if metres > MOVED_M or radians > MOVED_RAD:
+                moved[name] = T
+        return moved
+
+    def objects(self, index: int, altered: Collection[str]) -> list[str]:
+        """Objects of the key poses from an index on, without those that look different by now."""
+        ahead = self.entry.key_poses[index:]
+        names = dict.fromkeys(name for pose in ahead for name in pose.anchor.objects)
+        # What is pushed is needed until the push begins, also if no key pose belongs to it.
+        pushed = pushed_by_landmark(self.entry)
+        for pose in ahead[1:]:
+            if pose.phase == "push" and pose.sub_task in pushed:
+                names[pushed[pose.sub_task]] = None
+        return [name for name in names if name not in altered]
+
+    def touched(self, passed: Sequence[Target]) -> set[str]:
+        """What the hand took hold of or moved at the key poses passed: it is elsewhere from then on."""
+        touched: set[str] = set()
+        for pose in (target.key_pose for target in passed):
+            if pose.phase == "push":  # its anchor may be where the target goes
+                touched.add(self.sub_task(pose).target)
+            elif pose.phase in ("grasp", "open", "turn"):
+                touched.add(pose.anchor.place)
+        return touched
+
+    def regrasped(self, index: int) -> set[str]:
+        """What is grasped from a key pose on, within its sub-task: it is not in the hand any more."""
+        ahead = self.entry.key_poses[index:]
+        own = [pose for pose in ahead if pose.sub_task == ahead[0].sub_task]
+        return {pose.anchor.place for pose in own if pose.phase in ("approach", "grasp")}
+
+    def sub_task(self, pose: MemoryKeyPose) -> SubTask:
+        """The sub-task that a key pose serves."""
+        return self.entry.key.sub_tasks[pose.sub_task]
+
+    @property
+    def outcomes(self) -> list[Outcome]:
+        """The outcomes that the key poses can bring about; others could not be mended."""
+        served = {pose.sub_task for pose in self.entry.key_poses}
+        return [one for one in self.entry.outcomes if one.sub_task in served]
+
+    def missed(
+        self, poses: Mapping[str, Array], recognised: Collection[str], yaw_periods: Mapping[str, float]
+    ) -> list[Outcome] | None:
+        """The outcomes that are seen not to be met, in order; None where none is, but not all are seen.
+
+        One is seen where its target was recognised and the poses of its objects are known.
+        """
+        outcomes = self.outcomes
+        seen = [one for one in outcomes if one.target in recognised and poses.keys() >= set(one.objects)]
+        missed = [one for one in seen if not _is_met(one, poses, yaw_periods)]
+        return missed if missed or len(seen) == len(outcomes) else None
+
+
+def until(entry: MemoryEntry, sub_task: int) -> MemoryEntry:
+    """An entry without the sub-tasks after one."""
+    key = replace(entry.key, sub_tasks=entry.key.sub_tasks[: sub_task + 1])
+    return replace(entry, key=key, key_poses=tuple(p for p in entry.key_poses if p.sub_task <= sub_task))
+
+
+def _is_met(outcome: Outcome, poses: Mapping[str, Array], yaw_periods: Mapping[str, float]) -> bool:
+    """Whether an outcome is met whichever way round a symmetric landmark was seen."""
+    axes = outcome.anchor.axes
+    if axes == WORLD:
+        return outcome.is_met(poses)
+    turned = se3.yaw_equivalents(poses[axes], yaw_periods.get(axes, 2 * np.pi))
+    return any(outcome.is_met({**poses, axes: T}) for T in turned)
+
+
+# Before the first plan: nothing is done, nowhere.
+NO_PLAN = Plan(MemoryEntry(RetrievalKey((), ()), "", (), 0.0, 0, ""), {}, np.eye(4))

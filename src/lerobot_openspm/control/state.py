@@ -1,0 +1,153 @@
+"""What an episode is doing: one record, and one table of which status can follow which."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from enum import StrEnum
+
+import numpy as np
+
+from lerobot_openspm.control.planning import NO_PLAN, Plan
+from lerobot_openspm.memory.compose import Candidate
+from lerobot_openspm.memory.entry import MemoryEntry, Outcome
+from lerobot_openspm.memory.retrieval import Scored
+
+# After the last key pose the policy looks up to three times at what it moved. Then the outcome stays unknown.
+LOOKS_AT_OUTCOME = 3
+
+
+class Status(StrEnum):
+    """Status of one episode. Only the world causes these; bad input raises."""
+
+    WAITING = "waiting"  # no plan yet, for the instruction or for its next part
+    RUNNING = "running"
+    PAUSED = "paused"  # holds still until an object or a camera's picture is back
+    DONE = "done"  # every key pose was reached; the hand holds still
+    OBJECT_NOT_FOUND = "object_not_found"
+    INFEASIBLE = "infeasible"  # no entry passes the transfer checks here
+    NO_PROGRESS = "no_progress"  # attempts are used up
+    OBJECT_LOST = "object_lost"  # what is needed now was seen before and is gone; looked for until it is back
+    NOT_UNDERSTOOD = "not_understood"  # nothing in the memory is about the instruction
+    CAMERA_FAULT = "camera_fault"  # a camera gave no sound picture for too long
+
+
+_PLANNING = {Status.RUNNING, Status.OBJECT_NOT_FOUND, Status.INFEASIBLE}
+_GIVING_UP = {Status.NOT_UNDERSTOOD, Status.CAMERA_FAULT}
+
+# What can follow each status. The last three end the episode.
+TRANSITIONS: dict[Status, frozenset[Status]] = {
+    Status.WAITING: frozenset(_PLANNING | _GIVING_UP),
+    Status.OBJECT_NOT_FOUND: frozenset(_PLANNING | _GIVING_UP),
+    Status.INFEASIBLE: frozenset(_PLANNING | _GIVING_UP),
+    Status.RUNNING: frozenset(
+        {Status.PAUSED, Status.OBJECT_LOST, Status.DONE, Status.NO_PROGRESS} | _GIVING_UP
+    ),
+    Status.PAUSED: frozenset({Status.RUNNING, Status.OBJECT_LOST, Status.NO_PROGRESS} | _GIVING_UP),
+    Status.OBJECT_LOST: frozenset({Status.RUNNING, Status.NO_PROGRESS} | _GIVING_UP),
+    # From the end it goes on with the next part, or back to a sub-task whose outcome is not met.
+    Status.DONE: frozenset({Status.WAITING, Status.RUNNING, Status.NO_PROGRESS, Status.NOT_UNDERSTOOD}),
+    Status.NO_PROGRESS: frozenset(),
+    Status.NOT_UNDERSTOOD: frozenset(),
+    Status.CAMERA_FAULT: frozenset(),
+}
+
+
+@dataclass
+class EpisodeState:
+    """What is being done in one episode. The controller and its executor change it, and keep no copies.
+
+    Where the objects are is not said here: :class:`SceneState` knows that.
+
+    Attributes:
+        status: What the episode is up to; changed by :meth:`go` alone.
+        refusal: Why the instruction is not acted on; "" unless the status is NOT_UNDERSTOOD.
+        parts: For each part of the instruction, in order, what it can be carried out by; none before the
+            first look.
+        part: The part that is carried out now, counted from 0.
+        start_height: Height of the hand when the instruction was read, metres.
+        ranked: The entries of the last retrieval with their scores, best first.
+        plan: What is acted by, and where.
+        used: For each part that was begun, the entry of the memory that it was carried out by.
+        verdicts: For each part that was ended, whether it is seen to be done; None where that is not known.
+        index: The key pose that is approached.
+        replans: Chunks asked for so far; seeds the noise of each.
+        attempts: Attempts beyond the first at the present part.
+        looks_left: How often the end of the present part may still be looked at.
+        verdict: Whether the present part is seen to be done; None where that is not known.
+        gone: How far drawers and knobs of the present part have moved, by sub-task, metres or radians.
+        followed: Sub-tasks of the present part whose drawer or knob went all the way.
+        repeated: The sub-task of the present part that is done again, if one is.
+    """
+
+    status: Status = Status.WAITING
+    refusal: str = ""
+    parts: tuple[tuple[Candidate, ...], ...] = ()
+    part: int = 0
+    start_height: float = np.inf
+    ranked: tuple[Scored, ...] = ()
+    plan: Plan = NO_PLAN
+    used: tuple[MemoryEntry, ...] = ()
+    verdicts: tuple[bool | None, ...] = ()
+    index: int = 0
+    replans: int = 0
+    attempts: int = 0
+    looks_left: int = LOOKS_AT_OUTCOME
+    verdict: bool | None = None
+    gone: dict[int, float] = field(default_factory=dict[int, float])
+    followed: set[int] = field(default_factory=set[int])
+    repeated: int | None = None
+
+    def __deepcopy__(self, memo: dict[int, object]) -> EpisodeState:
+        """A copy that goes on by itself. Entries and plans never change, so both share them."""
+        return replace(self, gone=dict(self.gone), followed=set(self.followed))
+
+    def go(self, status: Status) -> None:
+        """Change the status.
+
+        Raises:
+            RuntimeError: It cannot follow the present one.
+        """
+        if status is not self.status and status not in TRANSITIONS[self.status]:
+            raise RuntimeError(f"an episode cannot go from {self.status} to {status}")
+        self.status = status
+
+    @property
+    def is_last_part(self) -> bool:
+        """Whether nothing is left to do after the present part."""
+        return self.part + 1 >= len(self.parts)
+
+    @property
+    def succeeded(self) -> bool | None:
+        """Whether the instruction is seen to be done; None before the end and where it is not seen."""
+        if self.status is Status.NO_PROGRESS:
+            return False
+        is_known = self.status is Status.DONE and all(verdict is True for verdict in self.verdicts)
+        return self.verdict if is_known else None
+
+    def entry_outcomes(self, success: bool) -> list[tuple[MemoryEntry, bool]]:
+        """How the entries fared that were acted by, each once, given whether the episode succeeded.
+
+        A failure does not count for the parts that were seen to be done, but for all others that were begun.
+        Where every part was seen to be done, one of the sightings is wrong, and the failure counts for all.
+        """
+        seen = list(zip(self.used, (*self.verdicts, self.verdict), strict=False))
+        is_denied = len(seen) == len(self.parts) and all(verdict is True for _, verdict in seen)
+        fared: dict[int, tuple[MemoryEntry, bool]] = {}
+        for entry, verdict in seen:
+            _, before = fared.get(id(entry), (entry, True))
+            fared[id(entry)] = entry, before and (success or (verdict is True and not is_denied))
+        return list(fared.values())
+
+    def begin_next_part(self) -> None:
+        """Turn to the next part, which has attempts and looks of its own."""
+        self.verdicts = (*self.verdicts, self.verdict)
+        self.part += 1
+        self.attempts, self.looks_left, self.verdict = 0, LOOKS_AT_OUTCOME, None
+        self.gone, self.followed, self.repeated = {}, set(), None
+
+    def judge(self, missed: Sequence[Outcome]) -> None:
+        """Take in which outcomes are missed. The others, and handles that went all the way, are done."""
+        done = {one.sub_task for one in self.plan.outcomes} | self.followed
+        is_all_known = done >= set(range(len(self.plan.entry.key.sub_tasks)))
+        self.verdict = False if missed else (is_all_known or None)

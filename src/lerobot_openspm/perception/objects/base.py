@@ -1,0 +1,233 @@
+"""What all kinds of known objects have in common: how they are learned, found again and written down.
+
+A kind is one folder with a class that is a :class:`KnownObject` and a :class:`Kind` that
+:data:`lerobot_openspm.perception.objects.kinds.KINDS` lists. Nobody else names a kind.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.random import Generator
+from numpy.typing import NDArray
+
+from lerobot_openspm.errors import ObservationError, PerceptionError
+from lerobot_openspm.geometry import se3
+from lerobot_openspm.geometry.camera import project
+from lerobot_openspm.geometry.se3 import Array
+from lerobot_openspm.perception.foreground import Bins, lab_bins
+from lerobot_openspm.types import Mask, PoseEstimate, Scene, Segmentation, Segmenter, Shape, View
+
+# Fingers close above the plane that objects stand on; where nothing else tells it, it is taken to lie this
+# far below the lowest point that they ever went to, metres.
+BELOW_HINTS_M = 0.02
+
+# By camera: what a segmenter found of one phrase.
+Instances = Mapping[str, Sequence[Segmentation]]
+# Fields for a JSON file, and arrays for a safetensors file.
+Record = tuple[dict[str, Any], dict[str, NDArray[Any]]]
+
+
+def check_view(view: View) -> None:
+    """Check a view before objects are sought in it.
+
+    Raises:
+        ObservationError: The image is not RGB uint8 of the camera's size, or the camera's pose is not rigid.
+    """
+    expected = (view.camera.height, view.camera.width, 3)
+    if view.image.shape != expected or view.image.dtype != np.uint8:
+        raise ObservationError(
+            f"image of shape {view.image.shape} and type {view.image.dtype}, expected {expected} of uint8; "
+            "scale the camera to the image with Camera.scaled"
+        )
+    if not se3.is_rigid(view.T_world_cam):
+        raise ObservationError("T_world_cam of a view is not a rigid (4, 4) transform; check the hand's pose")
+
+
+@dataclass(frozen=True)
+class Look:
+    """What the cameras show at one moment. It is shared by all objects that are sought in it.
+
+    Attributes:
+        views: Views by camera name, at least one.
+        instances: By phrase and camera: what a segmenter found.
+        hidden: Pixels ``(H, W)`` by camera name that something may be in front of; no evidence.
+        expected: Poses ``T_world_obj`` ``(4, 4)`` by object at which it is looked for first.
+
+    Raises:
+        ObservationError: There is no view, or one is malformed.
+    """
+
+    views: Mapping[str, View]
+    instances: Mapping[str, Instances] = field(default_factory=dict[str, Instances])
+    hidden: Mapping[str, Mask] = field(default_factory=dict[str, Mask])
+    expected: Mapping[str, Array] = field(default_factory=dict[str, Array])
+    _bins: dict[str, Bins] = field(default_factory=dict[str, Bins])
+
+    def __post_init__(self) -> None:
+        if not self.views:
+            raise ObservationError("no camera views to look for an object in; pass at least one")
+        for view in self.views.values():
+            check_view(view)
+
+    def bins(self, camera: str) -> Bins:
+        """Colour bin ``(H, W)`` of every pixel of a view; computed once for all objects."""
+        if camera not in self._bins:
+            self._bins[camera] = lab_bins(self.views[camera].image)
+        return self._bins[camera]
+
+    def instances_of(self, name: str) -> Instances:
+        """What the segmenter found of an object. Raises PerceptionError where none was asked."""
+        if name not in self.instances:
+            raise PerceptionError(
+                f"{name!r} was learned from a segmenter's masks, and is to be found without them; give the "
+                "segmenter that it was learned with"
+            )
+        return self.instances[name]
+
+    def seen_share(self, points_world: Array) -> float:
+        """Share of points ``(n, 3)`` that are in the picture and not hidden, in the view that shows most."""
+        shares = [0.0]
+        for name, view in self.views.items():
+            uv, depth = project(view.camera, view.T_world_cam, points_world)
+            uv = np.nan_to_num(uv, nan=-1.0)
+            size = np.array([view.camera.width, view.camera.height])
+            inside = (depth > 0) & (uv >= 0).all(1) & (uv <= size - 1).all(1)
+            if name in self.hidden:
+                inside[inside] = ~self.hidden[name][tuple(np.rint(uv[inside]).astype(int).T[::-1])]
+            shares.append(float(inside.mean()))
+        return max(shares)
+
+
+def look_at(
+    views: Mapping[str, View],
+    phrases: Sequence[str],
+    segmenter: Segmenter | None,
+    hidden: Mapping[str, Mask],
+    expected: Mapping[str, Array],
+) -> Look:
+    """A :class:`Look` for objects. A segmenter is asked once for all of their phrases."""
+    found = segmenter.segment(views, phrases) if segmenter is not None and phrases else {}
+    return Look(views, found, hidden, expected)
+
+
+class KnownObject(Protocol):
+    """An object that was learned. Every kind of object implements this."""
+
+    @property
+    def name(self) -> str:
+        """The noun phrase."""
+        ...
+
+    @property
+    def height(self) -> float:
+        """World z, metres, of the plane that it stood on, or of its reference point."""
+        ...
+
+    @property
+    def yaw_period(self) -> float:
+        """Turning by this angle (radians) leaves it unchanged; 0 for a body of revolution."""
+        ...
+
+    def localise(self, look: Look) -> PoseEstimate:
+        """Find the object.
+
+        Raises:
+            PerceptionError: It was learned from a segmenter's masks, and the look has none.
+        """
+        ...
+
+    def to_record(self) -> Record:
+        """What to write down of it; ``fields["kind"]`` and ``fields["name"]`` say what it is."""
+        ...
+
+
+@dataclass(frozen=True)
+class ObjectShape:
+    """An object's place and size, as a shape backend says.
+
+    Attributes:
+        T_world_obj: Upright pose ``(4, 4)``: origin at the footprint's centre, x along its long side.
+        extents: Length, width and height ``(3,)`` along that frame's axes, metres.
+        quality: From 0 to 1: how well the shape explains what was seen.
+        tilt: Angle in radians by which the shape was turned to stand upright.
+    """
+
+    T_world_obj: Array
+    extents: Array
+    quality: float
+    tilt: float = 0.0
+
+
+@dataclass(frozen=True)
+class Appearance:
+    """An object in the view that shows it best.
+
+    Attributes:
+        view: The view.
+        segmentation: Of the object in that view.
+        points_world: Points ``(n, 3)`` of its surface in the world, metres; None where none are known.
+    """
+
+    view: View
+    segmentation: Segmentation
+    points_world: Array | None = None
+
+
+class ShapeBackend(Protocol):
+    """Finds the shapes of segmented objects: the paper's "local object shape and principal axes"."""
+
+    def describe(self, objects: Sequence[Appearance]) -> list[ObjectShape]:
+        """The objects' shapes, in their order.
+
+        Raises:
+            PerceptionError: The backend cannot be used, or what was seen is too little for it.
+        """
+        ...
+
+
+@dataclass(frozen=True)
+class Lesson:
+    """What objects are learned from.
+
+    Attributes:
+        names: The objects that are still to be learned.
+        scenes: First frames and contact cues of the demonstrations of all tasks.
+        known: Objects that are known already; a new one is none of them.
+        rng: Chooses among the demonstrations of an object where there are more than needed.
+        segmenter: Finds the objects' masks; None where the demonstrations teach their looks.
+        source: What a segmenter's masks are to teach.
+        shapes: Tells the sizes of objects, for source "sam3d".
+    """
+
+    names: Sequence[str]
+    scenes: Sequence[Scene]
+    known: Collection[KnownObject]
+    rng: Generator
+    segmenter: Segmenter | None = None
+    source: Shape = "demonstrations"
+    shapes: ShapeBackend | None = None
+
+    @property
+    def floor(self) -> float:
+        """World height, metres, below which nothing that the hand touched can stand."""
+        return min(float(hint.point_world[2]) for one in self.scenes for hint in one.hints) - BELOW_HINTS_M
+
+
+@dataclass(frozen=True)
+class Kind:
+    """One kind of known objects.
+
+    Attributes:
+        name: As it is called in records.
+        learn: Learns the objects of a lesson that can be known this way; leaves the others out.
+        from_record: The object of a record's fields and arrays, all of them checked; the last argument names
+            their origin in a MemoryFormatError.
+    """
+
+    name: str
+    learn: Callable[[Lesson], Mapping[str, KnownObject]]
+    from_record: Callable[[Mapping[str, Any], Mapping[str, NDArray[Any]], str], KnownObject]

@@ -1,0 +1,60 @@
+"""All kinds of objects, and what is done with objects of whatever kind."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Sequence
+from dataclasses import replace
+from typing import get_args
+
+from numpy.random import Generator
+
+from lerobot_openspm.errors import DatasetError
+from lerobot_openspm.perception.objects.base import KnownObject, Lesson, ShapeBackend
+from lerobot_openspm.perception.objects.box.learn import BOX
+from lerobot_openspm.perception.objects.patches.learn import PATCHES
+from lerobot_openspm.perception.objects.shape.learn import SHAPE
+from lerobot_openspm.types import Scene, Segmenter, Shape
+
+# In the order in which they are asked to learn: each gets the objects that those before it left.
+KINDS = {kind.name: kind for kind in (PATCHES, SHAPE, BOX)}
+SHAPES: tuple[Shape, ...] = get_args(Shape)
+
+
+def learn_objects(
+    scenes: Sequence[Scene],
+    rng: Generator,
+    known: Collection[KnownObject] = (),
+    segmenter: Segmenter | None = None,
+    source: Shape = "demonstrations",
+    shapes: ShapeBackend | None = None,
+) -> dict[str, KnownObject]:
+    """Learn every object that some scene's contact cues name and that is not known.
+
+    Args:
+        scenes: First frames and contact cues of the demonstrations of all tasks.
+        rng: Chooses among the demonstrations of an object where there are more than needed.
+        known: Objects that are known already; none of the new ones is one of them.
+        segmenter: Finds the objects' masks; by default the demonstrations teach their colours and patches.
+        source: With a segmenter, "box" learns the boxes around the objects and "demonstrations" their shapes;
+            without one, there is only the latter. "sam3d" learns boxes of the sizes that `shapes` tells.
+        shapes: Tells the sizes of objects, for "sam3d".
+
+    Returns:
+        Objects by name. One that cannot be learned (never visible, no consistent colour) is left out, and the
+        log says so.
+
+    Raises:
+        DatasetError: No scene has a contact cue.
+    """
+    named = {hint.name for scene in scenes for hint in scene.hints}
+    if not named:
+        raise DatasetError(
+            "no demonstration shows a grasp, contact or release; perception has nothing to learn from"
+        )
+    names = sorted(named - {one.name for one in known})
+    lesson = Lesson(names, scenes, known, rng, segmenter, source, shapes)
+    learned: dict[str, KnownObject] = {}
+    for kind in KINDS.values():
+        left = [name for name in names if name not in learned]
+        learned |= kind.learn(replace(lesson, names=left))
+    return learned

@@ -1,0 +1,70 @@
+"""Whether objects hardly move between demonstrations, told by where the hand touched them.
+
+That an object hardly moves is never taken from a few scenes that happen to agree. The hand's repeated
+touches tell how likely it is, all places and both axes taken together. So do the other objects' touches, and
+how the objects are known that were learned before: in one place most objects stand still, in another most
+are moved about.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterable, Sequence
+
+import numpy as np
+from scipy.stats import chi2
+
+from lerobot_openspm.perception.objects.base import KnownObject
+from lerobot_openspm.perception.objects.patches.model import PatchModel
+from lerobot_openspm.types import ContactCue, Scene
+
+# The hand's target moves with the object; if its standard deviation along an axis is below this, patches do.
+# It is that of a uniform distribution within 3 cm of the middle, about as far as a patch is sought.
+MAX_STD_M = 0.03 / np.sqrt(3)
+
+
+def hardly_moving(
+    names: Sequence[str], scenes: Sequence[Scene], known: Collection[KnownObject] = ()
+) -> dict[str, float]:
+    """Probability by name that an object hardly moves between demonstrations, given all touches.
+
+    Two or three places that agree are weak evidence, so each object begins with what the others tell: of a
+    beta distribution, counting every other object that tells anything, and one of either kind.
+
+    Args:
+        names: The objects.
+        scenes: First frames of all demonstrations, with hints at the objects.
+        known: Other objects, which are known by patches where they hardly moved.
+    """
+    told = {name: p for name in names if (p := _hardly_moves(scenes, name)) is not None}
+    before = [float(isinstance(model, PatchModel)) for model in known if model.name not in names]
+    found = {}
+    for name in names:
+        others = [*before, *(p for other, p in told.items() if other != name)]
+        prior = (1 + sum(others)) / (2 + len(others))
+        own = told.get(name, 0.5)
+        found[name] = own * prior / (own * prior + (1 - own) * (1 - prior))
+    return found
+
+
+def _hardly_moves(scenes: Sequence[Scene], name: str) -> float | None:
+    """Probability, by the touches of one object alone, that its standard deviation is small.
+
+    The variance's posterior given n independent deviations is an inverse chi-squared distribution, where
+    nothing is known of its scale beforehand (Gelman et al., Bayesian Data Analysis, section 2.6). Kept
+    strictly between 0 and 1; None where no place was touched twice.
+    """
+    places = places_of(hint for scene in scenes for hint in scene.hints if hint.name == name)
+    points = [np.stack([hint.point_world[:2] for hint in place]) for place in places]
+    degrees = 2 * sum(len(own) - 1 for own in points)
+    if degrees == 0:
+        return None
+    squares = sum(float(((own - own.mean(axis=0)) ** 2).sum()) for own in points)
+    return float(np.clip(chi2.sf(squares / MAX_STD_M**2, degrees), 1e-6, 1 - 1e-6))
+
+
+def places_of(hints: Iterable[ContactCue]) -> list[list[ContactCue]]:
+    """Hints grouped by the place on the object that they touch."""
+    groups: dict[tuple[str, str], list[ContactCue]] = {}
+    for hint in hints:
+        groups.setdefault((hint.kind, hint.place), []).append(hint)
+    return list(groups.values())

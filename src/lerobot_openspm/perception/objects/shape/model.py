@@ -1,0 +1,241 @@
+"""An object known by its shape, and how it is found again.
+
+Candidates come from patches of foreground, by the object's colours or a segmenter's masks. Poses come from
+aligning silhouettes. An object that is followed is looked for where it is expected before everywhere else.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lerobot_openspm.errors import MemoryFormatError
+from lerobot_openspm.geometry import se3
+from lerobot_openspm.geometry.camera import intersect_plane
+from lerobot_openspm.geometry.se3 import Array
+from lerobot_openspm.perception import foreground
+from lerobot_openspm.perception.objects import records
+from lerobot_openspm.perception.objects.base import Look, Record
+from lerobot_openspm.perception.objects.shape.fitting import (
+    COARSE_CUTS_PX,
+    COARSE_PX,
+    FINE_CUTS_PX,
+    Cloud,
+    Evidence,
+    Fit,
+    PosePrior,
+    fit,
+    others,
+    verdict,
+)
+from lerobot_openspm.perception.objects.yaw import canonical
+from lerobot_openspm.types import UNKNOWN_YAW_STD, PoseEstimate, Support
+
+BLOBS_PER_VIEW = 3
+MAX_CANDIDATES = 3
+# Candidates with under 20 % of the best one's colour evidence are dropped.
+WEAK_SHARE = 0.2
+# Candidates that fit less than 70 % as well as the best one are not fitted more finely.
+POOR_SHARE = 0.7
+# Visibility is estimated on every 5th point.
+SHARE_STEP = 5
+# An object that is followed: how far from where it is expected it is looked for before everywhere else, and
+# how well it must be seen there for that to be left out.
+NEARBY_CUTS_PX = (12.0, 6.0, 4.0, 3.0)
+NEARBY_M, NEARBY_HEIGHT_M, NEARBY_RAD = 0.03, 0.003, 0.3
+NEARBY_CONFIDENCE = 0.9
+# An object this far above or below the plane it was learned on does not stand there.
+LIFTED_M = 0.005
+# Records: where the object's pixels come from, and the numbers.
+COLOURS, SEGMENTER = "colours", "segmenter"
+NUMBERS = ("spacing", "height", "yaw_period", "yaw_centre", "yaw_halfwidth", "typical_overlap")
+MAX_POINTS = 200_000
+
+
+@dataclass(frozen=True)
+class ShapeModel:
+    """An object known by its shape, and by its colours where these tell its pixels.
+
+    Attributes:
+        name: The noun phrase.
+        log_odds: Foreground log-odds ``(N_BINS,)`` per colour, float32; None where a segmenter finds it.
+        points: Surface points ``(n, 3)`` in the object's frame, metres, float32. The frame is upright, its
+            origin at the footprint's centre on the support plane.
+        spacing: Distance between neighbouring points, metres.
+        height: World z of the support plane the object stood on, metres.
+        yaw_period: Turning by this angle (radians) leaves the object unchanged; 0 for a body of revolution.
+        yaw_centre: Middle of the yaws seen in the demonstrations, radians.
+        yaw_halfwidth: Half the width of the range of yaws to search, at most ``yaw_period / 2``, radians.
+        typical_overlap: Intersection over union of drawing and mask, median over the demonstrations.
+    """
+
+    kind: ClassVar[str] = "shape"
+
+    name: str
+    log_odds: NDArray[np.float32] | None
+    points: NDArray[np.float32]
+    spacing: float
+    height: float
+    yaw_period: float
+    yaw_centre: float
+    yaw_halfwidth: float
+    typical_overlap: float
+
+    @property
+    def radius(self) -> float:
+        """Largest distance of a point from the vertical axis, metres."""
+        return float(np.linalg.norm(self.points[:, :2], axis=1).max())
+
+    @property
+    def cloud(self) -> Cloud:
+        """The points, in double precision."""
+        return Cloud(self.points.astype(float), self.spacing)
+
+    def search_yaws(self) -> Array:
+        """Yaws ``(k,)`` in radians to start a search from, at most about 45 degrees apart."""
+        if self.yaw_period == 0:
+            return np.zeros(1)
+        count = max(1, int(np.ceil(2 * self.yaw_halfwidth / np.deg2rad(46))))
+        steps = (np.arange(count) + 0.5) / count * 2 - 1
+        return self.yaw_centre + steps * self.yaw_halfwidth
+
+    def localise(self, look: Look) -> PoseEstimate:
+        """Find the object: where it is expected, else on its support plane, at any place and learned yaw."""
+        T_expected = look.expected.get(self.name)
+        evidence, fits = _evidence(self, look), list[Fit]()
+        if T_expected is not None:
+            there = fit(evidence, self.cloud, T_expected, _nearby(self, T_expected), NEARBY_CUTS_PX)
+            fits = [there] if there.score >= NEARBY_CONFIDENCE * self.typical_overlap else []
+        if not fits:
+            prior, starts = PosePrior(yaw=0.0 if self.yaw_period == 0 else np.inf), list[Fit]()
+            for point in candidates(evidence, self):
+                poses = [se3.from_yaw(point, yaw) for yaw in self.search_yaws()]
+                turned = [fit(evidence, self.cloud, T, prior, COARSE_CUTS_PX, COARSE_PX) for T in poses]
+                starts.append(max(turned, key=lambda one: one.score))
+            enough = POOR_SHARE * max((one.score for one in starts), default=0.0)
+            good = [one.T_world_obj for one in starts if one.score > 0 and one.score >= enough]
+            fits = [fit(evidence, self.cloud, T, prior, FINE_CUTS_PX) for T in good]
+            fits = _distinct(sorted(fits, key=lambda one: -one.score), self.radius)
+        return self._estimate(look, evidence, fits)
+
+    def _estimate(self, look: Look, evidence: Sequence[Evidence], fits: Sequence[Fit]) -> PoseEstimate:
+        """What fits at distinct places say, the best first."""
+        T_expected, points = look.expected.get(self.name), self.cloud.points[::SHARE_STEP]
+        if not fits:
+            visible = 1.0 if T_expected is None else look.seen_share(se3.apply(T_expected, points))
+            ignorance = np.diag([1.0, 1.0, 1.0, UNKNOWN_YAW_STD**2])
+            return PoseEstimate("not_found", np.eye(4), ignorance, 0.0, visible)
+        scores = [one.score for one in fits]
+        status, confidence = verdict(scores, self.typical_overlap)
+        place = fits[0].T_world_obj if T_expected is None or status == "found" else T_expected
+        visible = look.seen_share(se3.apply(place, points))
+        covariance = fits[0].covariance.copy()
+        if self.yaw_period == 0:
+            covariance[3, :] = covariance[:, 3] = 0
+            covariance[3, 3] = UNKNOWN_YAW_STD**2
+        poses = [canonical(one.T_world_obj, self.yaw_period, self.yaw_centre) for one in fits]
+        alike = tuple(poses[1 : 1 + others(scores, self.typical_overlap)])
+        support = _support(self, evidence, fits[0])
+        return PoseEstimate(status, poses[0], covariance, confidence, visible, support, alike)
+
+    def to_record(self) -> Record:
+        """See :class:`lerobot_openspm.perception.objects.base.KnownObject`."""
+        source = SEGMENTER if self.log_odds is None else COLOURS
+        fields = {"kind": self.kind, "foreground": source, "name": self.name}
+        arrays = {"points": self.points.astype(np.float32)}
+        if self.log_odds is not None:
+            arrays = {"log_odds": self.log_odds.astype(np.float32), **arrays}
+        return fields | {name: float(getattr(self, name)) for name in NUMBERS}, arrays
+
+
+def from_record(fields: Mapping[str, Any], arrays: Mapping[str, NDArray[Any]], where: str) -> ShapeModel:
+    """Inverse of :meth:`ShapeModel.to_record`. Raises MemoryFormatError, which names ``where``."""
+    name, source = fields["name"], fields.get("foreground")
+    if source not in (COLOURS, SEGMENTER):
+        raise MemoryFormatError(
+            f"{where}: 'foreground' of {name!r} is {source!r}, expected {COLOURS} or {SEGMENTER}"
+        )
+    numbers = records.numbers(fields, NUMBERS, where)
+    log_odds = records.array(arrays, "log_odds", (foreground.N_BINS,), where) if source == COLOURS else None
+    points = records.array(arrays, "points", (-1, 3), where)
+    if not 8 <= len(points) <= MAX_POINTS:
+        raise MemoryFormatError(f"{where}: 'points' has {len(points)} rows, expected 8 to {MAX_POINTS}")
+    return ShapeModel(name, log_odds, points, **numbers)
+
+
+def _evidence(model: ShapeModel, look: Look) -> list[Evidence]:
+    """Every view with the foreground probability of the object's pixels, and what of it is in sight."""
+    evidence = []
+    for camera, view in look.views.items():
+        hidden = look.hidden.get(camera)
+        visible = None if hidden is None else 1 - hidden.astype(np.float32)
+        if model.log_odds is not None:
+            evidence.append(
+                Evidence(view, foreground.probability(look.bins(camera), model.log_odds), visible)
+            )
+            continue
+        mask = np.zeros(view.image.shape[:2], np.float32)
+        for one in look.instances_of(model.name).get(camera, ()):
+            mask[one.mask] = 1.0
+        evidence.append(Evidence(view, mask, visible, camera))
+    return evidence
+
+
+def _nearby(model: ShapeModel, T_expected: Array) -> PosePrior:
+    """An object that is followed keeps about its yaw, and its height but for one in the air."""
+    is_lifted = abs(float(T_expected[2, 3]) - model.height) > LIFTED_M
+    return PosePrior(
+        NEARBY_M, NEARBY_HEIGHT_M if is_lifted else 0.0, 0.0 if model.yaw_period == 0 else NEARBY_RAD
+    )
+
+
+def _support(model: ShapeModel, evidence: Sequence[Evidence], best: Fit) -> Support:
+    """What a fit rests on: views that explain the mask equally well are consistent."""
+    seen = best.overlaps[np.isfinite(best.overlaps)]
+    consistency = float(seen.min() / max(seen.max(), 1e-6)) if len(seen) else 0.0
+    area = float(sum(np.count_nonzero(one.probability > 0.5) for one in evidence))
+    return Support(model.kind, area, consistency, model.typical_overlap)
+
+
+def candidates(evidence: Sequence[Evidence], model: ShapeModel) -> list[Array]:
+    """Places ``(3,)`` of the object's origin that patches of its colours suggest, the most likely first."""
+    votes: list[tuple[Array, float]] = []
+    middle = model.height + float(model.points[:, 2].mean())
+    for one in evidence:
+        for blob in foreground.find_blobs(one.probability, 12, BLOBS_PER_VIEW):
+            point = intersect_plane(one.view.camera, one.view.T_world_cam, blob.centre, middle)
+            distance = float(np.linalg.norm(point - one.view.T_world_cam[:3, 3]))
+            expected = (one.view.camera.focal_px / distance) ** 2 * model.points.std(axis=0)[:2].prod() * 12
+            # The pixel that the plane's point comes from must lie ahead of the camera, not behind it.
+            if (point - one.view.T_world_cam[:3, 3]) @ one.view.T_world_cam[:3, 2] > 0:
+                votes.append((point, min(blob.area / max(expected, 1.0), 1.0) * (1.0 if blob.whole else 0.3)))
+    places: list[Array] = []
+    strength: list[float] = []
+    for point, weight in sorted(votes, key=lambda vote: -vote[1]):
+        near = [
+            i for i, place in enumerate(places) if np.linalg.norm(place[:2] - point[:2]) < 0.6 * model.radius
+        ]
+        if near:
+            i = near[0]
+            places[i] = (places[i] * strength[i] + point * weight) / (strength[i] + weight)
+            strength[i] += weight
+        else:
+            places.append(point)
+            strength.append(weight)
+    order = np.argsort(-np.array(strength), kind="stable")[:MAX_CANDIDATES]
+    order = [i for i in order if strength[i] >= WEAK_SHARE * max(strength)]
+    return [np.array([places[i][0], places[i][1], model.height]) for i in order]
+
+
+def _distinct(fits: Sequence[Fit], radius: float) -> list[Fit]:
+    """Those that are not at the place of a better one."""
+    kept: list[Fit] = []
+    for one in fits:
+        places = [other.T_world_obj[:2, 3] for other in kept]
+        if all(np.linalg.norm(one.T_world_obj[:2, 3] - place) > 0.7 * radius for place in places):
+            kept.append(one)
+    return kept

@@ -1,0 +1,68 @@
+"""What the tabletop's comparisons keep as figures; their stages are stood in for."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+from benchmarks.results import PROVENANCE
+from benchmarks.tabletop import TabletopConfig, main
+
+from benchmarks import results, stages, tabletop
+from lerobot_openspm.cli.pipeline import THREADS, Episode
+
+EPISODES = [Episode("a", 1000, 100, True, "done"), Episode("b", 1000, 300, False, "no_progress")]
+
+
+@pytest.fixture(autouse=True)
+def _stages(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(results, "RESULTS", tmp_path)
+    monkeypatch.setattr(results, "is_published", lambda *_: True)
+    monkeypatch.setattr(results, "_threads", lambda: 7)
+
+    def collect(root: Path, *_: Any) -> dict[str, Any]:
+        root.mkdir(parents=True, exist_ok=True)
+        return {"frames": 200, "episodes": 2}
+
+    for module in (tabletop, stages):
+        monkeypatch.setattr(module, "collect_dataset", collect)
+    monkeypatch.setattr(stages, "train", lambda *_: (Path("checkpoint"), float("nan")))
+    monkeypatch.setattr(tabletop, "evaluate", lambda *_, **__: EPISODES)
+
+
+def test_the_policy_as_it_is_keeps_its_figures():
+    kept = main(TabletopConfig())
+    assert set(PROVENANCE) <= set(kept)
+    assert (kept["success"], kept["n"], kept["seed"], kept["demonstrations"]) == (0.5, 2, 1000, 10)
+    assert kept["per_task"] == {"a": 1.0, "b": 0.0}
+    assert kept["machine"]["threads"] == THREADS
+    # How long a training took that was resumed is not known; the whole took as long as it took.
+    assert kept["train_s"] is None
+    assert kept["total_s"] >= 0
+    # Now all stages are kept.
+    assert main(TabletopConfig())["total_s"] is None
+
+
+@pytest.mark.parametrize(
+    ("name", "runs", "seed"),
+    [
+        ("execution", ["closed_loop_trc", "closed_loop", "open_loop"], 1000),
+        ("oracle", ["oracle"], 1000),
+        ("conditioning", ["equivariant", "paper"], 1000),
+        ("two_bowls", ["two_bowls"], 11_000),
+    ],
+)
+def test_a_comparison_keeps_all_its_runs(name: str, runs: list[str], seed: int, tmp_path: Path):
+    main(TabletopConfig(name))
+    kept = json.loads((tmp_path / f"{name}.json").read_text())
+    assert set(PROVENANCE) <= set(kept)
+    assert list(kept["runs"]) == runs
+    assert (kept["n"], kept["seed"]) == (2, seed)
+    assert kept["machine"]["threads"] == THREADS
+    assert kept["runs"][runs[0]]["failed"] == [["b", 1000, "no_progress"]]
+
+
+def test_an_unknown_comparison_is_refused():
+    with pytest.raises(ValueError, match="comparison is 'weather', expected one of tabletop, execution"):
+        TabletopConfig("weather")
