@@ -50,11 +50,8 @@ def test_links_lead_somewhere(page: Path):
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
 def test_files_that_are_named_are_there(page: Path):
-    named = {
-        span for span in SPAN.findall(text_of(page)) if re.fullmatch(r"[\w/.]+/[\w.]*|\w+/\w+\.py", span)
-    }
-    missing = [one for one in sorted(named) if found(one) is None]
-    assert [one for one in missing if one.partition("/")[0] in ROOTS] == []
+    named = {span for span in SPAN.findall(text_of(page)) if PATH.fullmatch(span)}
+    assert [one for one in sorted(named) if found(one) is None and one.partition("/")[0] in ROOTS] == []
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
