@@ -8,6 +8,7 @@ another are noted with the type that comes back. The picture is Mermaid text, wh
 
 from __future__ import annotations
 
+import argparse
 import ast
 import importlib
 import os
@@ -113,5 +114,8 @@ def drawn(learning: Calls, acting: Calls) -> list[str]:
 
 
 if __name__ == "__main__":
+    argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    ).parse_args()
     os.environ.setdefault("MUJOCO_GL", "egl")
     main()

@@ -9,6 +9,7 @@ demonstrations of one task, recorded for it (about a minute). The last line is o
 
 from __future__ import annotations
 
+import argparse
 import ast
 import dataclasses
 import json
@@ -210,5 +211,8 @@ def import_seconds(repeats: int = 5) -> float:
 
 
 if __name__ == "__main__":
+    argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    ).parse_args()
     os.environ.setdefault("MUJOCO_GL", "egl")
     main()
