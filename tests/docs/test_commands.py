@@ -29,7 +29,13 @@ from tests.policy.lerobot_commands import CALIBRATION
 from lerobot_openspm.configuration_openspm import OpenSPMConfig
 
 LINES = [*lines(), *(Line("benchmarks/figures.py", figure.command, True) for figure in FIGURES.values())]
-RUN = ("openspm inspect", "openspm memory list", "openspm memory search", "openspm teach", "python scripts/stale_figures.py")
+RUN = (
+    "openspm inspect",
+    "openspm memory list",
+    "openspm memory search",
+    "openspm teach",
+    "python scripts/stale_figures.py",
+)
 HAS_LIBERO = importlib.util.find_spec("libero") is not None
 
 
