@@ -31,8 +31,10 @@ from lerobot_openspm.configuration_openspm import OpenSPMConfig
 LINES = [*lines(), *(Line("benchmarks/figures.py", figure.command, True) for figure in FIGURES.values())]
 RUN = (
     "openspm inspect",
+    "openspm memory export",
     "openspm memory list",
     "openspm memory search",
+    "openspm memory show",
     "openspm teach",
     "python scripts/stale_figures.py",
 )
@@ -134,6 +136,7 @@ def _run_python(arguments: list[str], patch: pytest.MonkeyPatch) -> None:
             runpy.run_module(arguments[1], run_name="__main__", alter_sys=True)
     else:
         patch.setattr(sys, "argv", arguments)
+        patch.syspath_prepend(str(Path(arguments[0]).resolve().parent))  # as Python does itself
         runpy.run_path(arguments[0], run_name="__main__")
 
 
