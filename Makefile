@@ -2,7 +2,7 @@
 
 .DEFAULT_GOAL := setup
 .NOTPARALLEL:
-.PHONY: help setup egl demo figures tables libero libero-setup test test-slow guard lint typecheck format clean
+.PHONY: help setup egl demo figures tables libero libero-setup check test test-slow guard lint typecheck format clean
 
 # The demo's total time counts the set-up, so the clock starts before anything else does.
 STARTED_AT := $(shell date +%s)
@@ -46,11 +46,13 @@ libero-setup: egl ## install LIBERO, with its meshes and textures
 		$(BIN)/python -m pip install --no-input --disable-pip-version-check --editable '.[libero]'; }
 	@$(BIN)/python scripts/libero_assets.py
 
-libero: libero-setup ## the same on LIBERO-GOAL: DEMOS, STATES initial states of TASKS (0-9); needs LIBERO, see README
+libero: libero-setup ## the same on LIBERO-GOAL: DEMOS, STATES initial states of TASKS (0-9); see docs/libero.md
 	@$(BIN)/python -m benchmarks.libero.run --demos=$(DEMOS) --states=$(STATES) --tasks=$(TASKS)
 
 tables: setup ## write docs/results.md and README's figures from what was measured (benchmarks/results)
 	@$(BIN)/python -m benchmarks.tables
+
+check: lint test ## lint and test: what has to be green before a commit
 
 test: egl ## run the tests, without those marked slow, libero or gpu (PYTEST_ARGS=... adds arguments)
 	@OMP_NUM_THREADS=1 $(BIN)/python -m pytest $(TWO_PROCESSES) $(PYTEST_ARGS)

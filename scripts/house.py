@@ -9,6 +9,7 @@ demonstrations of one task, recorded for it (about a minute). The last line is o
 
 from __future__ import annotations
 
+import argparse
 import ast
 import dataclasses
 import json
@@ -140,22 +141,28 @@ def leaves(config: Any, prefix: str = "") -> Iterator[str]:
             yield f"{prefix}{field.name}"
 
 
-def acting_path() -> tuple[set[str], int]:
-    """Modules of ours that run in the first `select_action` of an episode, and how deep their calls nest."""
-    import torch
+def mined_policy() -> Any:
+    """A policy that is mined from two demonstrations of one task, recorded for it."""
     from lerobot.datasets.lerobot_dataset import LeRobotDatasetMetadata
     from lerobot.policies.factory import make_policy
 
     from lerobot_openspm.cli.pipeline import collect_dataset
     from lerobot_openspm.configuration_openspm import OpenSPMConfig
-    from lerobot_openspm.envs.tabletop.env import TabletopEnv
 
     with tempfile.TemporaryDirectory() as folder:
         root = Path(folder) / "dataset"
         collect_dataset(root, 2, "openspm_tabletop", TASK)
         cameras = str(root / "meta" / "openspm_cameras.json")
         config = OpenSPMConfig(cameras=cameras, device="cpu", push_to_hub=False)
-        policy = make_policy(config, ds_meta=LeRobotDatasetMetadata("local/house", root=root))
+        return make_policy(config, ds_meta=LeRobotDatasetMetadata("local/house", root=root))
+
+
+def first_observation(policy: Any) -> dict[str, Any]:
+    """What the policy is shown first in an episode on the tabletop, by LeRobot's names."""
+    import torch
+
+    from lerobot_openspm.envs.tabletop.env import TabletopEnv
+
     env = TabletopEnv(task=TASK)
     env.reset(seed=2_350_000)
     batch: dict[str, Any] = {"task": [env.task_description]}
@@ -164,6 +171,13 @@ def acting_path() -> tuple[set[str], int]:
         image = env.simulator.render(key.rsplit(".", 1)[1], 256, 256)
         batch[key] = torch.from_numpy(image.copy()).permute(2, 0, 1)[None].float() / 255
     env.close()
+    return batch
+
+
+def acting_path() -> tuple[set[str], int]:
+    """Modules of ours that run in the first `select_action` of an episode, and how deep their calls nest."""
+    policy = mined_policy()
+    batch = first_observation(policy)
     modules, deepest, now = set[str](), 0, 0
 
     def note(frame: FrameType, event: str, _: Any) -> None:
@@ -197,5 +211,8 @@ def import_seconds(repeats: int = 5) -> float:
 
 
 if __name__ == "__main__":
+    argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    ).parse_args()
     os.environ.setdefault("MUJOCO_GL", "egl")
     main()

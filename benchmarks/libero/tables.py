@@ -127,7 +127,7 @@ def _memory(result: Quoted) -> str:
     note = (
         "The guess, which knows no demonstration: grasp the centroid from above, release above the landmark. "
         "It gets the simulator's poses and sizes of the objects. The paper asks a multimodal model instead: "
-        "see [judgement.md](judgement.md)."
+        "see [phase_labels.md](phase_labels.md)."
     )
     return f"{grid(rows, {**SUCCESS, 'Paper': 'paper'}, 'Key poses from')}\n\n{note}"
 

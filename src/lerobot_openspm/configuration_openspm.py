@@ -74,7 +74,7 @@ class SegmentationConfig:
 class JudgeConfig:
     """What says, beside motion and gripper, which phase ends at a key pose: ``--policy.judge.*``.
 
-    See ``docs/judgement.md``.
+    See ``docs/phase_labels.md``.
 
     Args:
         type: "none". "openai": a multimodal model behind an OpenAI-compatible endpoint. "qwen3vl": Qwen3-VL

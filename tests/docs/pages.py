@@ -9,6 +9,7 @@ REPOSITORY = Path(__file__).parents[2]
 # The page of results is made, of commands that are tested where they come from.
 PAGES = (
     REPOSITORY / "README.md",
+    REPOSITORY / "CONTRIBUTING.md",
     *(page for page in sorted((REPOSITORY / "docs").glob("*.md")) if page.stem != "results"),
 )
 # What is not ours to test; `echo N | python` answers LIBERO's question.

@@ -29,7 +29,15 @@ from tests.policy.lerobot_commands import CALIBRATION
 from lerobot_openspm.configuration_openspm import OpenSPMConfig
 
 LINES = [*lines(), *(Line("benchmarks/figures.py", figure.command, True) for figure in FIGURES.values())]
-RUN = ("openspm inspect", "openspm memory list", "openspm memory search", "openspm teach", "python scripts/")
+RUN = (
+    "openspm inspect",
+    "openspm memory export",
+    "openspm memory list",
+    "openspm memory search",
+    "openspm memory show",
+    "openspm teach",
+    "python scripts/stale_figures.py",
+)
 HAS_LIBERO = importlib.util.find_spec("libero") is not None
 
 
@@ -128,6 +136,7 @@ def _run_python(arguments: list[str], patch: pytest.MonkeyPatch) -> None:
             runpy.run_module(arguments[1], run_name="__main__", alter_sys=True)
     else:
         patch.setattr(sys, "argv", arguments)
+        patch.syspath_prepend(str(Path(arguments[0]).resolve().parent))  # as Python does itself
         runpy.run_path(arguments[0], run_name="__main__")
 
 
@@ -181,7 +190,7 @@ def test_a_target_of_make_exists_and_its_variables_too(line: Line):
 
 def test_what_pip_installs_of_ours_is_offered():
     project = tomllib.loads((REPOSITORY / "pyproject.toml").read_text())["project"]
-    ours = {(project["name"], page) for page in {line.page for line in LINES}} | {(".", "README.md")}
+    ours = {(project["name"], page) for page in {line.page for line in LINES}} | {(".", "docs/libero.md")}
     named = {
         extra.removesuffix("]")
         for line in of_ours("pip")
@@ -192,8 +201,9 @@ def test_what_pip_installs_of_ours_is_offered():
 
 
 def layout_option() -> str:
-    """What README says to type where a dataset's feature names do not tell its layout."""
-    (found,) = [word for word in (REPOSITORY / "README.md").read_text().split("`") if "state_layout=" in word]
+    """What the page says to type where a dataset's feature names do not tell its layout."""
+    page = (REPOSITORY / "docs/own_data.md").read_text()
+    (found,) = [word for word in page.split("`") if "state_layout=" in word]
     return " ".join(found.split())
 
 

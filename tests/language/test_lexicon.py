@@ -45,6 +45,12 @@ def test_words_and_wordings_that_are_added_are_read(file: Path, said: str):
     assert parse_instruction("put the bowl on the plate", lex=lexicon) == BOWL_ON_PLATE
 
 
+def test_a_word_that_is_given_another_meaning_has_that_one_alone():
+    lexicon = read_lexicon(json.dumps({"verbs": {"put": ["Slide"]}}))
+    assert (ENGLISH.verbs["slide"], lexicon.verbs["slide"]) == ("push", "put")
+    assert {word: lexicon.verbs[word] for word in ENGLISH.verbs} == {**ENGLISH.verbs, "slide": "put"}
+
+
 def test_a_name_that_is_added_means_the_same_in_retrieval(file: Path):
     names = TableNames(read_lexicon(str(file)))
     asked = read_task("put the dax on the plate", lex=names.lexicon)

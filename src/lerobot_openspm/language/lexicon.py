@@ -42,7 +42,6 @@ HALF_A_VERB = "half a verb"
 Form = Literal["base", "gerund", "participle", "third"]
 FORMS: tuple[Form, ...] = get_args(Form)
 _LONGEST = 4  # words of a phrase
-_LOADER = getattr(yaml, "CBaseLoader", yaml.BaseLoader)
 
 
 @dataclass(frozen=True)
@@ -290,7 +289,9 @@ def _merged(key: str, ours: Any, theirs: Any) -> Any:
     if isinstance(ours, list):
         return [*theirs, *ours]  # rules that are tried first
     if _KINDS[key] == "Table":
-        return {meaning: [*ours.get(meaning, ()), *theirs.get(meaning, ())] for meaning in {**ours, **theirs}}
+        given = {word.lower() for words in theirs.values() for word in words}  # has its new meaning alone
+        kept = {meaning: [w for w in words if w.lower() not in given] for meaning, words in ours.items()}
+        return {meaning: [*kept.get(meaning, ()), *theirs.get(meaning, ())] for meaning in {**kept, **theirs}}
     return {**ours, **theirs}
 
 

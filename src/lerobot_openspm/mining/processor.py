@@ -53,7 +53,7 @@ from lerobot_openspm.types import Segmenter, Shape
 
 logger = logging.getLogger(__name__)
 
-# Merges a judge's phase labels into the key poses of episodes; see `docs/judgement.md`.
+# Merges a judge's phase labels into the key poses of episodes; see `docs/phase_labels.md`.
 LabelPhases = Callable[[Demonstrations, tuple[MinedEpisode, ...], RobotModel], tuple[MinedEpisode, ...]]
 
 

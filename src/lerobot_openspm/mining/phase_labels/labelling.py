@@ -60,7 +60,9 @@ def make_judge(
     if kind == "qwen3vl":
         return Qwen3VLJudge(Qwen3VL.from_pretrained(model_id or WEIGHTS, device))
     if kind != "openai" or not model_id:
-        raise PhaseLabelError(f"no judge {kind!r} with model {model_id!r}; name both, see docs/judgement.md")
+        raise PhaseLabelError(
+            f"no judge {kind!r} with model {model_id!r}; name both, see docs/phase_labels.md"
+        )
     return EndpointJudge(ChatEndpoint(api_base or API_BASE, model_id, timeout_s))
 
 

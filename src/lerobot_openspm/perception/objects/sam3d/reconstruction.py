@@ -138,5 +138,5 @@ def expect(fine: bool, name: str, arrays: Arrays, expected: str) -> None:
         what = "nothing" if got is None else f"shape {got.shape}: {np.asarray(got).ravel()[:6]}"
         raise PerceptionError(
             f"SAM 3D worker: its answer's {name!r}: got {what}, expected {expected}; see docs/sam3d.md for "
-            "the messages"
+            "its arrays"
         )
