@@ -14,7 +14,7 @@ import importlib
 import os
 import re
 import sys
-from collections.abc import Iterator
+from collections.abc import Generator
 from contextlib import contextmanager
 from types import FrameType
 from typing import Any
@@ -45,7 +45,7 @@ def main() -> None:
 
 
 @contextmanager
-def noted(calls: Calls) -> Iterator[None]:
+def noted(calls: Calls) -> Generator[None]:
     """Note every call from one room into another while this is open."""
 
     def note(frame: FrameType, event: str, _: Any) -> None:

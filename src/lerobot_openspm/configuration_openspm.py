@@ -154,17 +154,16 @@ class OpenSPMConfig(PreTrainedConfig):
             "append" the dataset's episodes, or "rebuild" it from them.
         name_embeddings: Folder or Hub name of a model2vec model that recognises names of objects which the
             lexicon does not know; needs the extra ``[text]``. None: the lexicon alone.
-        lexicon: File of words that instructions are read by beside the built-in ones, of the form of
-            ``lerobot_openspm/language/lexicon.yaml``: other names of things, verbs, wordings. A checkpoint
-            keeps its contents here.
+        lexicon: File of names, verbs and wordings beside those of ``lerobot_openspm/language/lexicon.yaml``,
+            in the same form. A checkpoint keeps its contents here.
         judge: What says, beside motion and gripper, which phase ends at a key pose.
         chunk_size: Actions per chunk, the paper's H.
         n_action_steps: Actions executed before the next chunk, 1 to ``chunk_size``.
         conditioning: "equivariant" gives the flow model the relative pose in the frame of the target key
             pose; "paper" gives it the poses in the world.
         num_inference_steps: Euler steps from noise to a chunk. More are slower and follow the flow closer.
-        samples_per_frame: (frame, noise, time) samples drawn for each frame that the loader brings: the
-            batch size per loaded frame. The loader takes longer for one frame than the model for a hundred.
+        samples_per_frame: (frame, noise, time) samples drawn for each frame that the loader brings. Loading
+            a frame takes longer than learning from a hundred samples.
         noise_seed: Seed of the flow model's noise, which is drawn per (seed, episode, chunk).
         execution: How key poses are followed: "open_loop" plans each chunk from where the hand should be,
             "closed_loop" from where it is, "closed_loop_trc" adds terminal residual correction.
