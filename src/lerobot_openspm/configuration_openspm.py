@@ -138,8 +138,8 @@ class OpenSPMConfig(PreTrainedConfig):
         action_layout: Name of every number of ``action``; read from the dataset if not given.
         rotation: How state and action write rotations, where their names are wrong about it: "axis_angle",
             "quat" or "euler"; "none" ignores the rotation. Where the two differ, name them in the layouts.
-        control_hz: Actions per second that the robot takes; the dataset's frame rate if not given. Motions
-            are counted in steps; only how long an object or a camera was not seen is counted in seconds.
+        control_hz: Actions per second; the dataset's frame rate if not given. It only matters for how long
+            an object or a camera may be out of sight.
         hand_radius_m: Radius of the hand, in metres. It hides from the cameras what is behind it: those
             pixels say nothing about where objects are.
         perception: What finds objects. "demonstrations": the colours and patches that the demonstrations
