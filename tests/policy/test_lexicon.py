@@ -20,15 +20,15 @@ def test_a_word_of_the_users_own_is_acted_on_and_travels_with_the_checkpoint(
     batch = batch_of([{**frame, "task": "blick the dax on the plate"}])
     without = load()
     without.select_action(batch)
-    assert without.episodes[0].controller.refusal
+    assert without.episodes[0].controller.state.refusal
     policy = load(lexicon=str(words))
     policy.select_action(batch)
-    assert policy.episodes[0].controller.planner.ranked[0].entry.language == "put the bowl on the plate"
+    assert policy.episodes[0].controller.state.ranked[0].entry.language == "put the bowl on the plate"
     policy.save_pretrained(tmp_path / "saved")
     words.unlink()
     elsewhere = OpenSPMPolicy.from_pretrained(tmp_path / "saved")
     elsewhere.select_action(batch)
-    assert not elsewhere.episodes[0].controller.refusal
+    assert not elsewhere.episodes[0].controller.state.refusal
 
 
 def test_without_words_of_ones_own_a_checkpoint_keeps_none(
