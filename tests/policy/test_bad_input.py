@@ -142,7 +142,7 @@ SHORT_LAYOUT = {"names": ["x", "y", "z", "gripper"], "rotation": "none"}
         ({"version": VERSION + 1}, f"got version {VERSION + 1}, expected {VERSION}; upgrade"),
         ({"version": VERSION - 1}, f"got version {VERSION - 1}, expected {VERSION}; train again"),
         ({"format": "something"}, "something.*expected format 'openspm-memory'"),
-        ({"segmentation": "given"}, "segmentation=given, got --policy.segmentation=demonstrations"),
+        ({"segmentation": "given"}, "perception=given, got --policy.perception=demonstrations"),
         ({"objects": {}}, "got `object` - at `.*objects`"),
         ({"objects": [3]}, r"got `int` - at `.*objects\[0\]`"),
         ({"robot": None}, "got `null` - at `.*robot`"),
