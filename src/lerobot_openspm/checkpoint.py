@@ -29,9 +29,11 @@ def checkpoint_folder(name: str | Path, revision: str | None = None, **options: 
 
     Raises:
         FileNotFoundError: There is no such folder, and it is no name on the Hub.
+        MemoryFormatError: It has no memory, or one of another version.
     """
     directory = Path(name)
     if directory.is_dir():
+        arrays_file(directory)  # a checkpoint of before has options that its configuration fails on
         return directory
     download = partial(snapshot_download, str(name), **options)
     files = [CONFIG_NAME, SAFETENSORS_SINGLE_FILE, MEMORY_JSON]

@@ -140,8 +140,7 @@ class OpenSPMConfig(PreTrainedConfig):
             "quat" or "euler"; "none" ignores the rotation. Where the two differ, name them in the layouts.
         control_hz: Actions per second; the dataset's frame rate if not given. It only matters for how long
             an object or a camera may be out of sight.
-        hand_radius_m: Radius of the hand, in metres. It hides from the cameras what is behind it: those
-            pixels say nothing about where objects are.
+        hand_radius_m: Radius of the hand, in metres, which hides from the cameras what is behind it.
         perception: What finds objects. "demonstrations": the colours and patches that the demonstrations
             showed. "sam3" and "grounded_sam2": pretrained segmenters that take any phrase. "given": the
             masks in ``observation.masks.<camera>``. "oracle": the simulator's poses, for ablations only.

@@ -1,4 +1,4 @@
-"""The episodes that a policy runs: one for each environment, with a state and eyes of its own."""
+"""The episodes that a policy runs: one for each environment, with a state and perception of its own."""
 
 from __future__ import annotations
 

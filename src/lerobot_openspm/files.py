@@ -70,3 +70,12 @@ def locked(path: Path) -> Generator[None]:
         yield
     finally:
         lock.release()
+
+
+def read_text(path: Path, max_bytes: int) -> str:
+    """The text of a small file, whoever named it. Raises OSError where it is too long or no regular file."""
+    if path.exists() and not path.is_file():  # "/dev/zero" never ends
+        raise OSError("it is no file")
+    if (size := path.stat().st_size) > max_bytes:
+        raise OSError(f"it has {size} bytes, expected up to {max_bytes}")
+    return path.read_text("utf-8")

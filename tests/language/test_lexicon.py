@@ -87,6 +87,26 @@ def test_what_does_not_belong_in_a_file_is_named(tmp_path: Path, text: str, word
         read_lexicon(str(path))
 
 
+@pytest.mark.parametrize(
+    ("source", "words"),
+    [
+        ("/dev/zero", "is no file"),
+        ("{" + "".join(f'"{i}": &x{i} [*x{i - 1}, *x{i - 1}], ' for i in range(1, 60)) + "}", "is no JSON"),
+        ('{"synonyms": ' + "[" * 200_000, "is no JSON"),
+    ],
+)
+def test_what_a_strangers_checkpoint_names_is_not_read_without_end(source: str, words: str):
+    with pytest.raises(LexiconError, match=words):
+        read_lexicon(source)
+
+
+def test_a_file_that_is_too_long_is_refused(tmp_path: Path):
+    path = tmp_path / "words.yaml"
+    path.write_text("#" * 2**20 + "\n")
+    with pytest.raises(LexiconError, match="has 1048577 bytes, expected up to 1048576"):
+        read_lexicon(str(path))
+
+
 def test_a_file_that_is_missing_is_named_with_the_option(tmp_path: Path):
     with pytest.raises(LexiconError, match=r"none.yaml cannot be read: .*--policy.lexicon=FILE"):
         read_lexicon(str(tmp_path / "none.yaml"))

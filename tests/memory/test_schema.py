@@ -7,7 +7,7 @@ from tests.memory.memories import merged_entry, same
 
 from lerobot_openspm.errors import MemoryFormatError
 from lerobot_openspm.memory.entry import WORLD, Anchor, Outcome
-from lerobot_openspm.memory.schema import entry_from_json, entry_to_json
+from lerobot_openspm.memory.schema import entry_from_json, entry_to_json, loads
 
 OUTCOME = Outcome(0, "bowl", Anchor("plate", WORLD), np.array([0.01, 0.0, 0.02]), np.zeros(3), 0.025)
 
@@ -30,6 +30,12 @@ def test_every_number_is_read_to_the_last_bit():
         (found,) = entry_from_json(entry_to_json(entry(outcomes=(outcome,))), "here").outcomes
         assert found.position.tobytes() == outcome.position.tobytes()
         assert found.shown.tobytes() == outcome.shown.tobytes()
+
+
+def test_among_many_keys_the_one_that_is_there_twice_is_found_at_once():
+    text = json.dumps({f"key {i}": 0 for i in range(200_000)})[:-1] + ', "key 199999": 1}'
+    with pytest.raises(MemoryFormatError, match=r"here: .*key 'key 199999' twice"):
+        loads(text.encode(), "here")
 
 
 @pytest.mark.parametrize(

@@ -14,6 +14,7 @@ from typing import Any, Literal, cast, get_args
 import yaml
 
 from lerobot_openspm.errors import LexiconError
+from lerobot_openspm.files import read_text
 
 Words = tuple[str, ...]
 # What a key of the file holds: words or phrases, words with what they mean, regular expressions, and those
@@ -42,6 +43,8 @@ HALF_A_VERB = "half a verb"
 Form = Literal["base", "gerund", "participle", "third"]
 FORMS: tuple[Form, ...] = get_args(Form)
 _LONGEST = 4  # words of a phrase
+MAX_BYTES = 2**20  # of a user's file
+_LOADER = getattr(yaml, "CBaseLoader", yaml.BaseLoader)
 
 
 @dataclass(frozen=True)
@@ -231,7 +234,7 @@ class Lexicon:
 
     def _expanded(self, pattern: str) -> str:
         """A pattern with its fragments in place of their names."""
-        lists = {"colours": "|".join(sorted(self.colours)), "surfaces": "|".join(sorted(self.surfaces))}
+        lists = {key: "|".join(sorted(getattr(self, key))) for key in ("colours", "surfaces")}
         for name, fragment in {**self.fragments, **lists}.items():
             pattern = pattern.replace(f"{{{name}}}", fragment)
         return pattern
@@ -264,7 +267,7 @@ def read_lexicon(source: str | None = None) -> Lexicon:
     is_inline = source.lstrip().startswith("{")
     where = "of the checkpoint" if is_inline else source
     try:
-        told = _read(source if is_inline else Path(source).read_text("utf-8"), where)
+        told = _read(source if is_inline else read_text(Path(source), MAX_BYTES), where, is_inline)
     except (OSError, UnicodeDecodeError) as error:
         raise LexiconError(f"lexicon {where} cannot be read: {error}; pass --policy.lexicon=FILE") from error
     merged |= {key: _merged(key, merged[key], value) for key, value in told.items()}
@@ -278,11 +281,12 @@ def read_lexicon(source: str | None = None) -> Lexicon:
     return lexicon
 
 
-def _read(text: str, where: str) -> dict[str, Any]:
-    try:  # every scalar is text: "on" is no truth value
-        return _checked(yaml.load(text, Loader=yaml.BaseLoader), where)
-    except yaml.YAMLError as error:
-        raise LexiconError(f"lexicon {where} is no YAML: {error}") from error
+def _read(text: str, where: str, is_json: bool = False) -> dict[str, Any]:
+    try:
+        # JSON of a checkpoint has no aliases to blow up. YAML scalars are text: "on" is no truth value.
+        return _checked(json.loads(text) if is_json else yaml.load(text, Loader=_LOADER), where)
+    except (yaml.YAMLError, json.JSONDecodeError, RecursionError) as error:
+        raise LexiconError(f"lexicon {where} is no {'JSON' if is_json else 'YAML'}: {error}") from error
 
 
 def _merged(key: str, ours: Any, theirs: Any) -> Any:
@@ -313,7 +317,7 @@ def _checked(told: Any, where: str) -> dict[str, Any]:
 
 
 def _made(told: dict[str, Any], added: str) -> Lexicon:
-    made: dict[str, Any] = {}
+    made = dict(told)
     for key, value in told.items():
         if _KINDS[key] == "Table":
             made[key] = {word.lower(): meaning for meaning, words in value.items() for word in words}
@@ -321,8 +325,6 @@ def _made(told: dict[str, Any], added: str) -> Lexicon:
             made[key] = frozenset(map(str.lower, value))
         elif _KINDS[key] == "Rules":
             made[key] = tuple((pattern, other) for pattern, other in value)
-        else:
-            made[key] = value
     return Lexicon(**made, added=added)
 
 

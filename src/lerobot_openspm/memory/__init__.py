@@ -1,1 +1,1 @@
-"""The memory of key poses: entries, the bank that holds and saves them, instructions, retrieval."""
+"""The memory of key poses: entries, retrieval, one reader and one writer."""
