@@ -22,6 +22,7 @@ from lerobot_openspm.errors import OpenSPMError
 from lerobot_openspm.geometry.camera import Camera
 from lerobot_openspm.mining.mined import MinedKeyPoses
 from lerobot_openspm.modeling_openspm import OpenSPMPolicy
+from lerobot_openspm.perception.objects.base import Appearance
 from lerobot_openspm.types import Segmentation, View
 
 Options = dict[str, Any]
@@ -193,9 +194,9 @@ def shape_worker(trained: Trained, options: Options) -> Any:
     """The command with which SAM 3D cannot be started; None where it is not needed."""
 
     def describe() -> Any:
-        with training.shapes_of(config(options)) as shapes:
-            mask = Segmentation(np.ones((8, 8), bool), 1.0)
-            return None if shapes is None else shapes.describe(view(), mask, np.eye(3))
+        shapes = training.shapes_of(config(options))
+        seen = Appearance(view(), Segmentation(np.ones((8, 8), bool), 1.0), np.eye(3))
+        return None if shapes is None else shapes.describe([seen])
 
     return result(describe)
 
