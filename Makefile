@@ -40,10 +40,13 @@ figures: egl ## take the published figures (FIGURES="NAME ..." some of them) tha
 	@$(BIN)/python -m benchmarks.figures $(FIGURES)
 
 # LIBERO and its scenes are hundreds of megabytes that only these figures need.
+# Like set-up's, the stamp lets another pyproject.toml, say with a new bound, install again.
+LIBERO_STAMP := .venv/.openspm-libero
 libero-setup: egl ## install LIBERO, with its meshes and textures
-	@$(BIN)/python -c 'import importlib.util, sys; sys.exit(importlib.util.find_spec("libero") is None)' || { \
-		$(BIN)/python -m ensurepip >/dev/null; \
-		$(BIN)/python -m pip install --no-input --disable-pip-version-check --editable '.[libero]'; }
+	@cksum <pyproject.toml | cmp -s - $(LIBERO_STAMP) || { \
+		$(BIN)/python -m ensurepip >/dev/null && \
+		$(BIN)/python -m pip install --no-input --disable-pip-version-check --editable '.[libero]' && \
+		cksum <pyproject.toml >$(LIBERO_STAMP); }
 	@$(BIN)/python scripts/libero_assets.py
 
 libero: libero-setup ## the same on LIBERO-GOAL: DEMOS, STATES initial states of TASKS (0-9); see docs/libero.md

@@ -153,7 +153,7 @@ class OpenSPMConfig(PreTrainedConfig):
             "append" the dataset's episodes, or "rebuild" it from them.
         name_embeddings: Folder or Hub name of a model2vec model that recognises names of objects which the
             lexicon does not know; needs the extra ``[text]``. None: the lexicon alone.
-        lexicon: File of names, verbs and wordings beside those of ``lerobot_openspm/language/lexicon.yaml``,
+        lexicon: File of words beside those of ``lerobot_openspm/language/lexicon.yaml``,
             in the same form. A checkpoint keeps its contents here.
         judge: What says, beside motion and gripper, which phase ends at a key pose.
         chunk_size: Actions per chunk, the paper's H.

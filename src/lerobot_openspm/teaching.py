@@ -93,12 +93,12 @@ def teach(
     # An object that was not found cannot be an anchor, and with few demonstrations nothing shows that the one
     # taken instead is wrong.
     added = tuple(entry for entry in mined.entries if not _unseen(entry))
-    taught = {entry.language for entry in added}
-    for task in dict.fromkeys(tasks.values()):
-        if task not in taught:
-            known = known_names(memory.entries)
-            read = read_tasks([task], known, read_lexicon(config.lexicon))[task]
-            raise DatasetError(_nothing_learned(dataset_meta.repo_id, task, tasks, mined, read))
+    untaught = [task for task in tasks.values() if task not in {entry.language for entry in added}]
+    if untaught:
+        read = read_tasks(untaught[:1], known_names(memory.entries), read_lexicon(config.lexicon))
+        raise DatasetError(
+            _nothing_learned(dataset_meta.repo_id, untaught[0], tasks, mined, read[untaught[0]])
+        )
     named = dict.fromkeys(name for entry in added for name in entry.layout)
     objects = {name: mined.objects[name] for name in named if name in mined.objects}
     learned = replace(mined, entries=added, objects=objects)

@@ -228,8 +228,6 @@ class Lexicon:
             step: tuple((re.compile(self._expanded(pattern)), other) for pattern, other in pairs)
             for step, pairs in rules.items()
         }
-        for pattern, other in found["spelling"] + found["constructions"]:
-            pattern.sub(other, "")  # raises where it names a group that there is not
         return found
 
     def _expanded(self, pattern: str) -> str:
@@ -261,37 +259,28 @@ def read_lexicon(source: str | None = None) -> Lexicon:
     Raises:
         LexiconError: The file is missing, or holds an unknown key or what does not belong there.
     """
-    merged = _read(files("lerobot_openspm.language").joinpath("lexicon.yaml").read_text("utf-8"), "built-in")
+    text = files("lerobot_openspm.language").joinpath("lexicon.yaml").read_text("utf-8")
+    merged = yaml.load(text, Loader=_LOADER)
     if not source:
         return _made(merged, "")
     is_inline = source.lstrip().startswith("{")
     where = "of the checkpoint" if is_inline else source
     try:
-        told = _read(source if is_inline else read_text(Path(source), MAX_BYTES), where, is_inline)
+        text = source if is_inline else read_text(Path(source), MAX_BYTES)
+        # JSON of a checkpoint has no aliases to blow up. YAML scalars are text: "on" is no truth value.
+        told = json.loads(text) if is_inline else yaml.load(text, Loader=_LOADER)
     except (OSError, UnicodeDecodeError) as error:
         raise LexiconError(f"lexicon {where} cannot be read: {error}; pass --policy.lexicon=FILE") from error
-    merged |= {key: _merged(key, merged[key], value) for key, value in told.items()}
-    lexicon = _made(merged, json.dumps(told, ensure_ascii=False))
-    try:
-        _ = lexicon.rewrites
-    except re.error as error:
-        raise LexiconError(
-            f"lexicon {where}: {error.pattern!r}, expected a regular expression with its replacement: {error}"
-        ) from error
-    return lexicon
-
-
-def _read(text: str, where: str, is_json: bool = False) -> dict[str, Any]:
-    try:
-        # JSON of a checkpoint has no aliases to blow up. YAML scalars are text: "on" is no truth value.
-        return _checked(json.loads(text) if is_json else yaml.load(text, Loader=_LOADER), where)
     except (yaml.YAMLError, json.JSONDecodeError, RecursionError) as error:
-        raise LexiconError(f"lexicon {where} is no {'JSON' if is_json else 'YAML'}: {error}") from error
+        raise LexiconError(f"lexicon {where} is no {'JSON' if is_inline else 'YAML'}: {error}") from error
+    told = _checked(told, where)
+    merged |= {key: _merged(key, merged[key], value) for key, value in told.items()}
+    return _made(merged, json.dumps(told, ensure_ascii=False))
 
 
 def _merged(key: str, ours: Any, theirs: Any) -> Any:
     if isinstance(ours, list):
-        return [*theirs, *ours]  # rules that are tried first
+        return [*ours, *theirs]
     if _KINDS[key] == "Table":
         given = {word.lower() for words in theirs.values() for word in words}  # has its new meaning alone
         kept = {meaning: [w for w in words if w.lower() not in given] for meaning, words in ours.items()}
@@ -300,12 +289,17 @@ def _merged(key: str, ours: Any, theirs: Any) -> Any:
 
 
 def _checked(told: Any, where: str) -> dict[str, Any]:
-    """What a file holds, if it is of the right form."""
+    """What a user's file holds, if it is of the right form: words alone.
+
+    A regular expression that a stranger wrote may never come to an end.
+    """
     if not isinstance(told, dict):
         raise LexiconError(f"lexicon {where} is {str(told)[:40]!r}, expected keys such as 'synonyms'")
     for key, value in cast(dict[str, Any], told).items():
-        if key not in _KINDS:
-            raise LexiconError(f"lexicon {where} has the key {key!r}, expected some of {', '.join(_KINDS)}")
+        if key not in _KINDS or key in _PATTERNS:
+            why = "whose regular expressions are fixed, " if key in _PATTERNS else ""
+            allowed = ", ".join(sorted(_KINDS.keys() - _PATTERNS))
+            raise LexiconError(f"lexicon {where} has the key {key!r}, {why}expected some of {allowed}")
         expected, form = _FORMS[_KINDS[key]]
         if not _fits(value, form):
             raise LexiconError(f"lexicon {where}, {key}: is {json.dumps(value)[:60]}, expected {expected}")
@@ -336,17 +330,18 @@ def _fits(value: Any, form: Any) -> bool:
         return isinstance(value, list) and all(_fits(one, form[0]) for one in cast(Any, value))
     if isinstance(form, tuple):
         return _fits(value, [str]) and len(value) == 2
-    return isinstance(value, str)
+    return isinstance(value, str) and _WORDS.fullmatch(value) is not None
 
 
 _KINDS = {field.name: str(field.type) for field in fields(Lexicon) if field.name != "added"}
-# What each kind looks like in a file.
+_PATTERNS = {
+    "fragments", "spelling", "courtesies", "greetings", "headings", "constructions", "refused",
+}  # fmt: skip
+# What each kind looks like in a user's file.
 _FORMS: dict[str, tuple[str, Any]] = {
     "WordSet": ("a list of words", [str]),
-    "Patterns": ("a list of regular expressions", [str]),
     "Table": ("for each meaning a list of words", {str: [str]}),
-    "Mapping[str, str]": ("a regular expression for each name", {str: str}),
     "Mapping[str, tuple[str, str]]": ("for each verb its gerund and its participle", {str: (str, str)}),
-    "Rules": ("a list of pairs [regular expression, replacement]", [(str, str)]),
 }
+_WORDS = re.compile(r"[\w '-]+")
 ENGLISH = read_lexicon()
