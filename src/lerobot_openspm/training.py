@@ -6,7 +6,6 @@ learn(...): dataset -> dataset_processor(...).mine() -> MinedDataset -> memory_o
 from __future__ import annotations
 
 import logging
-from contextlib import AbstractContextManager, nullcontext
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -107,7 +106,7 @@ def dataset_processor(
         judge=None if config.judge.type == "none" else partial(labelled, config=config),
         segmenter=segmenter or config.make_segmenter(),
         shape=config.segmentation.shape,
-        open_shapes=partial(shapes_of, config),
+        make_shapes=partial(shapes_of, config),
         is_oracle=config.perception == "oracle",
     )
     return DatasetProcessor(dataset, options)
@@ -163,14 +162,14 @@ def open_demonstrations(dataset_meta: Any, config: OpenSPMConfig) -> Demonstrati
     return Demonstrations(dataset, *config.layouts())
 
 
-def shapes_of(config: OpenSPMConfig) -> AbstractContextManager[ShapeBackend | None]:
-    """The shape backend that a configuration asks for, to be closed after use; None where there is none.
+def shapes_of(config: OpenSPMConfig) -> ShapeBackend | None:
+    """The shape backend that a configuration asks for; None where there is none.
 
     Raises:
         PerceptionError: It is not said where SAM 3D is.
     """
     if config.segmentation.shape != "sam3d":
-        return nullcontext(None)
+        return None
     python, checkout = config.segmentation.sam3d_python, config.segmentation.sam3d_checkout
     if python is None or checkout is None:
         raise PerceptionError(
@@ -178,7 +177,7 @@ def shapes_of(config: OpenSPMConfig) -> AbstractContextManager[ShapeBackend | No
             "pass --policy.segmentation.sam3d_python=PYTHON and --policy.segmentation.sam3d_checkout=DIR, "
             "see docs/sam3d.md"
         )
-    return nullcontext(Sam3dShape(worker_command(Path(python), Path(checkout))))
+    return Sam3dShape(worker_command(Path(python), Path(checkout)))
 
 
 def labelled(

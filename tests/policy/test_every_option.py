@@ -193,9 +193,9 @@ def shape_worker(trained: Trained, options: Options) -> Any:
     """The command with which SAM 3D cannot be started; None where it is not needed."""
 
     def describe() -> Any:
-        with training.shapes_of(config(options)) as shapes:
-            mask = Segmentation(np.ones((8, 8), bool), 1.0)
-            return None if shapes is None else shapes.describe(view(), mask, np.eye(3))
+        shapes = training.shapes_of(config(options))
+        mask = Segmentation(np.ones((8, 8), bool), 1.0)
+        return None if shapes is None else shapes.describe(view(), mask, np.eye(3))
 
     return result(describe)
 

@@ -18,7 +18,6 @@ from __future__ import annotations
 import logging
 from collections import defaultdict
 from collections.abc import Callable, Collection, Mapping, Sequence
-from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, field
 from functools import cached_property, partial
 from statistics import median_low
@@ -75,7 +74,7 @@ class MiningOptions:
         judge: Labels phases, beside motion and gripper.
         segmenter: Finds the objects' masks; None where the demonstrations teach what objects look like.
         shape: What is learned about an object that a segmenter finds.
-        open_shapes: Starts the backend that measures objects, for shape "sam3d"; it is closed after use.
+        make_shapes: Makes the backend that measures objects, for shape "sam3d"; None where there is none.
         is_oracle: Whether object poses come from the simulator instead (oracle ablation only).
     """
 
@@ -91,7 +90,7 @@ class MiningOptions:
     judge: LabelPhases | None = None
     segmenter: Segmenter | None = None
     shape: Shape = "demonstrations"
-    open_shapes: Callable[[], AbstractContextManager[ShapeBackend | None]] = nullcontext
+    make_shapes: Callable[[], ShapeBackend | None] | None = None
     is_oracle: bool = False
 
 
@@ -137,11 +136,11 @@ class DatasetProcessor:
         cameras = self._cameras()
         found = self.key_poses(held_out)
         scenes = learn_scenes(self.demonstrations, found.episodes, cameras)
-        with self._options.open_shapes() as shapes:
-            objects = find_objects(
-                scenes, found.episodes, self._options.known_objects, np.random.default_rng(0),
-                self._options.segmenter, self._options.shape, shapes,
-            )  # fmt: skip
+        make_shapes = self._options.make_shapes
+        objects = find_objects(
+            scenes, found.episodes, self._options.known_objects, np.random.default_rng(0),
+            self._options.segmenter, self._options.shape, make_shapes and make_shapes(),
+        )  # fmt: skip
         poses, ends, simulator_objects = objects.poses, objects.ends, ()
         if self._options.is_oracle:
             poses, ends, simulator_objects = simulator_poses(
