@@ -113,7 +113,7 @@ def _tabletop(task: str, seed: int) -> Iterator[_Step]:
     sensor = ContactSensor(simulator.model, simulator.data, ("finger_left", "finger_right"))
     for action in expert_actions(simulator, task, np.random.default_rng(seed), UnsteadyHand):
         sensor.record()
-        seen = (env.state(), env.ee_pose(), float(np.abs(simulator.finger_positions()).sum()))
+        seen = (env.state(), simulator.ee_pose(), float(np.abs(simulator.finger_positions()).sum()))
         _, _, _, info = env.advance(action)
         if info["unstable"]:
             break

@@ -55,7 +55,7 @@ class TabletopWorld:
         env.reset(seed=seed)
         self.instruction = env.task_description
         self.max_steps = ANY_TASK[env.task].max_steps
-        self.state, self.object_poses = env.state, env.object_poses
+        self.state, self.object_poses = env.state, env.simulator.object_poses
 
     def image(self, name: str) -> np.ndarray:
         """A camera's present image ``(256, 256, 3)``, uint8."""

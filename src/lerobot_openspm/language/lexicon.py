@@ -54,13 +54,11 @@ class Verb:
     Attributes:
         operation: What it means, one of :data:`OPERATIONS` or :data:`HALF_A_VERB`.
         word: Its first word in its base form.
-        form: "base" ("put"), "gerund" ("putting"), "participle" ("put") or "third" ("puts").
         length: How many words it has.
     """
 
     operation: str
     word: str
-    form: Form
     length: int
 
 
@@ -158,7 +156,7 @@ class Lexicon:
             gerund, participle = self.irregular_verbs.get(word, (f"{stem}ing", f"{stem}ed"))
             third = f"{word}es" if word.endswith(("sh", "x", "ch", "ss")) else f"{word}s"
             for form, inflected in zip(FORMS, (word, gerund, participle, third), strict=True):
-                found[form, (inflected, *more)] = Verb(operation, word, form, 1 + len(more))
+                found[form, (inflected, *more)] = Verb(operation, word, 1 + len(more))
         return found
 
     def longest(self, words: Words, at: int, phrases: Table | WordSet) -> str:

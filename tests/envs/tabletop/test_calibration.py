@@ -15,7 +15,7 @@ DOCUMENT = Tabletop().calibration(256, 256)
 
 def _world_from_camera(env, camera: str) -> np.ndarray:
     calibration = DOCUMENT["cameras"][f"observation.images.{camera}"]
-    mount = env.ee_pose() if calibration["mount"] == "ee" else np.eye(4)
+    mount = env.simulator.ee_pose() if calibration["mount"] == "ee" else np.eye(4)
     return mount @ np.array(calibration["T_mount_cam"])
 
 
@@ -51,7 +51,7 @@ def test_projection_hits_the_coloured_pixels(make_env, camera):
             [scene.BURNER_X + scene.BURNER_RADIUS * np.cos(angles), scene.BURNER_RADIUS * np.sin(angles)]
         )
         edge = np.vstack([xy, np.full(360, scene.BURNER_TOP), np.ones(360)])
-        points = (env.object_poses()["stove"] @ edge).T[:, :3]
+        points = (env.simulator.object_poses()["stove"] @ edge).T[:, :3]
         calibrated = cameras_from_dict(DOCUMENT, "the simulator")[f"observation.images.{camera}"]
         outline, _ = project(calibrated, _world_from_camera(env, camera), points)
         moments = cv2.moments(outline.astype(np.float32))

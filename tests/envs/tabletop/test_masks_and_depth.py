@@ -36,7 +36,7 @@ def observation(env):
 
 def camera_of(env, name):
     camera = cameras_from_dict(Tabletop().calibration(SIZE, SIZE), "tabletop")[f"observation.images.{name}"]
-    return camera, camera.T_world_cam(env.ee_pose())
+    return camera, camera.T_world_cam(env.simulator.ee_pose())
 
 
 def points_of(env, observation, name):
@@ -68,7 +68,7 @@ def test_depth_on_the_table_is_the_rays_distance_to_its_plane(env, observation, 
 def test_what_a_mask_and_the_depth_show_lies_in_the_objects_extent(env, observation, name):
     points, _ = points_of(env, observation, name)
     labels = observation[f"masks.{name}"].ravel()
-    for obj, T_world_obj in env.object_poses().items():
+    for obj, T_world_obj in env.simulator.object_poses().items():
         own = se3.apply(se3.inverse(T_world_obj), points[labels == scene.OBJECT_LABELS[obj]])
         low, high = EXTENTS[obj]
         assert len(own) > 10, obj
@@ -81,7 +81,9 @@ def test_the_mask_holds_the_objects_projected_top(env, observation, name):
     camera, T_world_cam = camera_of(env, name)
     tops = {"box": (0, 0, 0.03), "rack": (0, 0, 0.05), "stove": (-0.03, 0, 0.03)}
     for obj, top in tops.items():
-        uv, depth = project(camera, T_world_cam, se3.apply(env.object_poses()[obj], np.array([top]))[0])
+        uv, depth = project(
+            camera, T_world_cam, se3.apply(env.simulator.object_poses()[obj], np.array([top]))[0]
+        )
         u, v = np.round(uv).astype(int)
         assert observation[f"masks.{name}"][0, v, u] == scene.OBJECT_LABELS[obj], obj
         assert observation[f"depth.{name}"][0, v, u] == pytest.approx(depth, abs=0.01), obj
@@ -90,7 +92,7 @@ def test_the_mask_holds_the_objects_projected_top(env, observation, name):
 def test_drawers_and_knob_are_their_objects(env):
     env.simulator.data.qpos[env.simulator.model.joint("drawer_top").qposadr[0]] = scene.DRAWER_TRAVEL
     observation = env.step(np.zeros(7, np.float32))[0]
-    T_world_cabinet, T_world_stove = (env.object_poses()[name] for name in ("cabinet", "stove"))
+    T_world_cabinet, T_world_stove = (env.simulator.object_poses()[name] for name in ("cabinet", "stove"))
     handle = np.array([[scene.HANDLE_X + scene.DRAWER_TRAVEL, 0.0, scene.handle_height(2)]])
     knob = np.array([[scene.KNOB_X, 0.0, scene.STOVE_HEIGHT + 0.036]])
     for name in ("front", "side"):

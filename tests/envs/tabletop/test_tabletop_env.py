@@ -37,11 +37,11 @@ def test_instances_share_no_state(make_env):
     first, second = make_env(), make_env()
     first.reset(seed=0)
     second.reset(seed=1)
-    before = first.object_poses()
+    before = first.simulator.object_poses()
     second.reset(seed=2)
     for action in _actions(5):
         second.step(action)
-    for name, pose in first.object_poses().items():
+    for name, pose in first.simulator.object_poses().items():
         np.testing.assert_array_equal(pose, before[name])
     assert not np.array_equal(first.simulator.model.body_pos, second.simulator.model.body_pos)
 
@@ -51,7 +51,7 @@ def test_starts_at_rest_at_home_with_no_task_done(make_env):
     for seed in range(10):
         _, info = env.reset(seed=seed)
         assert info == {"is_success": False, "status": "running", "unstable": False}
-        np.testing.assert_allclose(env.ee_pose()[:3, 3], scene.HOME_POSITION, atol=1e-3)
+        np.testing.assert_allclose(env.simulator.ee_pose()[:3, 3], scene.HOME_POSITION, atol=1e-3)
         assert all(env.simulator.is_at_rest(name) for name in scene.MOVABLE_NAMES)
         assert not any(task.is_done(env.simulator) for task in TASKS.values())
 
@@ -80,8 +80,10 @@ def test_actions_move_the_hand_in_the_world_frame(make_env):
         env.step(np.array([0, 0, 0, 0, 0, 0.5, 1], np.float32))
     for _ in range(10):
         observation, *_ = env.step(np.array([0, 0, 0, 0, 0, 0, 1], np.float32))
-    np.testing.assert_allclose(env.ee_pose()[:3, 3], np.add(scene.HOME_POSITION, (0.2, 0, 0)), atol=2e-3)
-    yaw = np.arctan2(env.ee_pose()[1, 0], env.ee_pose()[0, 0])
+    np.testing.assert_allclose(
+        env.simulator.ee_pose()[:3, 3], np.add(scene.HOME_POSITION, (0.2, 0, 0)), atol=2e-3
+    )
+    yaw = np.arctan2(env.simulator.ee_pose()[1, 0], env.simulator.ee_pose()[0, 0])
     assert yaw == pytest.approx(0.3, abs=0.01)
     assert abs(observation["agent_pos"][6]) < 0.002
 
@@ -92,10 +94,10 @@ def test_a_blocked_hand_does_not_wind_up(make_env):
     down = np.array([0, 0, -1, 0, 0, 0, 1], np.float32)
     for _ in range(60):
         env.step(down)
-    low = env.ee_pose()[2, 3]
+    low = env.simulator.ee_pose()[2, 3]
     for _ in range(6):
         env.step(-down)
-    assert env.ee_pose()[2, 3] > low + 0.06
+    assert env.simulator.ee_pose()[2, 3] > low + 0.06
 
 
 def test_object_poses_are_observed_only_on_demand(make_env):
@@ -103,7 +105,7 @@ def test_object_poses_are_observed_only_on_demand(make_env):
     observation, _ = env.reset(seed=0)
     vector = observation["object_poses"].reshape(len(scene.OBJECT_NAMES), 7)
     assert observation["object_poses"].shape == (len(OBJECT_POSE_NAMES),)
-    for row, pose in zip(vector, env.object_poses().values(), strict=True):
+    for row, pose in zip(vector, env.simulator.object_poses().values(), strict=True):
         np.testing.assert_allclose(row[:3], pose[:3, 3], atol=1e-6)
     assert "object_poses" not in make_env().reset(seed=0)[0]
 

@@ -30,7 +30,7 @@ def test_a_condition_that_no_layout_meets_ends_in_an_error(monkeypatch):
 def test_two_bowls_are_there_and_the_true_poses_are_those_of_the_objects_as_ever(make_env):
     env = make_env("left_bowl_on_plate", masks=True)
     observation, _ = env.reset(seed=3)
-    assert tuple(env.object_poses()) == scene.OBJECT_NAMES
+    assert tuple(env.simulator.object_poses()) == scene.OBJECT_NAMES
     one = make_env("bowl_on_plate", masks=True)
     alone, _ = one.reset(seed=3)
     area = [

@@ -197,17 +197,9 @@ class TabletopEnv(gym.Env):
             [pose[:3, 3], axis_angle(pose[:3, :3]), self.simulator.finger_positions()]
         ).astype(np.float32)
 
-    def object_poses(self) -> dict[str, np.ndarray]:
-        """T_world_obj, (4, 4), per object name: the simulator's truth."""
-        return self.simulator.object_poses()
-
-    def ee_pose(self) -> np.ndarray:
-        """T_world_ee, (4, 4): the simulator's truth."""
-        return self.simulator.ee_pose()
-
     def object_pose_vector(self) -> np.ndarray:
         """(49,) float32, as in `OBJECT_POSE_NAMES`: position (m) and quat_wxyz (w >= 0) per object."""
-        return pose_vector(self.object_poses()).astype(np.float32)
+        return pose_vector(self.simulator.object_poses()).astype(np.float32)
 
     def render(self) -> np.ndarray:
         """The front view, 256 x 256 RGB."""

@@ -153,13 +153,11 @@ class ObjectShape:
         T_world_obj: Upright pose ``(4, 4)``: origin at the footprint's centre, x along its long side.
         extents: Length, width and height ``(3,)`` along that frame's axes, metres.
         quality: From 0 to 1: how well the shape explains what was seen.
-        tilt: Angle in radians by which the shape was turned to stand upright.
     """
 
     T_world_obj: Array
     extents: Array
     quality: float
-    tilt: float = 0.0
 
 
 @dataclass(frozen=True)

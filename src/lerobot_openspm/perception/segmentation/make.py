@@ -34,8 +34,6 @@ BACKENDS = {
     ),
     "given": Backend(lambda _, labels, __: GivenSegmenter(labels)),
 }
-# With "demonstrations" nothing is segmented: they teach what the objects look like.
-SEGMENTERS = ("demonstrations", *BACKENDS)
 
 
 def make_segmenter(

@@ -97,12 +97,10 @@ class Innovation(NamedTuple):
     """How a measurement compared with the prediction.
 
     Attributes:
-        residual: Position, then orientation error ``(n, 6)``.
         squared: Normalised innovation squared ``(n,)``; chi-squared with six degrees of freedom.
         accepted: Whether it passed the gate ``(n,)``.
     """
 
-    residual: Array
     squared: Array
     accepted: NDArray[np.bool_]
 
@@ -171,7 +169,7 @@ def update(belief: Belief, T: Array, R: Array, gate: float = GATE) -> tuple[Beli
         belief.angular_velocity + change[:, 9:],
         P,
     )
-    return updated, Innovation(residual, squared, accepted)
+    return updated, Innovation(squared, accepted)
 
 
 def _turned(error: Array) -> Array:

@@ -24,8 +24,6 @@ from lerobot_openspm.types import UNKNOWN_YAW_STD, PoseEstimate, View
 
 # A box turned by more than this from where a fit begins may slip into a turn by a quarter.
 START_YAWS = np.arange(4) * np.pi / 4
-# Two bodies nearer than this share of their radius are one.
-SAME_PLACE = 0.7
 # A footprint whose sides differ by less than this share is a square: which is the longer cannot be seen.
 SQUARE_SHARE = 0.06
 # Records: the numbers of an object.
@@ -85,7 +83,7 @@ class BoxModel:
         found = associate(look.views, look.instances_of(self.name), middle, radius)
         placed = [place(look.views, masks, self) for masks in found]
         placed.sort(key=lambda one: -one.score)
-        placed = _distinct(placed, radius)
+        placed = [placed[i] for i in fitting.distinct([one.fit.body.T_world_obj for one in placed], radius)]
         T_expected, corners = look.expected.get(self.name), self.size * CORNERS
         if not placed:
             unknown = np.diag([1.0, 1.0, 1.0, UNKNOWN_YAW_STD**2])
@@ -146,17 +144,6 @@ def coverage(views: Mapping[str, View], masks: ObjectMasks, body: Box) -> float:
         overlap(view, masks[camera].mask if camera in masks else None, body) for camera, view in views.items()
     ]
     return fitting.score(np.array(overlaps))
-
-
-def _distinct(placed: list[Placed], radius: float) -> list[Placed]:
-    """Those that are not at the place of a better one: a part of a mask is no second object."""
-    kept: list[Placed] = []
-    for one in placed:
-        place_of = one.fit.body.T_world_obj[:2, 3]
-        others = [other.fit.body.T_world_obj[:2, 3] for other in kept]
-        if all(np.linalg.norm(place_of - other) > SAME_PLACE * radius for other in others):
-            kept.append(one)
-    return kept
 
 
 def _start(views: Mapping[str, View], masks: ObjectMasks, model: BoxModel) -> Array:

@@ -174,8 +174,8 @@ def _shape(one: Appearance, arrays: Arrays) -> ObjectShape:
         points_cam = se3.apply(se3.inverse(one.view.T_world_cam), one.points_world)
         found = found.scaled(factor_by_points(found, points_cam))
     expect(found.extents.max() < LARGEST_M, "extents", arrays, f"less than {LARGEST_M:g} m, scaled")
-    T_world_obj, extents, tilt = make_upright(one.view.T_world_cam @ found.T_cam_box, found.extents)
-    return ObjectShape(T_world_obj, extents, _quality(found, one.view, one.segmentation), tilt)
+    T_world_obj, extents, _ = make_upright(one.view.T_world_cam @ found.T_cam_box, found.extents)
+    return ObjectShape(T_world_obj, extents, _quality(found, one.view, one.segmentation))
 
 
 def _check(one: Appearance) -> None:

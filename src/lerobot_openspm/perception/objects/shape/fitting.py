@@ -28,6 +28,8 @@ FOUND_CONFIDENCE = 0.5
 RIVAL_SHARE = 0.93
 # A further place must explain the images so well to count as another object of the kind.
 ANOTHER_CONFIDENCE = 0.75
+# Two bodies nearer than this share of their radius are one: a part of a mask is no second object.
+SAME_PLACE = 0.7
 
 
 @dataclass(frozen=True)
@@ -171,6 +173,16 @@ def verdict(
         return "not_found", confidence
     is_rivalled = len(scores) > 1 and scores[1] > RIVAL_SHARE * scores[0]
     return "ambiguous" if is_rivalled else "found", confidence
+
+
+def distinct(poses: Sequence[Array], radius: float) -> list[int]:
+    """Indices of the poses ``(4, 4)``, the best first, that are not at the place of a better one."""
+    kept: list[int] = []
+    for i, T in enumerate(poses):
+        places = [poses[k][:2, 3] for k in kept]
+        if all(np.linalg.norm(T[:2, 3] - place) > SAME_PLACE * radius for place in places):
+            kept.append(i)
+    return kept
 
 
 def others(scores: Sequence[float], typical_overlap: float) -> int:

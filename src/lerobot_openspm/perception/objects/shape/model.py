@@ -28,6 +28,7 @@ from lerobot_openspm.perception.objects.shape.fitting import (
     Evidence,
     Fit,
     PosePrior,
+    distinct,
     fit,
     others,
     verdict,
@@ -119,7 +120,8 @@ class ShapeModel:
             enough = POOR_SHARE * max((one.score for one in starts), default=0.0)
             good = [one.T_world_obj for one in starts if one.score > 0 and one.score >= enough]
             fits = [fit(evidence, self.cloud, T, prior, FINE_CUTS_PX) for T in good]
-            fits = _distinct(sorted(fits, key=lambda one: -one.score), self.radius)
+            fits.sort(key=lambda one: -one.score)
+            fits = [fits[i] for i in distinct([one.T_world_obj for one in fits], self.radius)]
         return self._estimate(look, evidence, fits)
 
     def _estimate(self, look: Look, evidence: Sequence[Evidence], fits: Sequence[Fit]) -> PoseEstimate:
@@ -229,13 +231,3 @@ def candidates(evidence: Sequence[Evidence], model: ShapeModel) -> list[Array]:
     order = np.argsort(-np.array(strength), kind="stable")[:MAX_CANDIDATES]
     order = [i for i in order if strength[i] >= WEAK_SHARE * max(strength)]
     return [np.array([places[i][0], places[i][1], model.height]) for i in order]
-
-
-def _distinct(fits: Sequence[Fit], radius: float) -> list[Fit]:
-    """Those that are not at the place of a better one."""
-    kept: list[Fit] = []
-    for one in fits:
-        places = [other.T_world_obj[:2, 3] for other in kept]
-        if all(np.linalg.norm(one.T_world_obj[:2, 3] - place) > 0.7 * radius for place in places):
-            kept.append(one)
-    return kept
