@@ -69,7 +69,7 @@ def load_memory(directory: Path, config: OpenSPMConfig, is_kept: bool) -> Memory
     found_by = "oracle" if memory.perception == "oracle" else memory.segmentation
     for name, made, asked in (
         ("perception", found_by, config.perception),
-        ("segmentation.shape", memory.shape, config.segmentation.shape),
+        ("segmenter.shape", memory.shape, config.segmenter.shape),
     ):
         if made != asked:
             raise MemoryFormatError(
@@ -80,7 +80,7 @@ def load_memory(directory: Path, config: OpenSPMConfig, is_kept: bool) -> Memory
         where = str(directory / MEMORY_JSON)
         check_layouts(memory.layouts, config.layouts(), "the configuration's", where)
         check_anchors(memory, where)
-        check_labels(memory, config.segmentation.labels, str(directory / CONFIG_NAME))
+        check_labels(memory, config.segmenter.labels, str(directory / CONFIG_NAME))
     check_sizes(memory.cameras, config.image_sizes, config.cameras or str(directory / MEMORY_JSON))
     return memory
 
@@ -117,7 +117,7 @@ def check_labels(memory: Memory, labels: Mapping[str, int] | None, where: str) -
     """
     if labels is not None and (missing := sorted(set(memory.objects) - set(labels))):
         raise MemoryFormatError(
-            f"{where}: 'segmentation.labels' has no number for {', '.join(missing)}, which the memory has "
-            f"key poses at; it has {', '.join(sorted(labels))}. Pass --policy.segmentation.labels='{{...}}' "
+            f"{where}: 'segmenter.labels' has no number for {', '.join(missing)}, which the memory has "
+            f"key poses at; it has {', '.join(sorted(labels))}. Pass --policy.segmenter.labels='{{...}}' "
             "with all of them"
         )

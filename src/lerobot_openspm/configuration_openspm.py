@@ -36,8 +36,8 @@ WARMUP_STEPS, DECAY_STEPS = 50, 3000
 
 
 @dataclass
-class SegmentationConfig:
-    """What a segmenter needs, and what is learned from its masks: ``--policy.segmentation.*``.
+class SegmenterConfig:
+    """What a segmenter needs, and what is learned from its masks: ``--policy.segmenter.*``.
 
     Args:
         weights: Hub names or folders of a pretrained segmenter's weights: one for perception "sam3", detector
@@ -57,17 +57,15 @@ class SegmentationConfig:
     sam3d_checkout: str | None = None
 
     def __post_init__(self) -> None:
-        _require_choice("segmentation.shape", self.shape, get_args(Shape))
+        _require_choice("segmenter.shape", self.shape, get_args(Shape))
         if self.shape != "sam3d" and (self.sam3d_python or self.sam3d_checkout):
             raise ValueError(
-                f"segmentation.sam3d_python and sam3d_checkout are for shape 'sam3d', got {self.shape!r}; "
-                "pass --policy.segmentation.shape=sam3d too, or leave them out"
+                f"segmenter.sam3d_python and sam3d_checkout are for shape 'sam3d', got {self.shape!r}; "
+                "pass --policy.segmenter.shape=sam3d too, or leave them out"
             )
         for phrase, number in (self.labels or {}).items():
             if type(number) is not int or number < 1:
-                raise ValueError(
-                    f"segmentation.labels[{phrase!r}] is {number!r}, expected a number from 1 on"
-                )
+                raise ValueError(f"segmenter.labels[{phrase!r}] is {number!r}, expected a number from 1 on")
 
 
 @dataclass
@@ -146,7 +144,7 @@ class OpenSPMConfig(PreTrainedConfig):
             masks in ``observation.masks.<camera>``. "oracle": the simulator's poses, for ablations only.
         tracking: Whether objects are followed through the episode, and key poses with them. Otherwise they
             are found once, at its start, as in the paper, and later pictures are neither needed nor used.
-        segmentation: What a segmenter needs, and what is learned from its masks.
+        segmenter: What a segmenter needs, and what is learned from its masks.
         memory_episodes: Indices of the episodes that may enter the memory and the training samples; all if
             not given. Name them when some are held out: the policy is shown the whole dataset otherwise.
         memory_update: What happens to a checkpoint's memory when training goes on from it: "keep" it,
@@ -187,7 +185,7 @@ class OpenSPMConfig(PreTrainedConfig):
     # Perception.
     perception: PerceptionSource = "demonstrations"
     tracking: bool = True
-    segmentation: SegmentationConfig = field(default_factory=SegmentationConfig)
+    segmenter: SegmenterConfig = field(default_factory=SegmenterConfig)
 
     # Memory.
     memory_episodes: list[int] | None = None
@@ -226,22 +224,22 @@ class OpenSPMConfig(PreTrainedConfig):
 
     def _check_segmentation(self) -> None:
         """Options of a segmenter need a segmenter."""
-        labels, has_masks = self.segmentation.labels, self.perception in SEGMENTERS
-        if not has_masks and self.segmentation.shape != "demonstrations":
+        labels, has_masks = self.segmenter.labels, self.perception in SEGMENTERS
+        if not has_masks and self.segmenter.shape != "demonstrations":
             raise ValueError(
-                f"segmentation.shape is {self.segmentation.shape!r}, but perception {self.perception!r} has "
+                f"segmenter.shape is {self.segmenter.shape!r}, but perception {self.perception!r} has "
                 "no masks; pass --policy.perception=sam3, grounded_sam2 or given"
             )
-        if self.segmentation.weights and self.perception not in PRETRAINED:
+        if self.segmenter.weights and self.perception not in PRETRAINED:
             raise ValueError(
-                f"segmentation.weights are for perception {' and '.join(PRETRAINED)}, got "
+                f"segmenter.weights are for perception {' and '.join(PRETRAINED)}, got "
                 f"{self.perception!r}; pass --policy.perception=sam3 too, or leave them out"
             )
         if (self.perception == "given") != (labels is not None):
             raise ValueError(
-                f"perception is {self.perception!r}, segmentation.labels is {labels}, expected labels with "
+                f"perception is {self.perception!r}, segmenter.labels is {labels}, expected labels with "
                 "perception=given and with nothing else; pass e.g. --policy.perception=given "
-                """--policy.segmentation.labels='{"bowl": 1}'"""
+                """--policy.segmenter.labels='{"bowl": 1}'"""
             )
 
     def without_places(self) -> OpenSPMConfig:
@@ -250,7 +248,7 @@ class OpenSPMConfig(PreTrainedConfig):
         return replace(
             self,
             cameras=None,
-            segmentation=replace(self.segmentation, sam3d_python=None, sam3d_checkout=None),
+            segmenter=replace(self.segmenter, sam3d_python=None, sam3d_checkout=None),
             judge=replace(self.judge, api_base=None),
             name_embeddings=None if names and Path(names).is_dir() else names,
         )
@@ -270,7 +268,7 @@ class OpenSPMConfig(PreTrainedConfig):
             return None
         from lerobot_openspm.perception.segmentation.make import make_segmenter
 
-        weights, labels = self.segmentation.weights or (), self.segmentation.labels or {}
+        weights, labels = self.segmenter.weights or (), self.segmenter.labels or {}
         return make_segmenter(self.perception, labels, weights, str(self.device))
 
     def layouts(self) -> tuple[VectorLayout, VectorLayout]:

@@ -103,7 +103,7 @@ def teach(
     objects = {name: mined.objects[name] for name in named if name in mined.objects}
     learned = replace(mined, entries=added, objects=objects)
     result = memory.appended(learned)
-    check_labels(result, config.segmentation.labels, f"the checkpoint of {config.type}")
+    check_labels(result, config.segmenter.labels, f"the checkpoint of {config.type}")
     used = {entry.source for entry in added}
     skipped = tuple(i for i in wanted if f"{dataset_meta.repo_id}#{i}" not in used)
     return result, _lesson(memory, learned, skipped)

@@ -105,7 +105,7 @@ def dataset_processor(
         known_robot=known.robot if known else None,
         judge=None if config.judge.type == "none" else partial(labelled, config=config),
         segmenter=segmenter or config.make_segmenter(),
-        shape=config.segmentation.shape,
+        shape=config.segmenter.shape,
         make_shapes=partial(shapes_of, config),
         is_oracle=config.perception == "oracle",
     )
@@ -128,7 +128,7 @@ def memory_of(mined: MinedDataset, config: OpenSPMConfig) -> Memory:
         perception, segmentation = "oracle", "demonstrations"
     return Memory(
         entries, dict(mined.objects), mined.robot, dict(mined.cameras), perception,
-        mined.simulator_objects, segmentation, config.segmentation.shape, config.layouts(),
+        mined.simulator_objects, segmentation, config.segmenter.shape, config.layouts(),
     )  # fmt: skip
 
 
@@ -168,13 +168,13 @@ def shapes_of(config: OpenSPMConfig) -> ShapeBackend | None:
     Raises:
         PerceptionError: It is not said where SAM 3D is.
     """
-    if config.segmentation.shape != "sam3d":
+    if config.segmenter.shape != "sam3d":
         return None
-    python, checkout = config.segmentation.sam3d_python, config.segmentation.sam3d_checkout
+    python, checkout = config.segmenter.sam3d_python, config.segmenter.sam3d_checkout
     if python is None or checkout is None:
         raise PerceptionError(
-            f"segmentation.shape is 'sam3d', but sam3d_python is {python!r} and sam3d_checkout {checkout!r}; "
-            "pass --policy.segmentation.sam3d_python=PYTHON and --policy.segmentation.sam3d_checkout=DIR, "
+            f"segmenter.shape is 'sam3d', but sam3d_python is {python!r} and sam3d_checkout {checkout!r}; "
+            "pass --policy.segmenter.sam3d_python=PYTHON and --policy.segmenter.sam3d_checkout=DIR, "
             "see docs/sam3d.md"
         )
     return Sam3dShape(worker_command(Path(python), Path(checkout)))

@@ -15,7 +15,7 @@ from tests.policy.conftest import Frame, batch_of
 from tests.policy.lerobot_commands import call_lerobot, train_arguments, training_options
 from tests.policy.test_learning import new_config
 
-from lerobot_openspm.configuration_openspm import OpenSPMConfig, SegmentationConfig
+from lerobot_openspm.configuration_openspm import OpenSPMConfig, SegmenterConfig
 from lerobot_openspm.errors import (
     CalibrationError,
     DatasetError,
@@ -317,9 +317,9 @@ def test_sam3d_that_nobody_said_where_to_find_is_an_error(
     tiny_meta: LeRobotDatasetMetadata, calibration: Path
 ):
     config = new_config(tiny_meta)
-    config.perception, config.segmentation = "given", SegmentationConfig(labels={"bowl": 1}, shape="sam3d")
+    config.perception, config.segmenter = "given", SegmenterConfig(labels={"bowl": 1}, shape="sam3d")
     config.cameras = str(calibration)
-    with pytest.raises(PerceptionError, match=r"sam3d_python is None.*\.segmentation\.sam3d_python=PYTHON"):
+    with pytest.raises(PerceptionError, match=r"sam3d_python is None.*\.segmenter\.sam3d_python=PYTHON"):
         OpenSPMPolicy(config, dataset_meta=tiny_meta)
 
 
@@ -327,7 +327,7 @@ def test_weights_that_are_not_there_are_an_error_when_the_policy_is_made(
     tiny_meta: LeRobotDatasetMetadata, calibration: Path, tmp_path: Path
 ):
     config = new_config(tiny_meta)
-    config.perception, config.segmentation.weights = "sam3", [str(tmp_path / "nowhere")]
+    config.perception, config.segmenter.weights = "sam3", [str(tmp_path / "nowhere")]
     config.cameras = str(calibration)
     with pytest.raises(PerceptionError, match="nowhere"):
         OpenSPMPolicy(config, dataset_meta=tiny_meta)

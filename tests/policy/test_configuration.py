@@ -12,7 +12,7 @@ from lerobot.utils.constants import ACTION, OBS_STATE
 from scipy.spatial.transform import Rotation
 
 from lerobot_openspm.cli.mine import MineConfig
-from lerobot_openspm.configuration_openspm import JudgeConfig, OpenSPMConfig, SegmentationConfig
+from lerobot_openspm.configuration_openspm import JudgeConfig, OpenSPMConfig, SegmenterConfig
 from lerobot_openspm.errors import LayoutError
 from lerobot_openspm.perception.observation import split_batch
 
@@ -33,7 +33,7 @@ LABELS = {"bowl": 1, "wine bottle": 4}
 
 
 def masks(**options: Any) -> dict[str, Any]:
-    return {"segmentation": SegmentationConfig(**options)}
+    return {"segmenter": SegmenterConfig(**options)}
 
 
 @pytest.mark.parametrize(
@@ -41,9 +41,9 @@ def masks(**options: Any) -> dict[str, Any]:
     [
         (masks(shape="box"), "shape is 'box', but perception 'demonstrations' has no masks.*perception=sam3"),
         ({"perception": "oracle", **masks(shape="box")}, "'box', but perception 'oracle' has no masks"),
-        ({"perception": "given"}, "segmentation.labels is None.*--policy.segmentation.labels='"),
-        ({"perception": "sam3", **masks(labels=LABELS)}, "'sam3', segmentation.labels is {'bowl'"),
-        (masks(labels=LABELS), "'demonstrations', segmentation.labels is {'bowl'"),
+        ({"perception": "given"}, "segmenter.labels is None.*--policy.segmenter.labels='"),
+        ({"perception": "sam3", **masks(labels=LABELS)}, "'sam3', segmenter.labels is {'bowl'"),
+        (masks(labels=LABELS), "'demonstrations', segmenter.labels is {'bowl'"),
         (masks(weights=["one"]), "are for perception sam3 and grounded_sam2, got 'demonstrations'"),
     ],
 )
@@ -55,32 +55,32 @@ def test_options_that_make_no_sense_together_are_refused(options: dict[str, Any]
 @pytest.mark.parametrize(
     ("options", "words"),
     [
-        ({"shape": "telepathy"}, "segmentation.shape is 'telepathy', expected one of demonstrations, box"),
+        ({"shape": "telepathy"}, "segmenter.shape is 'telepathy', expected one of demonstrations, box"),
         ({"sam3d_python": "python"}, "are for shape 'sam3d', got 'demonstrations'"),
-        ({"labels": {"bowl": 0}}, r"segmentation.labels\['bowl'\] is 0, expected .* 1 on"),
-        ({"labels": {"bowl": True}}, r"segmentation.labels\['bowl'\] is True"),
+        ({"labels": {"bowl": 0}}, r"segmenter.labels\['bowl'\] is 0, expected .* 1 on"),
+        ({"labels": {"bowl": True}}, r"segmenter.labels\['bowl'\] is True"),
     ],
 )
 def test_options_of_a_segmenter_are_checked(options: dict[str, Any], words: str):
     with pytest.raises(ValueError, match=words):
-        SegmentationConfig(**options)
+        SegmenterConfig(**options)
 
 
 @pytest.mark.parametrize("shape", ["demonstrations", "box"])
 def test_a_segmenter_goes_with_either_shape(shape: str):
-    assert config(perception="given", **masks(labels=LABELS, shape=shape)).segmentation.shape == shape
-    assert config(perception="grounded_sam2", **masks(shape=shape)).segmentation.shape == shape
+    assert config(perception="given", **masks(labels=LABELS, shape=shape)).segmenter.shape == shape
+    assert config(perception="grounded_sam2", **masks(shape=shape)).segmenter.shape == shape
 
 
 def test_nested_options_are_read_from_a_command_line(capsys: pytest.CaptureFixture[str]):
     options = [
         "--policy.perception=given",
-        '--policy.segmentation.labels={"bowl": 1, "wine bottle": 4}',
+        '--policy.segmenter.labels={"bowl": 1, "wine bottle": 4}',
         "--policy.judge.type=openai",
         "--policy.judge.model_id=tiny-vl",
     ]
     policy = draccus.parse(MineConfig, args=options).policy
-    assert policy.segmentation == SegmentationConfig(labels=LABELS)
+    assert policy.segmenter == SegmenterConfig(labels=LABELS)
     assert policy.judge == JudgeConfig("openai", model_id="tiny-vl")
     with pytest.raises(SystemExit):
         draccus.parse(MineConfig, args=["--policy.judge.type=telepathy"])
@@ -95,11 +95,11 @@ def test_a_configuration_is_saved_and_read_as_it_is(tmp_path: Path):
     )  # fmt: skip
     saved.save_pretrained(tmp_path)
     assert PreTrainedConfig.from_pretrained(tmp_path) == saved
-    options = ["--judge.confidence=0.9", "--segmentation.labels=null", "--perception=sam3"]
+    options = ["--judge.confidence=0.9", "--segmenter.labels=null", "--perception=sam3"]
     changed = PreTrainedConfig.from_pretrained(tmp_path, cli_overrides=options)
     assert isinstance(changed, OpenSPMConfig)
     assert changed.judge == replace(saved.judge, confidence=0.9)
-    assert (changed.perception, changed.segmentation) == ("sam3", SegmentationConfig(shape="box"))
+    assert (changed.perception, changed.segmenter) == ("sam3", SegmenterConfig(shape="box"))
     assert changed.memory_episodes == [0, 2]
 
 

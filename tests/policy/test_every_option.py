@@ -18,7 +18,7 @@ from tests.policy.test_learning import new_config
 
 from lerobot_openspm import episodes as running
 from lerobot_openspm import training
-from lerobot_openspm.configuration_openspm import JudgeConfig, OpenSPMConfig, SegmentationConfig
+from lerobot_openspm.configuration_openspm import JudgeConfig, OpenSPMConfig, SegmenterConfig
 from lerobot_openspm.errors import OpenSPMError
 from lerobot_openspm.geometry.camera import Camera
 from lerobot_openspm.mining.mined import MinedKeyPoses
@@ -27,7 +27,7 @@ from lerobot_openspm.perception.objects.base import Appearance
 from lerobot_openspm.types import Segmentation, View
 
 Options = dict[str, Any]
-GROUPS = {"segmentation": SegmentationConfig, "judge": JudgeConfig}
+GROUPS = {"segmenter": SegmenterConfig, "judge": JudgeConfig}
 SECOND_SERVER = "the second server"
 
 
@@ -242,8 +242,8 @@ def evidence(trained: Trained, options: Options) -> Any:
 LABELS = {"perception": "given"}
 PRETRAINED = {"perception": "sam3"}
 SAM3D = {
-    "perception": "sam3", "segmentation.shape": "sam3d", "segmentation.sam3d_python": "nowhere",
-    "segmentation.sam3d_checkout": "here",
+    "perception": "sam3", "segmenter.shape": "sam3d", "segmenter.sam3d_python": "nowhere",
+    "segmenter.sam3d_checkout": "here",
 }  # fmt: skip
 NAMES = ["x", "y", "z", "roll", "pitch", "yaw", "gripper"]
 TURNED_NAMES = ["y", "x", "z", "roll", "pitch", "yaw", "gripper"]
@@ -268,11 +268,11 @@ CASES = {
     "hand_radius_m": Case(actions, 0.08, 1.0),
     "perception": Case(refusal, "demonstrations", "oracle"),
     "tracking": Case(actions_after_a_change, True, False),
-    "segmentation.weights": Case(masks, ["here"], ["there"], PRETRAINED),
-    "segmentation.labels": Case(masks, {"bowl": 1}, {"bowl": 2}, LABELS),
-    "segmentation.shape": Case(shape_worker, "sam3d", "box", PRETRAINED),
-    "segmentation.sam3d_python": Case(shape_worker, "nowhere", "elsewhere", SAM3D),
-    "segmentation.sam3d_checkout": Case(shape_worker, "here", "there", SAM3D),
+    "segmenter.weights": Case(masks, ["here"], ["there"], PRETRAINED),
+    "segmenter.labels": Case(masks, {"bowl": 1}, {"bowl": 2}, LABELS),
+    "segmenter.shape": Case(shape_worker, "sam3d", "box", PRETRAINED),
+    "segmenter.sam3d_python": Case(shape_worker, "nowhere", "elsewhere", SAM3D),
+    "segmenter.sam3d_checkout": Case(shape_worker, "here", "there", SAM3D),
     "memory_episodes": Case(episodes, [0], [1, 4]),
     "memory_update": Case(entries, "keep", "rebuild"),
     "lexicon": Case(understood, None, '{"verbs": {"put": ["blick"]}}'),

@@ -15,7 +15,7 @@ from tests.memory.memory_files import edit_header
 from tests.policy.conftest import NAME
 from tests.policy.lerobot_commands import CALIBRATION
 
-from lerobot_openspm.configuration_openspm import OpenSPMConfig, SegmentationConfig
+from lerobot_openspm.configuration_openspm import OpenSPMConfig, SegmenterConfig
 from lerobot_openspm.envs.tabletop import scene
 from lerobot_openspm.envs.tabletop.env import TabletopEnv
 from lerobot_openspm.errors import MemoryFormatError, PerceptionError
@@ -66,7 +66,7 @@ def masked_demonstrations(start_labels: list[dict[str, np.ndarray]]) -> Iterator
 def given_masks(checkpoint: Path) -> OpenSPMConfig:
     config = PreTrainedConfig.from_pretrained(checkpoint)
     assert isinstance(config, OpenSPMConfig)
-    config.perception, config.segmentation = "given", SegmentationConfig(labels=LABELS, shape="box")
+    config.perception, config.segmenter = "given", SegmenterConfig(labels=LABELS, shape="box")
     config.cameras, config.memory_update = str(CALIBRATION), "rebuild"
     return config
 
@@ -141,11 +141,11 @@ def test_a_memory_of_masks_is_not_read_as_one_of_colours(mined: Path):
     config = PreTrainedConfig.from_pretrained(mined)
     assert isinstance(config, OpenSPMConfig)
     assert read_memory(mined).segmentation == "given"
-    config.perception, config.segmentation = "demonstrations", SegmentationConfig()
+    config.perception, config.segmenter = "demonstrations", SegmenterConfig()
     with pytest.raises(MemoryFormatError, match=r"perception=given, got --policy\.perception=demonstrations"):
         OpenSPMPolicy.from_pretrained(mined, config=config)
-    config.perception, config.segmentation = "given", SegmentationConfig(labels=LABELS)
-    with pytest.raises(MemoryFormatError, match=r"shape=box, got --policy\.segmentation\.shape=demonstr"):
+    config.perception, config.segmenter = "given", SegmenterConfig(labels=LABELS)
+    with pytest.raises(MemoryFormatError, match=r"shape=box, got --policy\.segmenter\.shape=demonstr"):
         OpenSPMPolicy.from_pretrained(mined, config=config)
 
 
@@ -153,7 +153,7 @@ def test_a_phrase_without_a_label_is_named(
     checkpoint: Path, tiny_dataset: Path, masked_demonstrations: None, tmp_path: Path
 ):
     config, meta = given_masks(checkpoint), LeRobotDatasetMetadata(NAME, root=tiny_dataset)
-    config.segmentation.labels = {"bowl": 1}
+    config.segmenter.labels = {"bowl": 1}
     with pytest.raises(PerceptionError, match="no label is given for 'plate'"):
         OpenSPMPolicy.from_pretrained(
             relabelled(checkpoint, tmp_path / "old"), config=config, dataset_meta=meta

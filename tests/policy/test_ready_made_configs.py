@@ -9,7 +9,7 @@ from lerobot.configs import parser
 from lerobot.configs.eval import EvalPipelineConfig
 from lerobot.configs.train import TrainPipelineConfig
 
-from lerobot_openspm.configuration_openspm import OpenSPMConfig, SegmentationConfig
+from lerobot_openspm.configuration_openspm import OpenSPMConfig, SegmenterConfig
 
 CONFIGS = Path(__file__).parents[2] / "configs"
 
@@ -38,10 +38,10 @@ def test_training(robot: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
 
 
 def test_evaluation(monkeypatch: pytest.MonkeyPatch, checkpoint: Path):
-    options = ("--policy.perception=given", '--policy.segmentation.labels={"bowl": 3}')
+    options = ("--policy.perception=given", '--policy.segmenter.labels={"bowl": 3}')
     path = f"--policy.path={checkpoint}"
     config = read(monkeypatch, EvalPipelineConfig, "openspm_libero_eval.yaml", path, *options)
     assert (config.env.type, config.env.task) == ("libero", "libero_goal")
     assert (config.eval.n_episodes, config.eval.batch_size, config.seed) == (50, 1, 1000)
     assert isinstance(config.policy, OpenSPMConfig)
-    assert config.policy.segmentation == SegmentationConfig(labels={"bowl": 3})
+    assert config.policy.segmenter == SegmenterConfig(labels={"bowl": 3})

@@ -31,7 +31,7 @@ def test_the_default_perception_and_a_trained_flow_model_solve_episodes(
     checkpoint, _ = pipeline.train(root, tmp_path / "train")
     config = OpenSPMConfig.from_pretrained(checkpoint)
     defaults = OpenSPMConfig()
-    assert (config.perception, config.segmentation.shape) == ("demonstrations",) * 2
+    assert (config.perception, config.segmenter.shape) == ("demonstrations",) * 2
     assert (config.execution, config.tracking) == (defaults.execution, defaults.tracking)
     training = json.loads((checkpoint / "train_config.json").read_text())
     assert training["steps"] == 3000

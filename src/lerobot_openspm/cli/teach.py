@@ -37,7 +37,7 @@ class PolicyOption:
     """What the checkpoint does not say."""
 
     cameras: str | None = None  # calibration of the demonstrations; theirs or the checkpoint's if not given
-    segmentation: Sam3dOption = field(default_factory=Sam3dOption)
+    segmenter: Sam3dOption = field(default_factory=Sam3dOption)
 
 
 @dataclass
@@ -85,14 +85,14 @@ def _policy(config: TeachConfig) -> OpenSPMPolicy:
     from lerobot_openspm.modeling_openspm import OpenSPMPolicy
 
     policy = OpenSPMPolicy.from_pretrained(config.into)
-    places, segmentation = config.policy.segmentation, policy.config.segmentation
-    segmentation = replace(
-        segmentation,
-        sam3d_python=places.sam3d_python or segmentation.sam3d_python,
-        sam3d_checkout=places.sam3d_checkout or segmentation.sam3d_checkout,
+    places, saved = config.policy.segmenter, policy.config.segmenter
+    segmenter = replace(
+        saved,
+        sam3d_python=places.sam3d_python or saved.sam3d_python,
+        sam3d_checkout=places.sam3d_checkout or saved.sam3d_checkout,
     )
     cameras = config.policy.cameras or policy.config.cameras
-    policy.config = replace(policy.config, cameras=cameras, segmentation=segmentation)
+    policy.config = replace(policy.config, cameras=cameras, segmenter=segmenter)
     return policy
 
 
