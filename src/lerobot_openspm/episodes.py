@@ -6,8 +6,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from lerobot_openspm.configuration_openspm import OpenSPMConfig
-from lerobot_openspm.control.checks import TransferLimits
 from lerobot_openspm.control.controller import EpisodeController
+from lerobot_openspm.control.feasibility import TransferLimits
 from lerobot_openspm.control.planning import PlanningContext
 from lerobot_openspm.language.names import NameSimilarity
 from lerobot_openspm.memory.entry import MemoryEntry

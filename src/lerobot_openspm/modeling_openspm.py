@@ -68,7 +68,8 @@ class OpenSPMPolicy(PreTrainedPolicy):
         if dataset_meta is not None:
             _ = self.names  # what cannot be used is an error now, not at the first observation
             config.control_hz = config.control_hz or float(dataset_meta.fps)
-            self.flow.action_scale.copy_(self._learn(dataset_meta).action_scale)
+            training_set = self._learn(dataset_meta)
+            self.flow.action_scale.copy_(training_set.action_scale)
         self.reset()
 
     # Acting. Top to bottom: look where the controller wants it, ask for a chunk where it is needed, act.
@@ -288,7 +289,7 @@ class OpenSPMPolicy(PreTrainedPolicy):
         # What cannot be used is an error now, not at the first observation.
         _ = policy.segmenter, policy.names
         if dataset_meta is not None:
-            policy._learn(dataset_meta)
+            policy._learn(dataset_meta)  # the loaded action scale stays: the weights were trained with it
         return policy
 
     def require_memory(self) -> Memory:

@@ -5,8 +5,8 @@ import pytest
 from numpy.testing import assert_allclose
 from tests.memory.builders import OPEN_WIDTH, entry, hand_pose, robot
 
-from lerobot_openspm.control.checks import TransferLimits
 from lerobot_openspm.control.controller import EpisodeController
+from lerobot_openspm.control.feasibility import TransferLimits
 from lerobot_openspm.control.planning import MOVED_M, PlanningContext
 from lerobot_openspm.control.scene import BLIND_S, GIVE_UP_S, LOOK_AGAIN_S
 from lerobot_openspm.control.state import Status

@@ -6,8 +6,13 @@ from numpy.testing import assert_allclose
 from tests.geometry.strategies import transforms
 from tests.memory.builders import entry, hand_pose, key_pose, robot
 
-from lerobot_openspm.control import checks
-from lerobot_openspm.control.checks import TransferLimits, check_transfer, geometric_score, shape_deviation
+from lerobot_openspm.control import feasibility
+from lerobot_openspm.control.feasibility import (
+    TransferLimits,
+    check_transfer,
+    geometric_score,
+    shape_deviation,
+)
 from lerobot_openspm.control.transfer import RETREAT_M, transfer, transfer_pose
 from lerobot_openspm.geometry import se3
 from lerobot_openspm.memory.entry import WORLD
@@ -131,7 +136,7 @@ def test_each_check_names_the_key_pose_and_what_is_wrong(T, word):
 
 
 def test_a_jump_is_measured_from_the_key_pose_before_and_first_from_the_hand(monkeypatch):
-    monkeypatch.setattr(checks, "MAX_JUMP_M", 0.25)
+    monkeypatch.setattr(feasibility, "MAX_JUMP_M", 0.25)
     far = problems(("approach", hand_pose(0, 0, 0.2)), ("grasp", hand_pose(0.3, 0, 0.2)))
     assert far == ["key pose 1 (grasp at bowl) is 0.30 m and 0.00 rad from the one before"]
     first = problems(("approach", hand_pose(0.3, 0, 0.3)), ("grasp", hand_pose(0.3, 0, 0.2)))
@@ -210,7 +215,7 @@ def test_an_object_that_is_missing_or_out_of_reach_scores_nothing(monkeypatch):
     layout = entry().layout
     assert score({"bowl": layout["bowl"]}) == 0
     assert score(layout | {"plate": se3.from_yaw([3.0, 0, 0], 0.0)}) == 0
-    monkeypatch.setattr(checks, "MAX_JUMP_M", 0.05)
+    monkeypatch.setattr(feasibility, "MAX_JUMP_M", 0.05)
     assert score(layout) == 0
 
 
@@ -235,6 +240,6 @@ def test_what_can_be_done_at_all_scores_something(monkeypatch):
     take = key_pose("handle", hand_pose(0.0, 0.0, 0.1), "grasp", closed=True)
     memory = entry(key_poses=[take, pull], layout={"cabinet": np.eye(4), "handle": np.eye(4)})
     here = {"cabinet": np.eye(4), "handle": se3.from_yaw([-0.4, 0.0, 0.0], 2.0)}
-    monkeypatch.setattr(checks, "MAX_JUMP_M", 9)
-    monkeypatch.setattr(checks, "MAX_JUMP_RAD", 9)
+    monkeypatch.setattr(feasibility, "MAX_JUMP_M", 9)
+    monkeypatch.setattr(feasibility, "MAX_JUMP_RAD", 9)
     assert 0 < score(here, memory) < 0.01

@@ -205,7 +205,7 @@ class EpisodeController:
         return self.scene.look([*self._untouched(), *self.scene.tracker.held], hand)
 
     def _go_on(self, look: LookRequest, moved: frozenset[str], hand: Hand) -> None:
-        """Act on what has changed: fetch what was dropped, go where things are now."""
+        """Act on what has moved: what was in the hand and is seen elsewhere was dropped, so fetch it."""
         scene, executor, plan = self.scene, self.executor, self.state.plan
         target, index = executor.target, self.state.index
         dropped = {

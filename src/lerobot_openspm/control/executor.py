@@ -22,7 +22,7 @@ from lerobot_openspm.types import Execution, Hand
 
 logger = logging.getLogger(__name__)
 
-# Corrections per key pose, and how often a grasp that missed or a key pose that was not met is tried again.
+# Corrections per key pose, and attempts beyond the first in a part of the instruction.
 MAX_CORRECTIONS, MAX_ATTEMPTS = 8, 3
 # Phases that end with the hand on an object.
 CONTACTS = ("grasp", "release", "push", "open", "turn")
@@ -236,7 +236,7 @@ class Executor:
     # Trying again.
 
     def try_again(self, why: str) -> bool:
-        """Count another attempt at the present key pose; without one left there is no progress."""
+        """Count another attempt at the present part; without one left there is no progress."""
         self.state.attempts += 1
         phase = self.present.key_pose.phase
         if self.state.attempts > MAX_ATTEMPTS:

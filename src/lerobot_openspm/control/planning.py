@@ -7,7 +7,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from lerobot_openspm.control.checks import TransferLimits, check_transfer, geometric_score
+from lerobot_openspm.control.feasibility import TransferLimits, check_transfer, geometric_score
 from lerobot_openspm.control.transfer import Target, pushed_by_landmark, transfer
 from lerobot_openspm.geometry import se3
 from lerobot_openspm.geometry.se3 import Array
