@@ -72,7 +72,7 @@ def test_what_a_file_adds_is_kept_as_text_that_is_read_again(file: Path):
         ("constructions: [['(a+)+$', b]]", r"key 'constructions', whose regular expressions are fixed"),
         (
             "refused: {no: [a+]}",
-            r"key 'refused', whose regular expressions are fixed, expected some of aliases",
+            r"key 'refused', whose regular expressions are fixed, expected",
         ),
         ("colours: ['(a+)+$']", r"words.yaml, colours: is .*, expected a list of words"),
         ("synonyms: {bowl: ['(a+)+ of b']}", r"words.yaml, synonyms: is .*, expected for each meaning"),
