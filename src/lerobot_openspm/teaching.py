@@ -11,7 +11,7 @@ from typing import Any
 from lerobot_openspm.checkpoint import check_labels
 from lerobot_openspm.configuration_openspm import OpenSPMConfig, feature_names
 from lerobot_openspm.errors import DatasetError, LayoutError
-from lerobot_openspm.geometry.camera import load_cameras
+from lerobot_openspm.geometry.camera import Camera, load_cameras
 from lerobot_openspm.language.instruction import read_tasks
 from lerobot_openspm.language.lexicon import read_lexicon
 from lerobot_openspm.language.own_words import normal_words
@@ -86,19 +86,15 @@ def teach(
     _check_layouts(dataset_meta, config)
     tasks = _tasks(dataset_meta, wanted)
     settings = replace(config, memory_episodes=wanted)
-    own = Path(dataset_meta.root) / "meta" / DATASET_CAMERAS
-    cameras = load_cameras(own) if own.is_file() else memory.cameras
-    processor = dataset_processor(dataset_meta, settings, memory, cameras, segmenter)
+    processor = dataset_processor(dataset_meta, settings, memory, _cameras(dataset_meta, memory), segmenter)
     mined = memory_of(processor.mine(), settings)
-    # An object that was not found cannot be an anchor, and with few demonstrations nothing shows that the one
-    # taken instead is wrong.
+    # With few demonstrations nothing shows that an anchor is wrong, so all its objects have to be found.
     added = tuple(entry for entry in mined.entries if not _unseen(entry))
-    untaught = [task for task in tasks.values() if task not in {entry.language for entry in added}]
-    if untaught:
-        read = read_tasks(untaught[:1], known_names(memory.entries), read_lexicon(config.lexicon))
-        raise DatasetError(
-            _nothing_learned(dataset_meta.repo_id, untaught[0], tasks, mined, read[untaught[0]])
-        )
+    taught = {entry.language for entry in added}
+    task = next((task for task in tasks.values() if task not in taught), None)
+    if task is not None:
+        read = read_tasks([task], known_names(memory.entries), read_lexicon(config.lexicon))[task]
+        raise DatasetError(_nothing_learned(dataset_meta.repo_id, task, tasks, mined, read))
     named = dict.fromkeys(name for entry in added for name in entry.layout)
     objects = {name: mined.objects[name] for name in named if name in mined.objects}
     learned = replace(mined, entries=added, objects=objects)
@@ -120,6 +116,12 @@ def _lesson(memory: Memory, learned: Memory, skipped: tuple[int, ...]) -> Lesson
         objects_learned=tuple(name for name in named if name not in memory.objects),
         objects_recognised=tuple(name for name in named if name in memory.objects),
     )
+
+
+def _cameras(dataset_meta: Any, memory: Memory) -> dict[str, Camera]:
+    """The calibration that lies in the dataset, else the memory's."""
+    own = Path(dataset_meta.root) / "meta" / DATASET_CAMERAS
+    return load_cameras(own) if own.is_file() else memory.cameras
 
 
 def _episodes(dataset_meta: Any, episodes: Sequence[int] | None) -> list[int]:
