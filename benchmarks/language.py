@@ -91,7 +91,7 @@ def _sub_task(fields: dict[str, Any]) -> SubTask:
     )
 
 
-def bank(suites: Sequence[str] | None = None) -> list[MemoryEntry]:
+def known_entries(suites: Sequence[str] | None = None) -> list[MemoryEntry]:
     """A memory of keys alone: one entry for each wording of the tasks of some suites, or of all."""
     return [
         MemoryEntry(RetrievalKey(known.elements, ()), known.instruction, (), 1.0, 1, "instructions")
@@ -180,7 +180,7 @@ def _measure_acting(
     demonstrations in their own words, and the paraphrases of these that are not refused.
     """
     told = [row["instruction"] for row in everyday]
-    shown = [entry.language for entry in bank(SUITES)]
+    shown = [entry.language for entry in known_entries(SUITES)]
     to_find = [(row["paraphrase"], row["of"]) for row in paraphrases if row["of"] in shown]
     asked = [(row[key], row["instruction"]) for row in everyday for key in ("instruction", "reworded")]
     rights = _rights(asked, told, _is_told_as)
@@ -245,7 +245,7 @@ def _is_read(known: Known) -> bool:
 def _measure_split(split: str, folder: Path, failures: dict[str, list[str]]) -> dict[str, Any]:
     paraphrases = [row for row in read_rows(PARAPHRASES, folder) if row["split"] == split]
     strangers = [row for row in read_rows(OUT_OF_DOMAIN, folder) if row["split"] == split]
-    everything, demonstrated = bank(), bank(SUITES)
+    everything, demonstrated = known_entries(), known_entries(SUITES)
     of_demonstrated = {entry.language for entry in demonstrated}
     to_find = [row for row in paraphrases if row["of"] in of_demonstrated]
 

@@ -143,5 +143,5 @@ def _entry(key: Key, poses: Sequence[se3.Array], layout: se3.Array, quality: flo
     phases = tuple(phase for phase, _ in _PHASES)
     places = {target: layout[0], landmark: layout[1]}
     return MemoryEntry(
-        RetrievalKey(key, phases), language, key_poses, quality, 1, f"synthetic/bank#{i}", places
+        RetrievalKey(key, phases), language, key_poses, quality, 1, f"synthetic/memory#{i}", places
     )

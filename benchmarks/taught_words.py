@@ -132,7 +132,7 @@ def acted_entries(
     acted: list[MemoryEntry] = []
     for part in parts:
         rivals = sorted(part, key=lambda one: (not is_meant(one.source), one.semantic))
-        layout = {name: T for one in rivals for name, T in one.entry.layout.items()}
+        layout = {name: T for one in rivals for name, T in one.entry.object_poses.items()}
         best = context.rank(part, layout, T_world_ee)[0].entry
         acted.append(next(one.source for one in part if one.entry is best))
     return tuple(acted)

@@ -47,11 +47,13 @@ def _offset(memory: Memory, name: str, demonstrations: Demonstrations) -> Array:
     """One model's frame as the median over the demonstrations."""
     period, found = memory.objects[name].yaw_period, []
     for entry in memory.entries:
-        if name in entry.layout:
+        if name in entry.object_poses:
             episode = demonstrations.episodes([int(entry.source.rsplit("#", 1)[1])])[0]
             poses = demonstrations.simulator_poses(episode, 0)
             truth = upright(name_simulator_poses(poses, [name], memory.objects)[name])
-            equivalents = [se3.inverse(truth) @ T for T in se3.yaw_equivalents(entry.layout[name], period)]
+            equivalents = [
+                se3.inverse(truth) @ T for T in se3.yaw_equivalents(entry.object_poses[name], period)
+            ]
             found.append(min(equivalents, key=lambda T: abs(float(se3.yaw_of(T)))))
     relative = np.stack(found)
     return se3.from_yaw(np.median(relative[:, :3, 3], axis=0), np.median(se3.yaw_of(relative)))

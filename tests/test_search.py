@@ -8,7 +8,7 @@ from lerobot_openspm.language.names import names_from
 from lerobot_openspm.search import search_memory
 
 BOWL, STOVE = "put the bowl on the plate", "turn on the stove"
-BANK = (
+MEMORY = (
     entry(STOVE, source="stove", quality=1.0),
     entry(BOWL, source="poor", quality=0.2),
     entry(BOWL, source="good", quality=0.8),
@@ -21,7 +21,7 @@ def sources(hits):
 
 
 def test_what_retrieval_considers_is_ordered_by_its_score():
-    found = search_memory("place the bowl onto the plate", BANK)
+    found = search_memory("place the bowl onto the plate", MEMORY)
     assert (found.refusal, found.status, found.seen) == ("", "", {})
     (part,) = found.parts
     assert sources(part) == ["good", "poor"]
@@ -32,12 +32,12 @@ def test_what_retrieval_considers_is_ordered_by_its_score():
 
 
 def test_then_comes_the_best_entry_of_each_other_task_the_nearest_first():
-    found = search_memory(BOWL, BANK)
+    found = search_memory(BOWL, MEMORY)
     assert sources(found.others) == ["rack", "stove"]
 
 
 def test_where_nothing_is_considered_the_reason_and_the_nearest_are_named():
-    found = search_memory("put the mug on the plate", BANK)
+    found = search_memory("put the mug on the plate", MEMORY)
     assert found.parts == ()
     assert "the memory holds no memory for the instruction 'put the mug on the plate'" in found.refusal
     assert sources(found.others) == ["good", "rack", "stove"]
@@ -46,7 +46,7 @@ def test_where_nothing_is_considered_the_reason_and_the_nearest_are_named():
 
 def test_an_instruction_of_which_only_the_parts_are_known_is_found_part_by_part():
     both = drawer_entry(source="both")
-    found = search_memory(f"open the top drawer and {BOWL}", (*BANK, both))
+    found = search_memory(f"open the top drawer and {BOWL}", (*MEMORY, both))
     assert found.refusal == ""
     opened, placed = found.parts
     assert [(hit.entry.language, hit.source is both) for hit in opened] == [
@@ -55,25 +55,25 @@ def test_an_instruction_of_which_only_the_parts_are_known_is_found_part_by_part(
     assert sources(placed) == ["good", "poor"]
     assert all(hit.source is hit.entry for hit in placed)
     assert sorted(sources(found.others)) == ["rack", "stove"]
-    refused = search_memory(f"open the bottom drawer and {BOWL}", BANK)
+    refused = search_memory(f"open the bottom drawer and {BOWL}", MEMORY)
     assert (refused.parts, "is a part of the instruction" in refused.refusal) == ((), True)
 
 
 def test_names_that_embeddings_alone_know_are_found(tmp_path):
     model = make_model(tmp_path, {"tureen": (1.0, 0.1), "bowl": (1.0, 0.0), "plate": (0.0, 1.0)})
     instruction = "put the tureen on the plate"
-    assert search_memory(instruction, BANK).parts == ()
-    found = search_memory(instruction, BANK, names_from(str(model)))
+    assert search_memory(instruction, MEMORY).parts == ()
+    found = search_memory(instruction, MEMORY, names_from(str(model)))
     assert [sources(part) for part in found.parts] == [["good", "poor"]]
 
 
 def test_what_cannot_be_read_is_refused_and_says_why():
-    found = search_memory("sing a song", BANK)
+    found = search_memory("sing a song", MEMORY)
     assert found.parts == ()
     assert "no verb I know in 'sing a song'" in found.refusal
     assert "it knows: " in found.refusal
     with pytest.raises(InstructionError, match="says nothing"):
-        search_memory("...", BANK)
+        search_memory("...", MEMORY)
 
 
 def test_an_empty_memory_knows_nothing():

@@ -14,9 +14,9 @@ from huggingface_hub.errors import HFValidationError
 from lerobot_openspm.configuration_openspm import OpenSPMConfig
 from lerobot_openspm.errors import MemoryFormatError
 from lerobot_openspm.geometry.camera import check_sizes
-from lerobot_openspm.memory.bank import anchored_objects
 from lerobot_openspm.memory.io import MEMORY_JSON, arrays_file, read_memory
 from lerobot_openspm.memory.memory import Memory, check_layouts
+from lerobot_openspm.memory.stored_entries import anchored_objects
 
 
 def checkpoint_folder(name: str | Path, revision: str | None = None, **options: Any) -> Path:

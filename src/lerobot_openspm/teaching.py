@@ -95,7 +95,7 @@ def teach(
     if task is not None:
         read = read_tasks([task], known_names(memory.entries), read_lexicon(config.lexicon))[task]
         raise DatasetError(_nothing_learned(dataset_meta.repo_id, task, tasks, mined, read))
-    named = dict.fromkeys(name for entry in added for name in entry.layout)
+    named = dict.fromkeys(name for entry in added for name in entry.object_poses)
     objects = {name: mined.objects[name] for name in named if name in mined.objects}
     learned = replace(mined, entries=added, objects=objects)
     result = memory.appended(learned)
@@ -107,7 +107,7 @@ def teach(
 
 def _lesson(memory: Memory, learned: Memory, skipped: tuple[int, ...]) -> Lesson:
     """What is new beside a memory."""
-    named = dict.fromkeys(name for entry in learned.entries for name in entry.layout)
+    named = dict.fromkeys(name for entry in learned.entries for name in entry.object_poses)
     before = Counter(entry.language for entry in memory.entries)
     return Lesson(
         learned=learned,
@@ -181,7 +181,7 @@ def _unseen(entry: MemoryEntry) -> list[str]:
         for sub_task in entry.key.sub_tasks
         for name in ((sub_task.target,) if sub_task.words else sub_task.objects)
     )
-    return [name for name in named if name not in entry.layout]
+    return [name for name in named if name not in entry.object_poses]
 
 
 def _nothing_learned(

@@ -99,7 +99,7 @@ class ContactCue:
 
 
 @dataclass(frozen=True)
-class Scene:
+class DemonstrationScene:
     """What learning sees of one demonstration.
 
     Attributes:

@@ -95,12 +95,12 @@ def test_any_wording_is_learned_and_the_entry_that_is_meant_acts(measured: dict[
 
 
 def test_the_measures_can_fail():
-    bank = language.bank()
+    entries = language.known_entries()
     wrong = {"paraphrase": "put the bowl on the stove", "of": "put the bowl on the plate"}
     assert not language.is_parsed(wrong)
-    assert not language.is_first(wrong, bank)
+    assert not language.is_first(wrong, entries)
     assert not language.is_parsed({"paraphrase": "sing", "of": "put the bowl on the plate"})
-    assert not language.is_refused({"instruction": "put the bowl on the plate"}, bank)
+    assert not language.is_refused({"instruction": "put the bowl on the plate"}, entries)
     taught = teach_each(["wipe the table", "put the cup on the tray"], np.random.default_rng(0))
     assert [one.language for one in acted_entries("wipe a table", taught, lambda _: False)] == [
         "wipe the table"

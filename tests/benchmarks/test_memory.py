@@ -67,6 +67,6 @@ def test_made_up_entries_are_like_mined_ones():
     assert len({entry.key.sub_tasks for entry in memory.entries}) == 3
     assert len({entry.source for entry in memory.entries}) == 250
     for entry in memory.entries:
-        assert set(entry.objects) == set(entry.layout)
+        assert set(entry.objects) == set(entry.object_poses)
         assert len(entry.key_poses) == 8
         assert entry.key_poses[0].T_obj_ee[3].tolist() == pytest.approx([0, 0, 0, 1])

@@ -179,8 +179,8 @@ def report(root: Path, *options: str) -> tuple[dict[str, int], int]:
 
 def test_the_report_counts_what_the_pages_quote(checkout: Checkout):
     checkout.commit("scripts/stale_figures.py", (ROOT / "scripts/stale_figures.py").read_text())
-    bank = f"{PACKAGE}/memory/bank.py"
-    checkout.commit(bank, CODE)
+    code = f"{PACKAGE}/memory/stored_entries.py"
+    checkout.commit(code, CODE)
     checkout.commit("benchmarks/memory.py", CODE)
     assert report(checkout.root, "--check") == ({"quoted": 0, "stale": 0, "unreproducible": 0}, 0)
     checkout.commit("README.md", "<!-- figure: memory.n -->")
@@ -189,7 +189,7 @@ def test_the_report_counts_what_the_pages_quote(checkout: Checkout):
     checkout.commit("docs/a.md", "<!-- figure: memory.gone --> <!-- figure: language.n -->")
     assert report(checkout.root, "--check") == ({"quoted": 3, "stale": 0, "unreproducible": 2}, 1)
     checkout.commit("docs/a.md", "")
-    checkout.commit(bank, CODE.replace("return 1", "return 2"))
+    checkout.commit(code, CODE.replace("return 1", "return 2"))
     assert report(checkout.root, "--check") == ({"quoted": 1, "stale": 1, "unreproducible": 0}, 1)
     assert report(checkout.root)[1] == 0
 

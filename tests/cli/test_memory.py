@@ -15,10 +15,10 @@ from tests.perception.builders import model
 from lerobot_openspm.cli.memory import COMMANDS
 from lerobot_openspm.geometry.camera import cameras_to_dict
 from lerobot_openspm.memory import io as module
-from lerobot_openspm.memory.bank import EntryBank
 from lerobot_openspm.memory.entry import Anchor, Outcome
 from lerobot_openspm.memory.io import read_memory, write_memory
 from lerobot_openspm.memory.memory import Memory
+from lerobot_openspm.memory.stored_entries import StoredEntries
 
 BOWL, DRAWER, STOVE = "put the bowl on the plate", "open the top drawer", "put the bowl on the stove"
 OBJECTS = {"bowl": model("bowl", 1), "plate": model("plate", 2), "cabinet": model("cabinet", 3)}
@@ -41,7 +41,7 @@ def memory(request: pytest.FixtureRequest, tmp_path: Path, monkeypatch: pytest.M
 def load(memory: Path) -> Memory:
     """A memory with every entry read."""
     loaded = read_memory(memory)
-    assert isinstance(loaded.entries, EntryBank) == (module.READ_AT_LOAD == 0)
+    assert isinstance(loaded.entries, StoredEntries) == (module.READ_AT_LOAD == 0)
     return replace(loaded, entries=tuple(loaded.entries), superseded=tuple(loaded.superseded))
 
 
@@ -160,7 +160,7 @@ def test_add_refuses_what_is_no_memory(openspm: Openspm, memory: Path, tmp_path:
     assert "pass --other=FOLDER" in refused(openspm, memory, "add")
     assert "nothing at nowhere" in refused(openspm, memory, "add", "--other=nowhere")
     (tmp_path / "some.json").write_text('{"format": "zip"}')
-    assert "expected 'openspm-entries' and 7" in refused(
+    assert "expected 'openspm-entries' and 8" in refused(
         openspm, memory, "add", f"--other={tmp_path / 'some.json'}"
     )
     empty = tmp_path / "empty"
@@ -253,7 +253,7 @@ def test_a_file_can_bring_back_what_an_entry_was(openspm: Openspm, memory: Path,
         (lambda e: e["robot"].pop("open_width"), "field `open_width` - at `$.robot`"),
         (
             lambda e: e.update(version=99),
-            "got format and version ['openspm-entries', 99], expected 'openspm-entries' and 7",
+            "got format and version ['openspm-entries', 99], expected 'openspm-entries' and 8",
         ),
     ],
 )

@@ -53,8 +53,8 @@ def finish_part(one, perception, hand=None):
         before = hand
         hand = Hand(target.T_world_ee, target.key_pose.opening)
         for name in one.scene.tracker.held:
-            perception.layout[name] = (
-                hand.T_world_ee @ se3.inverse(before.T_world_ee) @ perception.layout[name]
+            perception.object_poses[name] = (
+                hand.T_world_ee @ se3.inverse(before.T_world_ee) @ perception.object_poses[name]
             )
         watch(one, perception, hand, 1)
     pytest.fail(f"the part did not end: {one.state.status} at key pose {one.state.index}")
@@ -68,9 +68,9 @@ def test_the_second_part_goes_where_the_first_one_has_put_things():
     hand = finish_part(one, perception, HAND)
     assert one.state.status is Status.RUNNING
     assert one.state.part == 1
-    assert not np.allclose(perception.layout["bowl"], LAYOUT["bowl"])
+    assert not np.allclose(perception.object_poses["bowl"], LAYOUT["bowl"])
     place = next(target for target in one.executor.targets if target.key_pose.phase == "place")
-    assert_allclose(place.T_world_ee, perception.layout["bowl"] @ place.key_pose.T_obj_ee, atol=2e-3)
+    assert_allclose(place.T_world_ee, perception.object_poses["bowl"] @ place.key_pose.T_obj_ee, atol=2e-3)
     assert [used.source for used in one.state.used] == [PLATE.source, BOX.source]
     finish_part(one, perception, hand)
     assert one.state.status is Status.DONE
@@ -84,19 +84,19 @@ def test_what_is_not_recognised_any_more_is_where_the_hand_let_it_go():
         """Recognises nothing where it was not at first."""
 
         def _estimate(self, name):
-            is_there = name in LAYOUT and np.allclose(self.layout[name], LAYOUT[name])
+            is_there = name in LAYOUT and np.allclose(self.object_poses[name], LAYOUT[name])
             return super()._estimate(name if is_there else "nothing")
 
     blind = Blind(LAYOUT)
     hand = finish_part(one, blind, HAND)
     assert one.state.part == 1
-    assert_allclose(one.state.plan.object_poses["bowl"], blind.layout["bowl"], atol=1e-9)
+    assert_allclose(one.state.plan.object_poses["bowl"], blind.object_poses["bowl"], atol=1e-9)
     assert not np.allclose(one.state.plan.object_poses["bowl"], LAYOUT["bowl"])
     index = next(i for i, pose in enumerate(one.executor.targets) if pose.key_pose.anchor.place == "bowl")
     one.executor.begin(one.executor.targets, hand, index)  # the box in the hand, on its way
     watch(one, blind, hand, 100)  # five seconds in which it is in sight and not recognised
     assert one.state.status is not Status.OBJECT_LOST
-    assert_allclose(one.state.plan.object_poses["bowl"], blind.layout["bowl"], atol=1e-9)
+    assert_allclose(one.state.plan.object_poses["bowl"], blind.object_poses["bowl"], atol=1e-9)
 
 
 def test_a_part_ends_as_high_as_the_episode_began_but_the_last_one_does_not():
@@ -117,7 +117,7 @@ def test_another_object_of_the_same_name_is_not_taken_to_be_where_the_first_one_
     asked = "put the left bowl on the plate and put the right bowl on the plate"
     perception, one = Perception(LAYOUT), controller(PLATE, instruction=asked)
     observe(one, HAND, perception)
-    del perception.layout["bowl"]
+    del perception.object_poses["bowl"]
     one.scene.tracker.release(one.scene.tracker.held, HAND.T_world_ee)
     one.executor.begin(one.executor.targets, HAND, len(one.executor.targets) - 1)
     watch(one, perception, Hand(one.executor.targets[-1].T_world_ee, HAND.opening), 12)
@@ -171,7 +171,7 @@ def test_an_opened_drawer_looks_different_and_is_not_looked_for_again():
     hand = finish_part(one, perception, HAND)
     assert one.state.part == 1
     perception.asked.clear()
-    perception.layout["cabinet"] = shifted(cabinet, 0.08)  # what its looks seem to say now
+    perception.object_poses["cabinet"] = shifted(cabinet, 0.08)  # what its looks seem to say now
     finish_part(one, perception, hand)
     assert one.state.status is Status.DONE
     assert not any("cabinet" in names for names in perception.asked)
@@ -183,16 +183,16 @@ def test_what_an_opened_drawer_hides_is_not_lost():
     perception = Perception({**LAYOUT, "cabinet": se3.from_yaw([0.2, 0.2, 0.0], 0.3)})
     one = controller(opening(), PLATE, instruction="open the top drawer and put the bowl on the plate")
     observe(one, HAND, perception)
-    del perception.layout["bowl"]  # it should be in sight, and is not recognised
+    del perception.object_poses["bowl"]  # it should be in sight, and is not recognised
     finish_part(one, perception, HAND)
     assert one.state.part == 1
     away = Hand(hand_pose(-0.4, -0.4, 0.5), HAND.opening)
     watch(one, perception, away, 100)
     assert one.state.status is Status.RUNNING
     assert one.state.status is not Status.PAUSED
-    perception.layout["bowl"] = LAYOUT["bowl"]
+    perception.object_poses["bowl"] = LAYOUT["bowl"]
     watch(one, perception, away, 12)
-    del perception.layout["bowl"]
+    del perception.object_poses["bowl"]
     watch(one, perception, away, 100)
     assert one.state.status is Status.OBJECT_LOST, "it was seen since, so it is gone now"
 
@@ -206,7 +206,7 @@ def test_what_closes_or_turns_hides_nothing(instruction: str, thing: str, phase:
     both = f"{instruction} and put the bowl on the plate"
     one = controller(opening(instruction, thing, phase), PLATE, instruction=both)
     observe(one, HAND, perception)
-    del perception.layout["bowl"]
+    del perception.object_poses["bowl"]
     finish_part(one, perception, HAND)
     watch(one, perception, Hand(hand_pose(-0.4, -0.4, 0.5), HAND.opening), 100)
     assert one.state.status is Status.OBJECT_LOST
@@ -237,7 +237,7 @@ def test_a_part_that_cannot_be_found_is_waited_for():
     assert one.state.status is Status.OBJECT_NOT_FOUND
     assert one.state.used == (PLATE,)
     assert not one.executor.next_action(hand)[:6].any()
-    perception.layout["box"] = LAYOUT["box"]
+    perception.object_poses["box"] = LAYOUT["box"]
     watch(one, perception, hand, LOOK_AGAIN_STEPS)
     assert one.state.status is Status.RUNNING
     assert one.state.used == (PLATE, BOX)

@@ -24,11 +24,11 @@ def drawer(axis=None):
         key_pose("cabinet", hand_pose(0.25, 0.0, 0.2), "open", closed=True, axis=axis),
         key_pose("cabinet", hand_pose(0.25, 0.0, 0.2), "release"),
     ]
-    layout = {"cabinet": se3.from_yaw([0.05, 0.1, 0.0], 0.6)}
-    memory = entry("open the top drawer of the cabinet", key_poses=poses, layout=layout)
+    object_poses = {"cabinet": se3.from_yaw([0.05, 0.1, 0.0], 0.6)}
+    memory = entry("open the top drawer of the cabinet", key_poses=poses, object_poses=object_poses)
     executor = Executor("closed_loop_trc", ROBOT, EpisodeState())
-    executor.begin(transfer(memory, layout, {}, HOME), Hand(HOME, OPEN_WIDTH))
-    return executor, layout["cabinet"]
+    executor.begin(transfer(memory, object_poses, {}, HOME), Hand(HOME, OPEN_WIDTH))
+    return executor, object_poses["cabinet"]
 
 
 def test_a_drawer_is_pulled_along_its_axis_from_where_its_handle_was_taken():

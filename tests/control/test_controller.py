@@ -30,17 +30,23 @@ def planning_context(*entries, limits=None, execution="closed_loop_trc", **optio
 class Perception:
     """Sees the objects where it is told, and remembers what it was asked for."""
 
-    def __init__(self, layout):
-        self.layout, self.asked, self.confidence, self.visible, self.faults = dict(layout), [], 1.0, 1.0, {}
+    def __init__(self, object_poses):
+        self.object_poses, self.asked, self.confidence, self.visible, self.faults = (
+            dict(object_poses),
+            [],
+            1.0,
+            1.0,
+            {},
+        )
 
     def __call__(self, names, expected, time_s):
         self.asked.append(list(names))
         return Detections({name: self._estimate(name) for name in names}, self.faults)
 
     def _estimate(self, name):
-        if name not in self.layout:
+        if name not in self.object_poses:
             return PoseEstimate("not_found", np.eye(4), COVARIANCE, 0.0, self.visible)
-        return PoseEstimate("found", self.layout[name], COVARIANCE, self.confidence, self.visible)
+        return PoseEstimate("found", self.object_poses[name], COVARIANCE, self.confidence, self.visible)
 
 
 def controller(*entries, instruction=INSTRUCTION, seed=0, shown=7, **options):
@@ -64,12 +70,12 @@ def watch(one, perception, hand, steps):
 
 
 def test_the_first_observation_makes_a_plan():
-    perception, one = Perception(entry().layout), controller()
+    perception, one = Perception(entry().object_poses), controller()
     assert one.state.status is Status.WAITING
     observe(one, HAND, perception)
     assert one.state.status is Status.RUNNING
     assert perception.asked == [["bowl", "plate"]]
-    bowl = entry().layout["bowl"]
+    bowl = entry().object_poses["bowl"]
     assert_allclose(one.executor.targets[0].T_world_ee, bowl @ entry().key_poses[0].T_obj_ee)
     observe(one, HAND, perception)
     assert len(perception.asked) == 1
@@ -77,21 +83,21 @@ def test_the_first_observation_makes_a_plan():
 
 
 def test_an_object_that_is_not_found_is_looked_for_again_and_then_found():
-    layout = entry().layout
-    perception, one = Perception({"bowl": layout["bowl"]}), controller()
+    object_poses = entry().object_poses
+    perception, one = Perception({"bowl": object_poses["bowl"]}), controller()
     for _ in range(LOOK_AGAIN_STEPS):
         observe(one, HAND, perception)
         assert one.state.status is Status.OBJECT_NOT_FOUND
         assert one.executor.next_action(HAND).tolist() == [0.0] * 6 + [-1.0]
     assert len(perception.asked) == 1
-    perception.layout = {"plate": layout["plate"]}  # what was seen once is remembered
+    perception.object_poses = {"plate": object_poses["plate"]}  # what was seen once is remembered
     observe(one, HAND, perception)
     assert len(perception.asked) == 2
     assert one.state.status is Status.RUNNING
 
 
 def test_key_poses_out_of_reach_are_infeasible():
-    far = {name: T + np.array([[0, 0, 0, 3.0], *[[0] * 4] * 3]) for name, T in entry().layout.items()}
+    far = {name: T + np.array([[0, 0, 0, 3.0], *[[0] * 4] * 3]) for name, T in entry().object_poses.items()}
     one = controller()
     observe(one, HAND, Perception(far))
     assert one.state.status is Status.INFEASIBLE
@@ -107,18 +113,18 @@ def test_a_feasible_entry_is_preferred_to_a_better_one_that_is_not():
     ]
     bad, good = entry(key_poses=too_low, quality=1.0, source="bad"), entry(quality=0.1, source="good")
     one = controller(bad, good)
-    observe(one, HAND, Perception(entry().layout))
+    observe(one, HAND, Perception(entry().object_poses))
     assert one.state.status is Status.RUNNING
     assert [scored.entry.source for scored in one.state.ranked] == ["good", "bad"]
 
 
 def test_a_missed_grasp_looks_again_and_goes_to_where_the_object_is_now():
-    perception, one = Perception(entry().layout), controller()
+    perception, one = Perception(entry().object_poses), controller()
     observe(one, HAND, perception)
     one.executor.begin(one.executor.targets, HAND, 3)
-    moved = entry().layout["bowl"].copy()
+    moved = entry().object_poses["bowl"].copy()
     moved[0, 3] += 0.05
-    perception.layout["bowl"] = moved
+    perception.object_poses["bowl"] = moved
     observe(one, Hand(HAND.T_world_ee, 0.0), perception)
     assert len(perception.asked) == 2
     assert one.state.index == 0
@@ -153,16 +159,16 @@ def shifted(T, x):
 
 
 def test_at_every_key_pose_what_was_not_touched_is_looked_for_again():
-    perception, one = Perception(entry().layout), controller()
+    perception, one = Perception(entry().object_poses), controller()
     advanced(one, perception, 1)
     assert perception.asked == [["bowl", "plate"]]
-    perception, one = Perception(entry().layout), controller()
+    perception, one = Perception(entry().object_poses), controller()
     advanced(one, perception, 4)  # the bowl is in the hand
     assert perception.asked == [["plate"]]
 
 
 def test_fingers_that_move_are_not_looked_past():
-    perception, one = Perception(entry().layout), controller()
+    perception, one = Perception(entry().object_poses), controller()
     advanced(one, perception, 2)
     assert one.executor.target.key_pose.dwell
     assert perception.asked == []
@@ -170,10 +176,10 @@ def test_fingers_that_move_are_not_looked_past():
 
 @pytest.mark.parametrize(("shift", "follows"), [(0.03, True), (-0.03, True), (0.004, True), (0.0015, False)])
 def test_key_poses_follow_an_object_that_has_moved(shift, follows):
-    perception, one = Perception(entry().layout), controller()
+    perception, one = Perception(entry().object_poses), controller()
     observe(one, HAND, perception)
     before = one.executor.targets
-    perception.layout["plate"] = shifted(entry().layout["plate"], shift)
+    perception.object_poses["plate"] = shifted(entry().object_poses["plate"], shift)
     watch(one, perception, HAND, 20)
     assert one.state.status is Status.RUNNING
     for old, new in zip(before, one.executor.targets, strict=True):
@@ -183,11 +189,11 @@ def test_key_poses_follow_an_object_that_has_moved(shift, follows):
 
 
 def test_what_jumped_is_noticed_within_half_a_second_and_the_queued_chunk_is_dropped():
-    perception, one = Perception(entry().layout), controller()
+    perception, one = Perception(entry().object_poses), controller()
     observe(one, HAND, perception)
     one.executor.push_chunk(np.full((5, 7), 0.5))
     one.executor.next_action(HAND)
-    perception.layout["bowl"] = moved = shifted(entry().layout["bowl"], 0.10)
+    perception.object_poses["bowl"] = moved = shifted(entry().object_poses["bowl"], 0.10)
     for _ in range(10):  # half a second
         one.executor.push_chunk(np.full((5, 7), 0.5))
         observe(one, HAND, perception)
@@ -199,46 +205,46 @@ def test_what_jumped_is_noticed_within_half_a_second_and_the_queued_chunk_is_dro
 
 
 def test_seen_elsewhere_once_is_not_believed_yet():
-    perception, one = Perception(entry().layout), controller()
+    perception, one = Perception(entry().object_poses), controller()
     observe(one, HAND, perception)
     before = [target.T_world_ee for target in one.executor.targets]
-    perception.layout["plate"] = shifted(entry().layout["plate"], 0.10)
+    perception.object_poses["plate"] = shifted(entry().object_poses["plate"], 0.10)
     watch(one, perception, HAND, LOOK_AGAIN_STEPS)
     assert one.scene.tracker.status("plate") is TrackStatus.AMBIGUOUS
-    perception.layout = entry().layout
+    perception.object_poses = entry().object_poses
     watch(one, perception, HAND, 10)
     assert one.scene.tracker.status("plate") is TrackStatus.TRACKED
     assert_allclose([target.T_world_ee for target in one.executor.targets], before, atol=1e-9)
 
 
 def test_an_object_that_jumps_under_the_hand_is_approached_from_above_again():
-    perception, one = Perception(entry().layout), controller()
+    perception, one = Perception(entry().object_poses), controller()
     advanced(one, perception, 1)  # above the bowl, on the way down
-    perception.layout["bowl"] = shifted(entry().layout["bowl"], 0.10)
+    perception.object_poses["bowl"] = shifted(entry().object_poses["bowl"], 0.10)
     watch(one, perception, HAND, 10)
     assert one.state.index == 0
 
 
 def test_the_landmark_that_jumps_does_not_send_a_held_object_back():
-    perception, one = Perception(entry().layout), controller()
+    perception, one = Perception(entry().object_poses), controller()
     hand = grasping(one, perception)
     one.executor.begin(one.executor.targets, hand, 5)  # over the plate, on the way down
-    perception.layout["plate"] = shifted(entry().layout["plate"], 0.10)
+    perception.object_poses["plate"] = shifted(entry().object_poses["plate"], 0.10)
     watch(one, perception, hand, 10)
     assert one.state.index == 4
     assert one.executor.targets[4].key_pose.phase == "pre-place"
     assert one.scene.tracker.held == {"bowl"}, "it is still in the hand, and would be missed"
-    perception.layout["bowl"] = shifted(entry().layout["bowl"], -0.12)
+    perception.object_poses["bowl"] = shifted(entry().object_poses["bowl"], -0.12)
     watch(one, perception, hand, 10)
     assert one.scene.tracker.held == frozenset()
     assert one.state.index == 0
 
 
 def test_a_dropped_object_is_fetched_from_where_it_fell():
-    perception, one = Perception(entry().layout), controller()
+    perception, one = Perception(entry().object_poses), controller()
     hand = grasping(one, perception)
     assert one.scene.tracker.held == {"bowl"}
-    perception.layout["bowl"] = fallen = shifted(entry().layout["bowl"], -0.12)
+    perception.object_poses["bowl"] = fallen = shifted(entry().object_poses["bowl"], -0.12)
     watch(one, perception, hand, 10)
     assert one.scene.tracker.held == frozenset()
     assert one.state.index == 0
@@ -248,10 +254,10 @@ def test_a_dropped_object_is_fetched_from_where_it_fell():
 
 @pytest.mark.parametrize("glimpse", [{"confidence": 0.85}, {"visible": 0.3}])
 def test_a_glimpse_past_the_hand_is_not_believed(glimpse):
-    perception, one = Perception(entry().layout), controller()
+    perception, one = Perception(entry().object_poses), controller()
     observe(one, HAND, perception)
     before = [target.T_world_ee for target in one.executor.targets]
-    perception.layout["plate"] = shifted(entry().layout["plate"], 0.03)
+    perception.object_poses["plate"] = shifted(entry().object_poses["plate"], 0.03)
     vars(perception).update(glimpse)
     watch(one, perception, HAND, 40)
     assert len(perception.asked) > 5
@@ -260,19 +266,19 @@ def test_a_glimpse_past_the_hand_is_not_believed(glimpse):
 
 
 def test_a_place_out_of_reach_is_not_believed():
-    perception, one = Perception(entry().layout), controller()
+    perception, one = Perception(entry().object_poses), controller()
     observe(one, HAND, perception)
     before = [target.T_world_ee for target in one.executor.targets]
-    perception.layout["plate"] = shifted(entry().layout["plate"], 3.0)
+    perception.object_poses["plate"] = shifted(entry().object_poses["plate"], 3.0)
     watch(one, perception, HAND, 20)
     assert one.state.status is Status.RUNNING
     assert_allclose([target.T_world_ee for target in one.executor.targets], before, atol=1e-9)
 
 
 def test_what_is_gone_is_waited_for_then_lost_and_taken_up_again_when_it_is_back():
-    perception, one = Perception(entry().layout), controller()
+    perception, one = Perception(entry().object_poses), controller()
     observe(one, HAND, perception)
-    bowl = perception.layout.pop("bowl")
+    bowl = perception.object_poses.pop("bowl")
     watch(one, perception, HAND, 18)  # nine tenths of a second
     assert one.scene.tracker.status("bowl") is TrackStatus.STALE
     assert one.state.status is Status.PAUSED
@@ -281,7 +287,7 @@ def test_what_is_gone_is_waited_for_then_lost_and_taken_up_again_when_it_is_back
     assert one.scene.tracker.status("bowl") is TrackStatus.LOST
     assert one.state.status is Status.OBJECT_LOST
     assert one.executor.next_action(HAND).tolist() == [0.0] * 6 + [-1.0]
-    perception.layout["bowl"] = bowl
+    perception.object_poses["bowl"] = bowl
     watch(one, perception, HAND, 10)
     assert one.state.status is Status.RUNNING
     assert one.state.status is not Status.PAUSED
@@ -289,9 +295,9 @@ def test_what_is_gone_is_waited_for_then_lost_and_taken_up_again_when_it_is_back
 
 
 def test_what_hides_behind_the_hand_is_not_lost():
-    perception, one = Perception(entry().layout), controller()
+    perception, one = Perception(entry().object_poses), controller()
     observe(one, HAND, perception)
-    perception.layout, perception.visible = {}, 0.2
+    perception.object_poses, perception.visible = {}, 0.2
     watch(one, perception, HAND, 100)
     assert one.state.status is Status.RUNNING
     assert one.scene.tracker.status("bowl") is TrackStatus.HIDDEN
@@ -299,21 +305,21 @@ def test_what_hides_behind_the_hand_is_not_lost():
 
 @pytest.mark.parametrize("step_s", [0.01, 0.05, 0.1, 0.3])
 def test_how_soon_a_jump_is_noticed_does_not_hang_on_the_robots_rate(step_s):
-    perception, one = Perception(entry().layout), controller(step_s=step_s)
+    perception, one = Perception(entry().object_poses), controller(step_s=step_s)
     observe(one, HAND, perception)
-    perception.layout["bowl"] = moved = shifted(entry().layout["bowl"], 0.10)
+    perception.object_poses["bowl"] = moved = shifted(entry().object_poses["bowl"], 0.10)
     watch(one, perception, HAND, max(2, int(0.5 / step_s + 1e-9)))
     assert_allclose(one.executor.targets[0].T_world_ee, moved @ entry().key_poses[0].T_obj_ee)
 
 
 @pytest.mark.parametrize("off", [{"tracking": False}, {"execution": "open_loop"}])
 def test_a_camera_fault_at_the_start_does_not_hold_up_what_never_looks_again(off):
-    perception, one = Perception(entry().layout), controller(**off)
+    perception, one = Perception(entry().object_poses), controller(**off)
     perception.faults = {"observation.images.front": Fault("is black or blank", 1.0)}
     observe(one, HAND, perception)
     assert one.state.status is Status.RUNNING
     assert one.state.status is not Status.PAUSED
-    perception, one = Perception(entry().layout), controller()
+    perception, one = Perception(entry().object_poses), controller()
     perception.faults = {"observation.images.front": Fault("is black or blank", 1.0)}
     observe(one, HAND, perception)
     assert one.state.status is Status.PAUSED
@@ -323,26 +329,26 @@ def test_a_camera_fault_at_the_start_does_not_hold_up_what_never_looks_again(off
 
 
 def test_what_is_seen_here_and_there_is_waited_for():
-    perception, one = Perception(entry().layout), controller()
+    perception, one = Perception(entry().object_poses), controller()
     observe(one, HAND, perception)
     for i in range(20):
-        perception.layout["bowl"] = shifted(entry().layout["bowl"], 0.1 * (-1) ** i)
+        perception.object_poses["bowl"] = shifted(entry().object_poses["bowl"], 0.1 * (-1) ** i)
         watch(one, perception, HAND, 3)
     assert (one.state.status is Status.PAUSED) or one.state.status is Status.OBJECT_LOST
     assert not one.executor.next_action(HAND)[:6].any()
 
 
 def test_without_tracking_nothing_is_looked_for_again():
-    perception, one = Perception(entry().layout), controller(tracking=False)
+    perception, one = Perception(entry().object_poses), controller(tracking=False)
     observe(one, HAND, perception)
     perception.asked.clear()
-    perception.layout["bowl"] = shifted(entry().layout["bowl"], 0.10)
+    perception.object_poses["bowl"] = shifted(entry().object_poses["bowl"], 0.10)
     watch(one, perception, HAND, 100)
     assert perception.asked == []
 
 
 def test_a_broken_camera_is_gone_without_for_half_a_second_then_held_still_for_then_given_up(caplog):
-    perception, one = Perception(entry().layout), controller()
+    perception, one = Perception(entry().object_poses), controller()
     observe(one, HAND, perception)
     seconds = 0.0
     while one.state.status in (Status.RUNNING, Status.PAUSED) and seconds < 5:
@@ -362,7 +368,7 @@ def test_a_broken_camera_is_gone_without_for_half_a_second_then_held_still_for_t
 
 
 def test_a_camera_that_recovers_in_time_is_forgiven():
-    perception, one = Perception(entry().layout), controller()
+    perception, one = Perception(entry().object_poses), controller()
     observe(one, HAND, perception)
     perception.faults = {"observation.images.front": Fault("is frozen", 1.0)}
     watch(one, perception, HAND, 6)
@@ -373,7 +379,7 @@ def test_a_camera_that_recovers_in_time_is_forgiven():
 
 
 def test_the_open_loop_does_not_look_again():
-    perception, one = Perception(entry().layout), controller(execution="open_loop")
+    perception, one = Perception(entry().object_poses), controller(execution="open_loop")
     observe(one, HAND, perception)
     perception.asked.clear()
     for _ in range(100):
@@ -405,7 +411,7 @@ def test_what_is_not_understood_holds_still_and_says_why_once(instruction, why, 
 
 
 def test_noise_is_a_function_of_seed_episode_and_chunk_alone():
-    shape, perception = (5, 7), Perception(entry().layout)
+    shape, perception = (5, 7), Perception(entry().object_poses)
     others = [controller(shown=8 + i) for i in range(1, 4)]  # made before: no shared generator moves on
     first, again = controller(), controller()
     noise = first.noise(shape)

@@ -55,7 +55,7 @@ class World:
 def make(execution="closed_loop_trc", key_poses=None, hand=HOME):
     memory = entry(key_poses=key_poses)
     executor = Executor(execution, ROBOT, EpisodeState())
-    executor.begin(transfer(memory, memory.layout, {}, hand), Hand(hand, OPEN_WIDTH))
+    executor.begin(transfer(memory, memory.object_poses, {}, hand), Hand(hand, OPEN_WIDTH))
     return executor
 
 

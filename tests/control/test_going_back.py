@@ -134,7 +134,7 @@ def stuck(one, perception, hand, index):
 
 def carrying(opening):
     """The bowl is in the hand, and its place is not reached."""
-    perception, one = Perception(entry().layout), controller()
+    perception, one = Perception(entry().object_poses), controller()
     observe(one, HAND, perception)
     one.executor.begin(one.executor.targets, HAND, 2)
     grasp = one.executor.targets[2]
@@ -161,7 +161,7 @@ def test_what_is_no_more_in_the_hand_is_fetched():
 
 
 def test_what_slipped_out_while_it_was_lifted_stands_where_it_stood_and_does_not_hang_in_the_air():
-    perception, one = Perception(entry().layout), controller()
+    perception, one = Perception(entry().object_poses), controller()
     observe(one, HAND, perception)
     first = one.executor.targets[0].T_world_ee
     one.executor.begin(one.executor.targets, HAND, 2)
@@ -177,17 +177,17 @@ def test_what_slipped_out_while_it_was_lifted_stands_where_it_stood_and_does_not
 def test_what_a_later_sub_task_grasps_again_stays_in_the_hand():
     both = "put the bowl on the plate and put the bowl on the stove"
     again = [replace(pose, sub_task=1) for pose in pick_and_place("bowl", "stove")]
-    layout = {**entry().layout, "stove": se3.from_yaw([-0.2, -0.1, 0.0], 0.0)}
-    perception = Perception(layout)
-    one = controller(entry(both, (*pick_and_place(), *again), layout), instruction=both)
+    object_poses = {**entry().object_poses, "stove": se3.from_yaw([-0.2, -0.1, 0.0], 0.0)}
+    perception = Perception(object_poses)
+    one = controller(entry(both, (*pick_and_place(), *again), object_poses), instruction=both)
     observe(one, HAND, perception)
     one.executor.begin(one.executor.targets, HAND, 2)
     grasp, lift = one.executor.targets[2], one.executor.targets[3]
     watch(one, perception, Hand(grasp.T_world_ee, 0.03), grasp.key_pose.n_steps + 1)
-    perception.layout["bowl"] = lift.T_world_ee @ se3.inverse(grasp.T_world_ee) @ layout["bowl"]
+    perception.object_poses["bowl"] = lift.T_world_ee @ se3.inverse(grasp.T_world_ee) @ object_poses["bowl"]
     watch(one, perception, Hand(lift.T_world_ee, 0.03), 1)
     assert one.executor.targets[one.state.index].key_pose.phase == "pre-place"
-    perception.layout["plate"] = layout["plate"] @ se3.from_yaw([0.05, 0.05, 0.0], 0.0)
+    perception.object_poses["plate"] = object_poses["plate"] @ se3.from_yaw([0.05, 0.05, 0.0], 0.0)
     watch(one, perception, Hand(lift.T_world_ee, 0.03), 15)
     assert one.state.attempts == 0
     assert one.scene.tracker.held == {"bowl"}
@@ -198,11 +198,11 @@ ON_PLATE = Outcome(0, "bowl", Anchor("plate", "plate"), np.zeros(3), np.zeros(3)
 
 def ended(at, look=None):
     """A bowl that was let go at a place relative to the plate, the hand gone, and looks from then on."""
-    place = entry().layout["plate"] @ se3.from_yaw([*at], 0.0)
-    perception, one = Perception(entry().layout), controller(entry(outcomes=(ON_PLATE,)))
+    place = entry().object_poses["plate"] @ se3.from_yaw([*at], 0.0)
+    perception, one = Perception(entry().object_poses), controller(entry(outcomes=(ON_PLATE,)))
     observe(one, HAND, perception)
     one.executor.begin(one.executor.targets, HAND, 7)
-    perception.layout["bowl"] = place
+    perception.object_poses["bowl"] = place
     watch(one, look or perception, Hand(one.executor.targets[7].T_world_ee, 0.08), 12)
     return one, place
 
@@ -234,14 +234,14 @@ def test_without_a_picture_what_was_done_is_neither_seen_nor_tried_again(off_m, 
 def drawer_opened_but_bowl_missed(putting):
     """The bowl beside its plate and the drawer open, at the end of an entry that does both."""
     pull = [replace(pose, sub_task=1) for pose in handle(KINDS["slide"]).key_poses]
-    layout = {**entry().layout, **CABINET}
+    object_poses = {**entry().object_poses, **CABINET}
     both = "put the bowl on the plate and open the top drawer"
-    whole = entry(both, (*putting, *pull), layout, outcomes=(ON_PLATE,))
-    perception, one = Perception(layout), controller(whole, instruction=both)
+    whole = entry(both, (*putting, *pull), object_poses, outcomes=(ON_PLATE,))
+    perception, one = Perception(object_poses), controller(whole, instruction=both)
     observe(one, HAND, perception)
     last = len(one.executor.targets) - 1
     one.executor.begin(one.executor.targets, HAND, last)
-    perception.layout["bowl"] = layout["plate"] @ se3.from_yaw([0.06, 0.0, 0.0], 0.0)
+    perception.object_poses["bowl"] = object_poses["plate"] @ se3.from_yaw([0.06, 0.0, 0.0], 0.0)
     watch(one, perception, Hand(one.executor.targets[last].T_world_ee, 0.08), 12)
     return perception, one
 
@@ -251,7 +251,7 @@ def test_of_several_things_to_do_only_the_one_that_is_missed_is_done_again():
     assert one.state.index == 0
     assert {target.key_pose.sub_task for target in one.executor.targets} == {0}
     one.executor.begin(one.executor.targets, HAND, 7)
-    perception.layout["bowl"] = entry().layout["plate"]
+    perception.object_poses["bowl"] = entry().object_poses["plate"]
     watch(one, perception, Hand(one.executor.targets[7].T_world_ee, 0.08), 12)
     assert one.state.status is Status.DONE
     assert one.state.attempts == 1
@@ -264,14 +264,14 @@ def test_what_is_done_again_ends_with_the_hand_backed_off():
 
 
 def test_an_outcome_that_no_key_pose_leads_to_is_not_tried_again():
-    layout = entry().layout
-    memory = entry("put both bowls on the plate", pick_and_place(), layout,
+    object_poses = entry().object_poses
+    memory = entry("put both bowls on the plate", pick_and_place(), object_poses,
                    outcomes=(replace(ON_PLATE, sub_task=1),))  # fmt: skip
     assert len(memory.key.sub_tasks) == 2
-    perception, one = Perception(layout), controller(memory, instruction="put both bowls on the plate")
+    perception, one = Perception(object_poses), controller(memory, instruction="put both bowls on the plate")
     observe(one, HAND, perception)
     one.executor.begin(one.executor.targets, HAND, 7)
-    perception.layout["bowl"] = layout["plate"] @ se3.from_yaw([0.06, 0.0, 0.0], 0.0)
+    perception.object_poses["bowl"] = object_poses["plate"] @ se3.from_yaw([0.06, 0.0, 0.0], 0.0)
     watch(one, perception, Hand(one.executor.targets[7].T_world_ee, 0.08), 12)
     assert one.state.status is Status.DONE
     assert one.state.attempts == 0

@@ -27,8 +27,8 @@ def seen(T, *others, status=None):
     return PoseEstimate(status, T, 1e-6 * np.eye(4), 1.0, others=tuple(others))
 
 
-def look(grounding, bowl, layout=None):
-    return grounding.sort_out({"bowl": bowl, "rack": seen(RACK)}, layout or {})["bowl"]
+def look(grounding, bowl, object_poses=None):
+    return grounding.sort_out({"bowl": bowl, "rack": seen(RACK)}, object_poses or {})["bowl"]
 
 
 @pytest.mark.parametrize("bowl", [seen(NEAR, FAR), seen(FAR, NEAR), seen(FAR, NEAR, status="found")])

@@ -45,9 +45,9 @@ def push(goal=GOAL, shown=GOAL):
     return entry(INSTRUCTION, poses, LAYOUT, outcomes=(outcome,))
 
 
-def ends(memory, layout):
+def ends(memory, object_poses):
     """Where the hand enters the plate and where it stops pushing, (3,) each."""
-    targets = transfer(memory, layout, {}, HAND.T_world_ee)
+    targets = transfer(memory, object_poses, {}, HAND.T_world_ee)
     return targets[1].T_world_ee[:3, 3], targets[2].T_world_ee[:3, 3]
 
 
@@ -59,23 +59,23 @@ def test_in_the_demonstrated_scene_the_hand_does_what_was_demonstrated():
 
 @given(st.floats(-0.3, 0.3), st.floats(-0.3, 0.3), st.floats(-0.3, 0.3))
 def test_from_wherever_the_plate_stands_the_hand_leads_it_to_its_place(x, y, yaw):
-    layout = {
+    object_poses = {
         "plate": se3.from_yaw([0.4 + x, y, 0.0], 2.0),
         "stove": LAYOUT["stove"] @ se3.from_yaw([0.0, 0.0, 0.0], yaw),
     }
-    goal = se3.apply(layout["stove"], GOAL[None])[0]
-    way = (goal - layout["plate"][:3, 3])[:2]
+    goal = se3.apply(object_poses["stove"], GOAL[None])[0]
+    way = (goal - object_poses["plate"][:3, 3])[:2]
     if np.linalg.norm(way) < 0.01:
         return
-    inside, done = ends(push(), layout)
+    inside, done = ends(push(), object_poses)
     lead = way / np.linalg.norm(way)
-    assert_allclose(inside[:2], layout["plate"][:2, 3] + 0.03 * lead, atol=1e-9)
+    assert_allclose(inside[:2], object_poses["plate"][:2, 3] + 0.03 * lead, atol=1e-9)
     assert_allclose(done[:2], goal[:2] + LEAD_M * lead, atol=1e-9)
 
 
 def test_the_height_of_a_push_is_that_of_what_stands_still():
-    layout = {**LAYOUT, "plate": se3.from_yaw([0.3, 0.1, 0.006], 0.0)}
-    inside, done = ends(push(), layout)
+    object_poses = {**LAYOUT, "plate": se3.from_yaw([0.3, 0.1, 0.006], 0.0)}
+    inside, done = ends(push(), object_poses)
     assert_allclose([inside[2], done[2]], 0.02, atol=1e-12)
 
 
@@ -88,17 +88,17 @@ def test_a_demonstration_that_stopped_short_is_pushed_to_where_the_others_end():
 
 def test_a_plate_that_is_almost_there_is_not_turned_about():
     memory, goal = push(), se3.apply(LAYOUT["stove"], GOAL[None])[0]
-    layout = {**LAYOUT, "plate": se3.from_yaw(goal + np.array([0.001, -0.001, 0.0]), 0.0)}
-    inside, _ = ends(memory, layout)
+    object_poses = {**LAYOUT, "plate": se3.from_yaw(goal + np.array([0.001, -0.001, 0.0]), 0.0)}
+    inside, _ = ends(memory, object_poses)
     shown, _ = ends(memory, LAYOUT)
-    assert_allclose(inside - layout["plate"][:3, 3], shown - LAYOUT["plate"][:3, 3], atol=1e-9)
+    assert_allclose(inside - object_poses["plate"][:3, 3], shown - LAYOUT["plate"][:3, 3], atol=1e-9)
 
 
 def test_a_push_without_a_known_outcome_ends_where_the_demonstration_did():
     memory = push()
     unknown = entry(INSTRUCTION, memory.key_poses, LAYOUT)
-    layout = {**LAYOUT, "plate": se3.from_yaw([0.3, -0.2, 0.0], 0.0)}
-    _, done = ends(unknown, layout)
+    object_poses = {**LAYOUT, "plate": se3.from_yaw([0.3, -0.2, 0.0], 0.0)}
+    _, done = ends(unknown, object_poses)
     assert_allclose(done, ends(memory, LAYOUT)[1], atol=1e-12)
 
 
@@ -215,8 +215,8 @@ def test_what_a_push_leads_to_is_watched_beyond_a_turn():
     shown = one.executor.targets[3].T_world_ee
     one.executor.begin(one.executor.targets, here, 3)
     one.scene.tracker.hold("plate", here.T_world_ee)
-    perception.layout["stove"] = shifted(LAYOUT["stove"], 0.04)
-    del perception.layout["plate"]
+    perception.object_poses["stove"] = shifted(LAYOUT["stove"], 0.04)
+    del perception.object_poses["plate"]
     watch(one, perception, here, 10)
     assert_allclose(one.executor.targets[3].T_world_ee, shifted(shown, 0.04), atol=2e-3)
 
@@ -252,7 +252,7 @@ def test_a_plate_that_slides_under_the_hand_is_pushed_on_and_one_left_behind_is_
         met = hand.T_world_ee[:3, 3].copy()
         way = se3.apply(LAYOUT["stove"], GOAL[None])[0] - LAYOUT["plate"][:3, 3]
         way /= np.linalg.norm(way)
-        perception.layout["plate"] = se3.from_yaw([*(met - (LEAD_M + behind) * way)[:2], 0.0], 0.0)
+        perception.object_poses["plate"] = se3.from_yaw([*(met - (LEAD_M + behind) * way)[:2], 0.0], 0.0)
         watch(one, perception, hand, 20)
         assert one.state.status is Status.RUNNING
         assert (one.state.index < 2) is is_fetched, behind
@@ -262,7 +262,7 @@ def done(one, perception, end):
     """The push, finished, with the plate where it is told, looked at once."""
     observe(one, HAND, perception)
     last = one.executor.targets[-1]
-    perception.layout["plate"] = end
+    perception.object_poses["plate"] = end
     one.scene.tracker.forget(["plate"])
     one.executor.begin(one.executor.targets, HAND, len(one.executor.targets) - 1)
     hand = Hand(last.T_world_ee, 0.0)
@@ -325,7 +325,7 @@ def test_what_is_pushed_is_looked_for_although_no_key_pose_belongs_to_it():
     perception, one = Perception(LAYOUT), controller(landmark_push(), instruction=INSTRUCTION)
     observe(one, HAND, perception)
     assert set(perception.asked[0]) == {"plate", "stove"}
-    perception.layout["plate"] = moved = shifted(LAYOUT["plate"], 0.05)
+    perception.object_poses["plate"] = moved = shifted(LAYOUT["plate"], 0.05)
     watch(one, perception, HAND, 12)
     assert_allclose(one.state.plan.object_poses["plate"], moved, atol=2e-3)
     phases = [pose.phase for pose in landmark_push().key_poses]
@@ -335,8 +335,8 @@ def test_what_is_pushed_is_looked_for_although_no_key_pose_belongs_to_it():
 
 
 def test_a_push_by_its_landmark_alone_begins_beside_the_plate_wherever_it_stands():
-    layout = {**LAYOUT, "plate": se3.from_yaw([0.25, -0.15, 0.0], 0.0)}
-    for scene in (LAYOUT, layout):
+    object_poses = {**LAYOUT, "plate": se3.from_yaw([0.25, -0.15, 0.0], 0.0)}
+    for scene in (LAYOUT, object_poses):
         found, expected = (ends(memory, scene) for memory in (landmark_push(), push()))
         assert_allclose(found, expected, atol=1e-9)
 
@@ -346,6 +346,6 @@ def test_a_plate_that_no_key_pose_belongs_to_and_that_is_not_found_does_not_hold
     one = controller(landmark_push(), instruction=INSTRUCTION)
     observe(one, HAND, perception)
     assert one.state.status is Status.RUNNING
-    perception.layout["plate"] = LAYOUT["plate"]
+    perception.object_poses["plate"] = LAYOUT["plate"]
     watch(one, perception, HAND, 6)
     assert "plate" in one.state.plan.object_poses, "it is taken up when it is seen"

@@ -45,8 +45,8 @@ def test_transfer_is_batched():
 def test_moving_all_objects_moves_all_targets_alike(x, y, yaw):
     G = se3.from_yaw([x, y, 0.0], yaw)
     memory = entry()
-    before = transfer(memory, memory.layout, {}, HOME)
-    after = transfer(memory, {name: G @ T for name, T in memory.layout.items()}, {}, HOME)
+    before = transfer(memory, memory.object_poses, {}, HOME)
+    after = transfer(memory, {name: G @ T for name, T in memory.object_poses.items()}, {}, HOME)
     assert len(after) == len(memory.key_poses)
     for old, new in zip(before, after, strict=True):
         assert_allclose(new.T_world_ee, G @ old.T_world_ee, atol=1e-9)
@@ -54,8 +54,8 @@ def test_moving_all_objects_moves_all_targets_alike(x, y, yaw):
 
 def test_moving_one_object_moves_its_own_targets_alone():
     memory, G = entry(), se3.from_yaw([0.1, -0.2, 0.0], 0.7)
-    layout = memory.layout | {"plate": G @ memory.layout["plate"]}
-    before, after = transfer(memory, memory.layout, {}, HOME), transfer(memory, layout, {}, HOME)
+    object_poses = memory.object_poses | {"plate": G @ memory.object_poses["plate"]}
+    before, after = transfer(memory, memory.object_poses, {}, HOME), transfer(memory, object_poses, {}, HOME)
     for old, new in zip(before, after, strict=True):
         moved = G if new.key_pose.anchor.place == "plate" else np.eye(4)
         assert_allclose(new.T_world_ee, moved @ old.T_world_ee, atol=1e-9)
@@ -63,15 +63,18 @@ def test_moving_one_object_moves_its_own_targets_alone():
 
 def test_an_anchor_with_the_worlds_axes_follows_the_place_and_not_the_turn():
     pose = key_pose("rack", hand_pose(0.1, 0.0, 0.2), "place", axes=WORLD)
-    layout = {"rack": se3.from_yaw([0.3, 0.4, 0.0], 1.2)}
-    target = transfer(entry(key_poses=[pose], layout=layout), layout, {}, HOME)[0]
+    object_poses = {"rack": se3.from_yaw([0.3, 0.4, 0.0], 1.2)}
+    target = transfer(entry(key_poses=[pose], object_poses=object_poses), object_poses, {}, HOME)[0]
     assert_allclose(target.T_world_ee, hand_pose(0.4, 0.4, 0.2), atol=1e-12)
 
 
 def test_an_anchor_with_anothers_axes_follows_the_place_of_one_and_the_turn_of_the_other():
     pose = key_pose("plate", hand_pose(0.1, 0.0, 0.2), "place", axes="bowl")
-    layout = {"plate": se3.from_yaw([0.3, 0.4, 0.0], 1.2), "bowl": se3.from_yaw([9.0, 9.0, 0.0], np.pi / 2)}
-    target = transfer(entry(key_poses=[pose], layout=layout), layout, {}, HOME)[0]
+    object_poses = {
+        "plate": se3.from_yaw([0.3, 0.4, 0.0], 1.2),
+        "bowl": se3.from_yaw([9.0, 9.0, 0.0], np.pi / 2),
+    }
+    target = transfer(entry(key_poses=[pose], object_poses=object_poses), object_poses, {}, HOME)[0]
     assert_allclose(target.T_world_ee, hand_pose(0.3, 0.5, 0.2, np.pi / 2), atol=1e-12)
 
 
@@ -80,26 +83,26 @@ def test_an_anchor_with_anothers_axes_follows_the_place_of_one_and_the_turn_of_t
 )
 def test_a_symmetric_object_is_met_from_the_side_that_turns_the_hand_least(hand_yaw, turned):
     pose = key_pose("box", hand_pose(0.05, 0.0, 0.1), "grasp", closed=True)
-    layout = {"box": se3.from_yaw([0.2, 0.1, 0.0], 0.2)}
-    memory = entry(key_poses=[pose], layout=layout)
-    (target,) = transfer(memory, layout, {"box": np.pi}, hand_pose(0, 0, 0.3, hand_yaw))
+    object_poses = {"box": se3.from_yaw([0.2, 0.1, 0.0], 0.2)}
+    memory = entry(key_poses=[pose], object_poses=object_poses)
+    (target,) = transfer(memory, object_poses, {"box": np.pi}, hand_pose(0, 0, 0.3, hand_yaw))
     expected = se3.from_yaw([0.2, 0.1, 0.0], turned) @ pose.T_obj_ee
     assert_allclose(target.T_world_ee, expected, atol=1e-9)
-    (fixed,) = transfer(memory, layout, {"box": 2 * np.pi}, hand_pose(0, 0, 0.3, hand_yaw))
-    assert_allclose(fixed.T_world_ee, layout["box"] @ pose.T_obj_ee, atol=1e-12)
+    (fixed,) = transfer(memory, object_poses, {"box": 2 * np.pi}, hand_pose(0, 0, 0.3, hand_yaw))
+    assert_allclose(fixed.T_world_ee, object_poses["box"] @ pose.T_obj_ee, atol=1e-12)
 
 
 def test_one_choice_of_side_holds_for_all_key_poses_of_an_object():
     memory = entry()
-    targets = transfer(memory, memory.layout, {"bowl": np.pi}, hand_pose(0, 0, 0.3, np.pi + 0.3))
+    targets = transfer(memory, memory.object_poses, {"bowl": np.pi}, hand_pose(0, 0, 0.3, np.pi + 0.3))
     at_bowl = [t for t in targets if t.key_pose.anchor.place == "bowl"]
-    turned = memory.layout["bowl"] @ se3.from_yaw(np.zeros(3), np.pi)
+    turned = memory.object_poses["bowl"] @ se3.from_yaw(np.zeros(3), np.pi)
     for target in at_bowl:
         assert_allclose(target.T_world_ee, turned @ target.key_pose.T_obj_ee, atol=1e-9)
 
 
 def test_contacts_and_the_arrivals_before_them_are_precise():
-    targets = transfer(entry(), entry().layout, {}, HOME)
+    targets = transfer(entry(), entry().object_poses, {}, HOME)
     assert [(t.key_pose.phase, t.precise) for t in targets] == [
         ("approach", False), ("approach", True), ("grasp", True), ("lift", False), ("pre-place", False),
         ("place", True), ("release", True), ("retreat", False),
@@ -107,9 +110,9 @@ def test_contacts_and_the_arrivals_before_them_are_precise():
 
 
 def problems(*poses, hand=HOME):
-    layout = {"bowl": np.eye(4)}
+    object_poses = {"bowl": np.eye(4)}
     key_poses = [key_pose("bowl", T, phase) for phase, T in poses]
-    targets = transfer(entry(key_poses=key_poses, layout=layout), layout, {}, hand)
+    targets = transfer(entry(key_poses=key_poses, object_poses=object_poses), object_poses, {}, hand)
     return check_transfer(targets, hand, robot(), TransferLimits())
 
 
@@ -150,8 +153,8 @@ def test_every_problem_is_listed():
 
 def test_a_scene_like_the_demonstrations_or_moved_as_a_whole_has_no_shape_deviation():
     memory, G = entry(), se3.from_yaw([0.1, 0.2, 0.0], 1.0)
-    for layout in (memory.layout, {name: G @ T for name, T in memory.layout.items()}):
-        assert shape_deviation(memory, transfer(memory, layout, {}, HOME)) == pytest.approx(0, abs=1e-6)
+    for object_poses in (memory.object_poses, {name: G @ T for name, T in memory.object_poses.items()}):
+        assert shape_deviation(memory, transfer(memory, object_poses, {}, HOME)) == pytest.approx(0, abs=1e-6)
 
 
 def test_another_way_through_free_space_counts_less_than_another_way_in_contact():
@@ -160,9 +163,9 @@ def test_another_way_through_free_space_counts_less_than_another_way_in_contact(
             key_pose("bowl", hand_pose(0, 0, 0.1), "approach"),
             key_pose("plate", hand_pose(0, 0, 0.1), phase),
         ]
-        layout = {"bowl": np.eye(4), "plate": se3.from_yaw([0.2, 0, 0], 0.0)}
-        memory = entry(key_poses=poses, layout=layout)
-        longer = layout | {"plate": se3.from_yaw([0.3, 0, 0], 0.0)}
+        object_poses = {"bowl": np.eye(4), "plate": se3.from_yaw([0.2, 0, 0], 0.0)}
+        memory = entry(key_poses=poses, object_poses=object_poses)
+        longer = object_poses | {"plate": se3.from_yaw([0.3, 0, 0], 0.0)}
         return shape_deviation(memory, transfer(memory, longer, {}, HOME))
 
     assert deviation("push") == pytest.approx(0.1)
@@ -172,19 +175,19 @@ def test_another_way_through_free_space_counts_less_than_another_way_in_contact(
 def test_a_cut_demonstration_ends_with_a_retreat_against_its_arrival():
     whole = entry()
     cut = entry(key_poses=whole.key_poses[:-1])
-    targets = transfer(cut, cut.layout, {}, HOME)
+    targets = transfer(cut, cut.object_poses, {}, HOME)
     assert [target.key_pose.phase for target in targets[-2:]] == ["release", "retreat"]
     released, left = targets[-2].T_world_ee, targets[-1].T_world_ee
     # It came down from above, so it leaves upwards, turned as it was.
     assert_allclose(left[:3, 3] - released[:3, 3], [0, 0, RETREAT_M], atol=1e-9)
     assert_allclose(left[:3, :3], released[:3, :3], atol=1e-9)
-    assert len(transfer(whole, whole.layout, {}, HOME)) == len(whole.key_poses)
+    assert len(transfer(whole, whole.object_poses, {}, HOME)) == len(whole.key_poses)
 
 
 def test_a_demonstration_cut_with_the_object_in_the_hand_ends_with_letting_go():
     memory = entry(key_poses=entry().key_poses[:6])
     assert memory.key_poses[-1].phase == "place"
-    targets = transfer(memory, memory.layout, {}, HOME)
+    targets = transfer(memory, memory.object_poses, {}, HOME)
     assert [target.key_pose.phase for target in targets[-3:]] == ["place", "release", "retreat"]
     release, retreat = targets[-2:]
     assert_allclose(release.T_world_ee, targets[5].T_world_ee)
@@ -197,48 +200,50 @@ def test_a_demonstration_cut_with_the_object_in_the_hand_ends_with_letting_go():
 def test_what_is_not_to_be_put_anywhere_is_not_let_go():
     poses = [*entry().key_poses[:3], key_pose("bowl", hand_pose(0, 0, 0.3), "place", closed=True)]
     memory = entry("open the top drawer of the bowl", key_poses=poses)
-    targets = transfer(memory, memory.layout, {}, HOME)
+    targets = transfer(memory, memory.object_poses, {}, HOME)
     assert "release" not in [target.key_pose.phase for target in targets]
 
 
-def score(layout, memory=None):
-    return geometric_score(memory or entry(), layout, {}, HOME, robot(), TransferLimits())
+def score(object_poses, memory=None):
+    return geometric_score(memory or entry(), object_poses, {}, HOME, robot(), TransferLimits())
 
 
 @given(st.floats(-0.1, 0.1), st.floats(-0.1, 0.1), st.floats(-0.3, 0.3))
 def test_a_scene_arranged_like_the_entrys_own_scores_one_wherever_it_is(x, y, yaw):
     G = se3.from_yaw([x, y, 0.0], yaw)
-    assert score({name: G @ T for name, T in entry().layout.items()}) == pytest.approx(1)
+    assert score({name: G @ T for name, T in entry().object_poses.items()}) == pytest.approx(1)
 
 
 def test_an_object_that_is_missing_or_out_of_reach_scores_nothing(monkeypatch):
-    layout = entry().layout
-    assert score({"bowl": layout["bowl"]}) == 0
-    assert score(layout | {"plate": se3.from_yaw([3.0, 0, 0], 0.0)}) == 0
+    object_poses = entry().object_poses
+    assert score({"bowl": object_poses["bowl"]}) == 0
+    assert score(object_poses | {"plate": se3.from_yaw([3.0, 0, 0], 0.0)}) == 0
     monkeypatch.setattr(feasibility, "MAX_JUMP_M", 0.05)
-    assert score(layout) == 0
+    assert score(object_poses) == 0
 
 
 def test_the_less_like_the_entrys_own_arrangement_the_less_it_scores():
-    layout = entry().layout
+    object_poses = entry().object_poses
     shifts = [0.0, 0.05, 0.15, 0.3]
-    scores = [score(layout | {"plate": se3.from_yaw([-d, 0, 0], 0.0) @ layout["plate"]}) for d in shifts]
+    scores = [
+        score(object_poses | {"plate": se3.from_yaw([-d, 0, 0], 0.0) @ object_poses["plate"]}) for d in shifts
+    ]
     assert scores == sorted(scores, reverse=True)
     assert len(set(scores)) == 4
-    turned = score(layout | {"plate": layout["plate"] @ se3.from_yaw(np.zeros(3), 0.5)})
+    turned = score(object_poses | {"plate": object_poses["plate"] @ se3.from_yaw(np.zeros(3), 0.5)})
     assert 0 < turned < 1
 
 
 def test_objects_that_no_key_pose_is_relative_to_make_no_difference():
-    layout = entry().layout
-    assert score(layout | {"mug": se3.from_yaw([0.3, 0.3, 0], 1.0)}) == score(layout)
+    object_poses = entry().object_poses
+    assert score(object_poses | {"mug": se3.from_yaw([0.3, 0.3, 0], 1.0)}) == score(object_poses)
 
 
 def test_what_can_be_done_at_all_scores_something(monkeypatch):
     # A drawer that opens another way round from where the hand comes from: far from alike, yet possible.
     pull = key_pose("cabinet", hand_pose(0.3, 0.0, 0.1), "open", closed=True)
     take = key_pose("handle", hand_pose(0.0, 0.0, 0.1), "grasp", closed=True)
-    memory = entry(key_poses=[take, pull], layout={"cabinet": np.eye(4), "handle": np.eye(4)})
+    memory = entry(key_poses=[take, pull], object_poses={"cabinet": np.eye(4), "handle": np.eye(4)})
     here = {"cabinet": np.eye(4), "handle": se3.from_yaw([-0.4, 0.0, 0.0], 2.0)}
     monkeypatch.setattr(feasibility, "MAX_JUMP_M", 9)
     monkeypatch.setattr(feasibility, "MAX_JUMP_RAD", 9)

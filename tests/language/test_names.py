@@ -109,9 +109,9 @@ def test_embeddings_compare_the_words_of_what_the_grammar_cannot_read(tmp_path):
     model = make_model(
         tmp_path, {"scrub": (1.0, 0.1), "wipe": (1.0, 0.0), "table": (0.0, 1.0), "burn": (-1.0, 0.0)}
     )
-    names, bank = Model2VecNames(str(model)), [entry("wipe the table")]
-    (found,) = semantic_candidates("scrub the table", bank, names)
+    names, entries = Model2VecNames(str(model)), [entry("wipe the table")]
+    (found,) = semantic_candidates("scrub the table", entries, names)
     assert 0.75 <= found[1] < 1
     for asked, similarity in (("scrub the table", TABLE_NAMES), ("burn the table", names)):
         with pytest.raises(InstructionError, match="no memory"):
-            semantic_candidates(asked, bank, similarity)
+            semantic_candidates(asked, entries, similarity)

@@ -52,16 +52,16 @@ def pick_and_place(target="bowl", landmark="plate", yaw=0.3):
     )
 
 
-def entry(instruction="put the bowl on the plate", key_poses=None, layout=None, **changes):
+def entry(instruction="put the bowl on the plate", key_poses=None, object_poses=None, **changes):
     sub_tasks = read_task(instruction)
     objects = [name for sub_task in sub_tasks for name in sub_task.objects]
     if key_poses is None:
         key_poses = pick_and_place(objects[0], objects[-1])
-    if layout is None:
-        layout = {name: se3.from_yaw([0.1 * i, 0.2, 0.0], 0.5 * i) for i, name in enumerate(objects)}
+    if object_poses is None:
+        object_poses = {name: se3.from_yaw([0.1 * i, 0.2, 0.0], 0.5 * i) for i, name in enumerate(objects)}
     fields = {"quality": 0.9, "version": 1, "source": "local/demos#0", **changes}
     key = RetrievalKey(sub_tasks, tuple(pose.phase for pose in key_poses))
-    return MemoryEntry(key, instruction, tuple(key_poses), layout=layout, **fields)
+    return MemoryEntry(key, instruction, tuple(key_poses), object_poses=object_poses, **fields)
 
 
 def semantic_candidates(instruction, entries, names=TABLE_NAMES):

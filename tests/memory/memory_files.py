@@ -6,8 +6,8 @@ import json
 import numpy as np
 from safetensors.numpy import load, save
 
-from lerobot_openspm.memory.bank import BETWEEN, DIGEST_BYTES, TAIL
 from lerobot_openspm.memory.io import ENTRIES, SEAL, arrays_file
+from lerobot_openspm.memory.stored_entries import BETWEEN, DIGEST_BYTES, TAIL
 
 
 def names(directory):

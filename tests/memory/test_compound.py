@@ -34,8 +34,8 @@ def test_an_entry_with_two_sub_tasks_teaches_both():
     assert opening.key.phases == ("approach", "grasp", "open", "release", "retreat")
     assert [pose.phase for pose in putting.key_poses] == [p.phase for p in whole.key_poses[5:]]
     for part, objects in ((opening, ["cabinet"]), (putting, ["bowl", "cabinet"])):
-        assert sorted(part.layout) == objects
-        assert set(part.objects) <= set(part.layout)
+        assert sorted(part.object_poses) == objects
+        assert set(part.objects) <= set(part.object_poses)
         assert {pose.sub_task for pose in part.key_poses} == {0}
         assert (part.quality, part.source) == (0.7, "local/demos#3")
     for part, poses in ((opening, whole.key_poses[:5]), (putting, whole.key_poses[5:])):
@@ -146,24 +146,24 @@ def test_parts_can_be_carried_over_to_a_scene():
     from lerobot_openspm.control.transfer import transfer
 
     opening, _ = parts(drawer_entry())
-    layout = {"cabinet": se3.from_yaw([0.3, 0.1, 0.0], 0.4)}
-    targets = transfer(opening, layout, {}, hand_pose(0, 0, 0.3))
-    np.testing.assert_allclose(targets[0].T_world_ee, layout["cabinet"] @ opening.key_poses[0].T_obj_ee)
+    object_poses = {"cabinet": se3.from_yaw([0.3, 0.1, 0.0], 0.4)}
+    targets = transfer(opening, object_poses, {}, hand_pose(0, 0, 0.3))
+    np.testing.assert_allclose(targets[0].T_world_ee, object_poses["cabinet"] @ opening.key_poses[0].T_obj_ee)
 
 
 WIPE, SINK = "wipe the table with the sponge", "put the sponge in the sink"
 
 
 def test_what_the_grammar_cannot_read_is_carried_out_sentence_by_sentence():
-    bank = [entry(WIPE, source="wipe"), entry(SINK, source="sink")]
+    entries = [entry(WIPE, source="wipe"), entry(SINK, source="sink")]
     for asked in (f"{WIPE}, and then {SINK}", f"Please {WIPE}. Then {SINK}!", f"{WIPE} and {SINK}"):
-        chain = plan_parts(asked, bank)
+        chain = plan_parts(asked, entries)
         assert [[one.source.source for one in part] for part in chain] == [["wipe"], ["sink"]]
-    chain = plan_parts(f"{SINK} and {WIPE}", bank)
+    chain = plan_parts(f"{SINK} and {WIPE}", entries)
     assert [[one.source.source for one in part] for part in chain] == [["sink"], ["wipe"]]
     for asked in (f"sing, then {SINK}", f"{WIPE} and then sing", f"do not {WIPE}, then {SINK}"):
         with pytest.raises(InstructionError, match="it knows"):
-            plan_parts(asked, bank)
+            plan_parts(asked, entries)
 
 
 def test_an_instruction_kept_by_its_words_is_one_part_however_much_it_moved():

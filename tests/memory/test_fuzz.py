@@ -11,8 +11,8 @@ from tests.memory.memory_files import names
 
 from lerobot_openspm.errors import MemoryFormatError, OpenSPMError
 from lerobot_openspm.memory import io as module
-from lerobot_openspm.memory.bank import EntryBank
 from lerobot_openspm.memory.io import read_memory, write_memory
+from lerobot_openspm.memory.stored_entries import StoredEntries
 
 
 def whole():
@@ -34,7 +34,7 @@ def load(request, monkeypatch):
 
     def load(folder):
         loaded = read_memory(folder)
-        assert isinstance(loaded.entries, EntryBank) == (request.param == "read when asked for")
+        assert isinstance(loaded.entries, StoredEntries) == (request.param == "read when asked for")
         return replace(loaded, entries=tuple(loaded.entries), superseded=tuple(loaded.superseded))
 
     return load

@@ -8,7 +8,6 @@ from tests.memory.builders import entry, semantic_candidates
 from lerobot_openspm.errors import InstructionError
 from lerobot_openspm.language.instruction import parse_instruction
 from lerobot_openspm.memory import indexed_entries as module
-from lerobot_openspm.memory.bank import key_digest
 from lerobot_openspm.memory.entry import RetrievalKey
 from lerobot_openspm.memory.indexed_entries import (
     ENTRIES_IN_ALL,
@@ -19,19 +18,20 @@ from lerobot_openspm.memory.indexed_entries import (
     near,
 )
 from lerobot_openspm.memory.retrieval import MIN_SEMANTIC, semantic_score
+from lerobot_openspm.memory.stored_entries import key_digest
 from lerobot_openspm.types import SubTask
 
 BOWL, STOVE = "put the bowl on the plate", "turn on the stove"
-DIGEST_OF_BOWL = 13536161139241641483
+DIGEST_OF_BOWL = 9109827965828624359
 DRAWER = "open the top drawer and put the bowl inside"
 
 
-def bank_of(keys, qualities=None):
+def entries_of(keys, qualities=None):
     """An entry for every key, numbered in its source."""
     template = entry()
     qualities = np.linspace(0, 1, len(keys)) if qualities is None else qualities
     return [
-        replace(template, key=RetrievalKey(key, ("approach",)), quality=float(quality), source=f"bank#{i}")
+        replace(template, key=RetrievalKey(key, ("approach",)), quality=float(quality), source=f"entries#{i}")
         for i, (key, quality) in enumerate(zip(keys, qualities, strict=True))
     ]
 
@@ -42,40 +42,40 @@ def sources(entries):
 
 @pytest.fixture(scope="module")
 def many():
-    return bank_of(distinct_keys(INDEX_FROM + 500, np.random.default_rng(0)))
+    return entries_of(distinct_keys(INDEX_FROM + 500, np.random.default_rng(0)))
 
 
 def test_it_is_the_sequence_it_indexes(many):
-    bank = IndexedEntries(many)
-    assert len(bank) == len(many)
-    assert bank[3] is many[3]
-    assert bank[2:5] == many[2:5]
-    assert list(bank) == many
+    entries = IndexedEntries(many)
+    assert len(entries) == len(many)
+    assert entries[3] is many[3]
+    assert entries[2:5] == many[2:5]
+    assert list(entries) == many
 
 
 def test_small_banks_are_left_as_they_are(many):
     few = tuple(many[:INDEX_FROM])
     assert indexed(few) is few
     assert near(parse_instruction(BOWL), few, semantic_score) is few
-    bank = indexed(many)
-    assert isinstance(bank, IndexedEntries)
-    assert indexed(bank) is bank
+    entries = indexed(many)
+    assert isinstance(entries, IndexedEntries)
+    assert indexed(entries) is entries
 
 
 def test_the_best_by_meaning_is_near_however_it_is_said(many):
     rng = np.random.default_rng(1)
-    bank, reached = IndexedEntries(many), []
+    entries, reached = IndexedEntries(many), []
     for i in rng.integers(len(many), size=40):
         asked = said_otherwise(many[i].key.sub_tasks, rng)
         best = max(semantic_score(asked, one.key.sub_tasks) for one in many)
-        found = bank.near(asked, semantic_score)
+        found = entries.near(asked, semantic_score)
         reached.append(max(semantic_score(asked, one.key.sub_tasks) for one in found) == best)
     assert np.mean(reached) >= 0.95
 
 
 def test_retrieval_is_that_of_all_entries(many):
     known = [*many, entry(BOWL), entry(STOVE), entry("put the bowl next to the plate")]
-    expected, found = (semantic_candidates(BOWL, bank) for bank in (known, indexed(known)))
+    expected, found = (semantic_candidates(BOWL, entries) for entries in (known, indexed(known)))
     order = lambda pairs: sorted((one.source, one.language, score) for one, score in pairs)  # noqa: E731
     assert order(found) == order(expected)
     assert [one.language for one, _ in found] == [BOWL]
@@ -95,7 +95,7 @@ def test_of_equal_keys_the_best_are_handed_on(many):
     qualities = rng.random(5000)
     same = [
         replace(one, source=f"same#{i}")
-        for i, one in enumerate(bank_of([parse_instruction(BOWL)] * 5000, qualities))
+        for i, one in enumerate(entries_of([parse_instruction(BOWL)] * 5000, qualities))
     ]
     found = IndexedEntries([*many, *same]).near(parse_instruction(BOWL), semantic_score)
     best = [f"same#{i}" for i in np.argsort(-qualities)[:ENTRIES_PER_KEY]]
@@ -105,8 +105,8 @@ def test_of_equal_keys_the_best_are_handed_on(many):
 
 def test_no_more_than_so_many_in_all_but_one_of_every_key():
     keys = [key for key in distinct_keys(40, np.random.default_rng(0)) if len(key) == 1]
-    bank = IndexedEntries(bank_of(keys * 100))
-    found = bank.near(keys[3], lambda asked, known: 1.0 if asked == known else 0.5)
+    entries = IndexedEntries(entries_of(keys * 100))
+    found = entries.near(keys[3], lambda asked, known: 1.0 if asked == known else 0.5)
     assert len(found) == ENTRIES_IN_ALL
     assert {one.key.sub_tasks for one in found} == set(keys)
     assert [one.key.sub_tasks for one in found[:ENTRIES_PER_KEY]] == [keys[3]] * ENTRIES_PER_KEY
@@ -114,20 +114,20 @@ def test_no_more_than_so_many_in_all_but_one_of_every_key():
 
 def test_of_keys_about_something_else_one_entry_is_handed_on():
     keys = [key for key in distinct_keys(40, np.random.default_rng(0)) if len(key) == 1]
-    found = IndexedEntries(bank_of(keys * 100)).near(keys[3], lambda asked, known: float(asked == known))
+    found = IndexedEntries(entries_of(keys * 100)).near(keys[3], lambda asked, known: float(asked == known))
     assert len(found) == ENTRIES_PER_KEY + len(keys) - 1
     assert {one.key.sub_tasks for one in found} == set(keys)
 
 
 def test_parts_are_found_in_either_direction():
-    filler = bank_of(distinct_keys(300, np.random.default_rng(0)))
+    filler = entries_of(distinct_keys(300, np.random.default_rng(0)))
     whole, part = entry(DRAWER, source="whole"), entry("open the top drawer", source="part")
-    bank = IndexedEntries([*filler, whole, part])
+    entries = IndexedEntries([*filler, whole, part])
     inside = parse_instruction(DRAWER)[1]
-    assert sources(bank.near([inside], semantic_score))[:1] != ["part"]
-    assert "whole" in sources(bank.near([inside], semantic_score))
-    assert sources(bank.near(parse_instruction("open the top drawer"), semantic_score))[0] == "part"
-    chain = sources(bank.near(parse_instruction(DRAWER), semantic_score))
+    assert sources(entries.near([inside], semantic_score))[:1] != ["part"]
+    assert "whole" in sources(entries.near([inside], semantic_score))
+    assert sources(entries.near(parse_instruction("open the top drawer"), semantic_score))[0] == "part"
+    chain = sources(entries.near(parse_instruction(DRAWER), semantic_score))
     assert chain[0] == "whole"
     assert "part" in chain
 

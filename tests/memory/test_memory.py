@@ -233,8 +233,8 @@ ENTRIES = {
     "language as number": (setting(*ENTRY, "language", value=3), r"entries\[0\].*language"),
     "more successes than trials": (setting(*ENTRY, "successes", value=1), r"entries\[0\].*successes"),
     "trials as truth": (setting(*ENTRY, "trials", value=True), r"entries\[0\].*trials"),
-    "layout of another kind": (setting(*ENTRY, "layout", value=3), r"entries\[0\]"),
-    "one object less": (without(*ENTRY, "layout", "bowl"), r"entries\[0\].*'bowl'"),
+    "object poses of another kind": (setting(*ENTRY, "object_poses", value=3), r"entries\[0\]"),
+    "one object less": (without(*ENTRY, "object_poses", "bowl"), r"entries\[0\].*'bowl'"),
     "a sub-task there is not": (setting(*POSE, "sub_task", value=1), r"entries\[0\].*'sub_task' is 1"),
     "pose as text": (setting(*POSE, "T_obj_ee", value="here"), r"entries\[0\].*T_obj_ee"),
     "pose of texts": (setting(*POSE, "T_obj_ee", value=[["1"] * 4] * 3), r"entries\[0\].*T_obj_ee"),
@@ -243,7 +243,10 @@ ENTRIES = {
     "scaled pose": (setting(*POSE, "T_obj_ee", 0, 0, value=1.5), r"entries\[0\].*T_obj_ee.*rigid"),
     "huge pose": (setting(*POSE, "T_obj_ee", 0, 0, value=1e300), r"entries\[0\].*<= 1000000000.0.*T_obj_ee"),
     "null in a pose": (setting(*POSE, "T_obj_ee", 0, 3, value=None), r"entries\[0\].*T_obj_ee"),
-    "mirrored layout": (setting(*ENTRY, "layout", "bowl", 2, value=[0, 0, -1, 0]), r"entries\[0\].*'layout'"),
+    "mirrored object poses": (
+        setting(*ENTRY, "object_poses", "bowl", 2, value=[0, 0, -1, 0]),
+        r"entries\[0\].*'object_poses'",
+    ),
     "source with half a character": (
         setting(*ENTRY, "source", value="a\ud800"),
         r"of printable characters, not empty - at `\$\.source`",
@@ -254,8 +257,8 @@ ENTRIES = {
     "no language": (setting(*ENTRY, "language", value=" "), r"entries\[0\].*not empty - at `\$\.language`"),
     "language with half a character": (setting(*ENTRY, "language", value="put \udfff"), r"\$\.language"),
     "layout with half a character": (
-        lambda rows: rows[0]["layout"].update({"a\ud800": rows[0]["layout"]["bowl"]}),
-        r"at `key` in `\$\.layout`",
+        lambda rows: rows[0]["object_poses"].update({"a\ud800": rows[0]["object_poses"]["bowl"]}),
+        r"at `key` in `\$\.object_poses`",
     ),
     "landmarks with half a character": (
         setting(*SUB_TASK, "target_where", value={"relation": "on", "landmarks": ["a\ud800"]}),

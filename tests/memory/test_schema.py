@@ -42,8 +42,8 @@ def test_among_many_keys_the_one_that_is_there_twice_is_found_at_once():
     ("change", "error"),
     [
         ({"sub_task": 1}, "1 sub-tasks"),
-        ({"target": "ghost"}, "not in its 'layout'"),
-        ({"anchor": {"place": "ghost", "axes": "ghost"}}, "not in its 'layout'"),
+        ({"target": "ghost"}, "not in its 'object_poses'"),
+        ({"anchor": {"place": "ghost", "axes": "ghost"}}, "not in its 'object_poses'"),
         ({"position": [0.0, 1.0]}, r"\$\.outcomes\[0\]\.position"),
         ({"shown": [0.0, 1.0, None]}, r"\$\.outcomes\[0\]\.shown\[2\]"),
         ({"tolerance_m": -0.1}, "tolerance_m"),

@@ -7,7 +7,7 @@ import numpy as np
 from lerobot_openspm.geometry import se3
 from lerobot_openspm.geometry.camera import Camera
 from lerobot_openspm.perception.foreground import N_BINS
-from lerobot_openspm.perception.objects.base import Lesson, Look
+from lerobot_openspm.perception.objects.base import Examples, Look
 from lerobot_openspm.perception.objects.box.model import BoxModel
 from lerobot_openspm.perception.objects.patches.match import Patch, Probe
 from lerobot_openspm.perception.objects.patches.model import PatchModel
@@ -49,5 +49,5 @@ def localise(views, known, instances=None, hidden=None, T_expected=None):
     return known.localise(Look(views, found, hidden or {}, expected))
 
 
-def lesson(names, scenes, known=(), segmenter=None, source="demonstrations", shapes=None):
-    return Lesson(names, scenes, known, np.random.default_rng(0), segmenter, source, shapes)
+def examples(names, scenes, known=(), segmenter=None, source="demonstrations", shapes=None):
+    return Examples(names, scenes, known, np.random.default_rng(0), segmenter, source, shapes)

@@ -7,7 +7,7 @@ import numpy as np
 
 from lerobot_openspm.geometry import se3
 from lerobot_openspm.geometry.camera import Camera, project
-from lerobot_openspm.types import ContactCue, Scene, View
+from lerobot_openspm.types import ContactCue, DemonstrationScene, View
 
 SIZE = 160
 TABLE = (196, 166, 128)
@@ -72,7 +72,7 @@ def views_of(poses: dict[str, np.ndarray], T_moved: np.ndarray | None = None) ->
     return render([(SHAPES.get(name, DISTRACTOR), T) for name, T in poses.items()], T_moved)
 
 
-def demonstration(rng: np.random.Generator, wrong: bool = False) -> Scene:
+def demonstration(rng: np.random.Generator, wrong: bool = False) -> DemonstrationScene:
     """The cup is grasped at its rim and put on the block; one in a few hints may be plainly wrong."""
     poses = draw_poses(rng)
     grasp = se3.apply(poses["cup"], np.array([[0.03, 0.0, 0.05]]))[0] + rng.normal(0, 0.004, 3)
@@ -82,10 +82,10 @@ def demonstration(rng: np.random.Generator, wrong: bool = False) -> Scene:
         grasp, release = release + aside, grasp - aside
     later = poses | {"cup": se3.from_yaw(poses["block"][:3, 3] + [0, 0, 0.05], 0.0)}
     hints = (ContactCue("cup", grasp, "grasp"), ContactCue("block", release, "release"))
-    return Scene(views_of(poses), hints, views_of(later))
+    return DemonstrationScene(views_of(poses), hints, views_of(later))
 
 
-def partly_hidden(scene: Scene, name: str, camera: str, share: float) -> Scene:
+def partly_hidden(scene: DemonstrationScene, name: str, camera: str, share: float) -> DemonstrationScene:
     """The same scene with a grey bar over the right-hand `share` of an object's place in one view."""
     view = scene.views[camera]
     (hint,) = (hint for hint in scene.hints if hint.name == name)

@@ -10,16 +10,16 @@ from tests.perception.drawn_world import demonstration, draw_poses
 from lerobot_openspm.perception.objects.kinds import learn_objects
 from lerobot_openspm.perception.objects.patches.model import PatchModel
 from lerobot_openspm.perception.objects.patches.stillness import hardly_moving
-from lerobot_openspm.types import ContactCue, Scene
+from lerobot_openspm.types import ContactCue, DemonstrationScene
 
 # How far to either side of the middle objects stand, along both axes.
 NEAR_M, FAR_M = 0.007, 0.06
 
 
-def scenes(sides_m: dict[str, float], touches: int, places: int = 1) -> list[Scene]:
+def scenes(sides_m: dict[str, float], touches: int, places: int = 1) -> list[DemonstrationScene]:
     """Scenes in which every object is touched, in turn on one side of its middle and on the other."""
     return [
-        Scene(
+        DemonstrationScene(
             {},
             tuple(
                 ContactCue(

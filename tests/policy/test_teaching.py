@@ -58,7 +58,8 @@ def without_stove(memory: Memory, episodes: tuple[int, ...]) -> Memory:
     """The same where the stove was not found in some of the episodes."""
     unseen = {f"{NAME}#{index}" for index in episodes}
     entries = [
-        replace(e, layout={"plate": e.layout["plate"]}) if e.source in unseen else e for e in memory.entries
+        replace(e, object_poses={"plate": e.object_poses["plate"]}) if e.source in unseen else e
+        for e in memory.entries
     ]
     return replace(memory, entries=tuple(entries))
 

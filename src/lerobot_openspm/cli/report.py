@@ -70,7 +70,7 @@ def _key_pose_picture(entry: MemoryEntry, memory: Memory, dataset: LeRobotDatase
     episode = demonstrations.episodes([int(entry.source.rsplit("#", 1)[1])])[0]
     key, camera = next((k, c) for k, c in memory.cameras.items() if c.mount == "world")
     view = demonstrations.views(episode, 0, {key: camera})[key]
-    poses = [pose.anchor.frame(entry.layout) @ pose.T_obj_ee for pose in entry.key_poses]
+    poses = [pose.anchor.frame(entry.object_poses) @ pose.T_obj_ee for pose in entry.key_poses]
     return draw_key_poses(view, poses, [pose.phase for pose in entry.key_poses])
 
 

@@ -16,7 +16,7 @@ from lerobot_openspm.errors import OpenSPMError
 from lerobot_openspm.flow.condition import Query, progress
 from lerobot_openspm.geometry import se3
 from lerobot_openspm.geometry.se3 import Array
-from lerobot_openspm.memory.entry import PHASES
+from lerobot_openspm.memory.entry import CONTACT_PHASES, PHASES
 from lerobot_openspm.memory.robot import RobotModel
 from lerobot_openspm.types import Execution, Hand
 
@@ -24,8 +24,6 @@ logger = logging.getLogger(__name__)
 
 # Corrections per key pose, and attempts beyond the first in a part of the instruction.
 MAX_CORRECTIONS, MAX_ATTEMPTS = 8, 3
-# Phases that end with the hand on an object.
-CONTACTS = ("grasp", "release", "push", "open", "turn")
 # An opening below this share of the demonstrated one means that the fingers hold nothing.
 HELD_SHARE = 0.4
 # Where the demonstration's fingers stood further apart than this share of open, they held something.
@@ -251,7 +249,7 @@ class Executor:
         index, place = self.state.index, self.present.key_pose.anchor.place
         while index > 0:
             before = self.targets[index - 1].key_pose
-            if before.anchor.place != place or before.phase in CONTACTS:
+            if before.anchor.place != place or (before.phase in CONTACT_PHASES and before.phase != "place"):
                 break
             index -= 1
         return index

@@ -10,11 +10,9 @@ import numpy as np
 from lerobot_openspm.control.transfer import Target, transfer
 from lerobot_openspm.geometry import se3
 from lerobot_openspm.geometry.se3 import Array
-from lerobot_openspm.memory.entry import MemoryEntry
+from lerobot_openspm.memory.entry import CONSTRAINED_PHASES, MemoryEntry
 from lerobot_openspm.memory.robot import RobotModel
 
-# Phases in which an object follows the hand along a constraint.
-CONSTRAINED_PHASES = ("push", "open", "turn")
 # Longest way and largest turn between consecutive key poses: the reach of a table-top arm, and just short of
 # half a turn, whose direction is open.
 MAX_JUMP_M, MAX_JUMP_RAD = 0.8, 2.8
@@ -98,7 +96,7 @@ def shape_deviation(entry: MemoryEntry, targets: Sequence[Target]) -> float:
     one anchor they are equal. Where the hand pushes, pulls or turns something, a different motion does
     something else to the object, so those count in full. In free space a difference hardly matters.
     """
-    shown = [pose.anchor.frame(entry.layout) @ pose.T_obj_ee for pose in entry.key_poses]
+    shown = [pose.anchor.frame(entry.object_poses) @ pose.T_obj_ee for pose in entry.key_poses]
     now = [target.T_world_ee for target in targets]
     constrained, free = [0.0], [0.0]
     for i, pose in enumerate(entry.key_poses[1:], start=1):  # a retreat of ours has nothing to compare with

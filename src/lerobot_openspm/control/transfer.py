@@ -38,11 +38,11 @@ class PushPath:
     now: Array
     is_by_landmark: bool = False
 
-    def position(self, pose: MemoryKeyPose, layout_shown: Mapping[str, Array]) -> Array:
+    def position(self, pose: MemoryKeyPose, poses_shown: Mapping[str, Array]) -> Array:
         """Where the hand goes ``(3,)`` for a key pose of the push."""
         is_at_start = pose.anchor.place == self.target or (self.is_by_landmark and pose.phase == "approach")
         place = 0 if is_at_start else 1
-        T_world_ee = pose.anchor.frame(layout_shown) @ pose.T_obj_ee
+        T_world_ee = pose.anchor.frame(poses_shown) @ pose.T_obj_ee
         turn = _heading(self.now) - _heading(self.shown)
         if min(_length(self.shown), _length(self.now)) < MIN_PUSH_M:
             turn = 0.0
@@ -126,7 +126,7 @@ def transfer(
         before = transfer_pose(T_world_anchor, pose.T_obj_ee)
         path = paths.get(pose.sub_task)
         if path is not None:
-            before = se3.transform(before[:3, :3], path.position(pose, entry.layout))
+            before = se3.transform(before[:3, :3], path.position(pose, entry.object_poses))
         axis = pose.axis
         if axis is not None:
             axis = replace(axis, direction=T_world_anchor[:3, :3] @ axis.direction)
@@ -146,9 +146,9 @@ def push_paths(entry: MemoryEntry, object_poses: Mapping[str, Array]) -> dict[in
     by_landmark = pushed_by_landmark(entry)
     paths: dict[int, PushPath] = {}
     for outcome in _push_outcomes(entry):
-        if any(name not in poses for name in outcome.objects for poses in (entry.layout, object_poses)):
+        if any(name not in poses for name in outcome.objects for poses in (entry.object_poses, object_poses)):
             continue
-        shown = np.stack([entry.layout[outcome.target][:3, 3], outcome.place_shown(entry.layout)])
+        shown = np.stack([entry.object_poses[outcome.target][:3, 3], outcome.place_shown(entry.object_poses)])
         now = np.stack([object_poses[outcome.target][:3, 3], outcome.place(object_poses)])
         is_by_landmark = outcome.sub_task in by_landmark
         paths[outcome.sub_task] = PushPath(outcome.target, shown, now, is_by_landmark)

@@ -17,15 +17,13 @@ from lerobot_openspm.language.descriptions import phrase
 from lerobot_openspm.language.meaning import semantic_score
 from lerobot_openspm.language.names import TABLE_NAMES, NameSimilarity
 from lerobot_openspm.language.own_words import normal_words
-from lerobot_openspm.memory.entry import MemoryEntry, RetrievalKey
+from lerobot_openspm.memory.entry import CONTACT_PHASES, MemoryEntry, RetrievalKey
 from lerobot_openspm.memory.indexed_entries import near
 from lerobot_openspm.memory.retrieval import candidates_for, read_instruction, why_unread
 from lerobot_openspm.types import SubTask
 
 # A sub-task takes hold of something and lets it go again.
 TRANSITIONS_PER_SUB_TASK = 2
-# Ways through free space; without the objects they are relative to, the hand finds another way.
-FREE_PHASES = ("approach", "lift", "pre-place", "retreat")
 # What one thing after another is said with: "wipe the table, and then open the drawer".
 _NEXT = re.compile(r"(?:\band )?\bthen\b|[;.!?\n]+", re.IGNORECASE)
 _AND = re.compile(r"\band\b", re.IGNORECASE)
@@ -36,9 +34,9 @@ class Candidate:
     """An entry that a part of an instruction can be carried out by.
 
     Attributes:
-        entry: What is executed: an entry of the bank, or one sub-task of it.
+        entry: What is executed: an entry of the memory, or one sub-task of it.
         semantic: Its ``S_sem``.
-        source: The entry of the bank.
+        source: The entry of the memory.
         asked: What of the instruction it carries out, one for each of the entry's sub-tasks.
     """
 
@@ -76,9 +74,9 @@ def _part(entry: MemoryEntry, number: int) -> MemoryEntry | None:
         replace(pose, sub_task=0)
         for pose in entry.key_poses
         if pose.sub_task == number
-        and (set(pose.anchor.objects) <= set(sub_task.objects) or pose.phase not in FREE_PHASES)
+        and (set(pose.anchor.objects) <= set(sub_task.objects) or pose.phase in CONTACT_PHASES)
     )
-    contacts = [pose for pose in kept if pose.phase not in FREE_PHASES]
+    contacts = [pose for pose in kept if pose.phase in CONTACT_PHASES]
     if not contacts or any(not set(pose.anchor.objects) <= set(sub_task.objects) for pose in contacts):
         return None
     return replace(
@@ -86,7 +84,7 @@ def _part(entry: MemoryEntry, number: int) -> MemoryEntry | None:
         key=RetrievalKey((sub_task,), tuple(pose.phase for pose in kept)),
         language=phrase(sub_task),
         key_poses=kept,
-        layout={name: T for name, T in entry.layout.items() if name in sub_task.objects},
+        object_poses={name: T for name, T in entry.object_poses.items() if name in sub_task.objects},
         outcomes=tuple(replace(one, sub_task=0) for one in entry.outcomes if one.sub_task == number),
     )
 

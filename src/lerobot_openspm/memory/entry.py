@@ -16,8 +16,10 @@ Phase = Literal[
     "approach", "grasp", "lift", "pre-place", "place", "release", "retreat", "push", "open", "turn"
 ]
 PHASES: tuple[str, ...] = get_args(Phase)
-# Phases in which the hand touches something: their key poses are met precisely, the others in passing.
-CONTACT_PHASES = ("grasp", "place", "release", "push", "open", "turn")
+# The hand moves as the object allows.
+CONSTRAINED_PHASES = ("push", "open", "turn")
+# The hand touches something: these key poses are met precisely, the others in passing.
+CONTACT_PHASES = ("grasp", "place", "release", *CONSTRAINED_PHASES)
 
 
 @dataclass(frozen=True)
@@ -52,10 +54,10 @@ class Anchor:
         """The objects whose poses are needed."""
         return (self.place,) if self.axes in (self.place, WORLD) else (self.place, self.axes)
 
-    def frame(self, layout: Mapping[str, Array]) -> Array:
+    def frame(self, object_poses: Mapping[str, Array]) -> Array:
         """The anchor's pose ``T_world_anchor`` ``(4, 4)``, given the objects' poses ``T_world_obj``."""
-        rotation = np.eye(3) if self.axes == WORLD else layout[self.axes][:3, :3]
-        return se3.transform(rotation, layout[self.place][:3, 3])
+        rotation = np.eye(3) if self.axes == WORLD else object_poses[self.axes][:3, :3]
+        return se3.transform(rotation, object_poses[self.place][:3, 3])
 
 
 AxisKind = Literal["slide", "turn"]
@@ -154,17 +156,17 @@ class Outcome:
         """The objects whose poses are needed to judge it."""
         return tuple(dict.fromkeys((self.target, *self.anchor.objects)))
 
-    def place_shown(self, layout: Mapping[str, Array]) -> Array:
+    def place_shown(self, object_poses: Mapping[str, Array]) -> Array:
         """Where the demonstration left the target ``(3,)`` in the world, given its objects' poses."""
-        return se3.apply(self.anchor.frame(layout), self.shown[None])[0]
+        return se3.apply(self.anchor.frame(object_poses), self.shown[None])[0]
 
-    def place(self, layout: Mapping[str, Array]) -> Array:
+    def place(self, object_poses: Mapping[str, Array]) -> Array:
         """Where the target should end ``(3,)`` in the world, given the objects' poses ``T_world_obj``."""
-        return se3.apply(self.anchor.frame(layout), self.position[None])[0]
+        return se3.apply(self.anchor.frame(object_poses), self.position[None])[0]
 
-    def is_met(self, layout: Mapping[str, Array]) -> bool:
+    def is_met(self, object_poses: Mapping[str, Array]) -> bool:
         """Whether the target is where it should be, given the objects' poses ``T_world_obj``."""
-        off = layout[self.target][:3, 3] - self.place(layout)
+        off = object_poses[self.target][:3, 3] - self.place(object_poses)
         beside = float(np.linalg.norm(off[:2]))
         return beside <= self.tolerance_m and -MAX_FALL_M <= float(off[2]) <= self.tolerance_m
 
@@ -181,7 +183,7 @@ class MemoryEntry:
             updated by how it fared at deployment.
         version: The paper's ``nu_i``: counts up when an entry is replaced.
         source: Dataset and episode the entry was mined from.
-        layout: Poses ``T_world_obj`` ``(4, 4)`` of the objects at the start of the demonstration.
+        object_poses: Poses ``T_world_obj`` ``(4, 4)`` of the objects at the start of the demonstration.
         trials: How often the entry was acted by at deployment, where the outcome is known.
         successes: How many of these succeeded.
         outcomes: Where the sub-tasks leave what they move, for those of which it is known.
@@ -193,7 +195,7 @@ class MemoryEntry:
     quality: float
     version: int
     source: str
-    layout: dict[str, Array] = field(default_factory=dict[str, Array])
+    object_poses: dict[str, Array] = field(default_factory=dict[str, Array])
     trials: int = 0
     successes: int = 0
     outcomes: tuple[Outcome, ...] = ()

@@ -14,7 +14,6 @@ import numpy as np
 
 from lerobot_openspm.errors import MemoryFormatError
 from lerobot_openspm.files import write_beside
-from lerobot_openspm.memory.bank import anchored_objects
 from lerobot_openspm.memory.entry import MemoryEntry
 from lerobot_openspm.memory.io import read_memory
 from lerobot_openspm.memory.memory import Memory
@@ -31,6 +30,7 @@ from lerobot_openspm.memory.schema import (
     origin_of,
     record_of,
 )
+from lerobot_openspm.memory.stored_entries import anchored_objects
 from lerobot_openspm.perception.objects.base import KnownObject
 from lerobot_openspm.perception.objects.store import to_parts as object_to_parts
 

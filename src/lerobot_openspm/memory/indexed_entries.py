@@ -1,4 +1,4 @@
-"""The entries of a large bank, of which a retrieval reads only those whose keys are near what is asked.
+"""The entries of a large memory, of which a retrieval reads only those whose keys are near what is asked.
 
 Semantic candidates first, geometric feasibility after, as the paper outlines: the index finds the nearest
 keys, they are scored exactly, and of the best keys the best entries are handed on to be scored in the scene.
@@ -12,10 +12,10 @@ from typing import overload
 import numpy as np
 from numpy.typing import NDArray
 
-from lerobot_openspm.memory.bank import EntryBank, Key
 from lerobot_openspm.memory.entry import MemoryEntry
 from lerobot_openspm.memory.index import make_index
 from lerobot_openspm.memory.key_vector import key_vectors
+from lerobot_openspm.memory.stored_entries import Key, StoredEntries
 from lerobot_openspm.types import SubTask
 
 # Banks of more entries are indexed; scoring fewer takes no longer than perception.
@@ -33,7 +33,7 @@ class IndexedEntries(Sequence[MemoryEntry]):
     """Entries with an index over their keys, and over the sub-tasks of keys that have several.
 
     Args:
-        entries: The bank. Of an :class:`EntryBank` one entry of every different key is read, else all.
+        entries: The memory's. Of :class:`StoredEntries` one entry of every different key is read, else all.
 
     Attributes:
         names: Of all objects that the entries are about.
@@ -113,7 +113,7 @@ def indexed(entries: Sequence[MemoryEntry]) -> Sequence[MemoryEntry]:
 
 
 def known_names(entries: Sequence[MemoryEntry]) -> frozenset[str]:
-    """Names of all objects that a bank, as :func:`indexed` gave it, is about."""
+    """Names of all objects that entries, as :func:`indexed` gave them, are about."""
     if isinstance(entries, IndexedEntries):
         return entries.names
     return _names({entry.key.sub_tasks for entry in entries})
@@ -128,7 +128,7 @@ def near(asked: Sequence[SubTask], entries: Sequence[MemoryEntry], score: Score)
 
     Args:
         asked: The sub-tasks of an instruction.
-        entries: A bank, as :func:`indexed` gave it.
+        entries: Those of a memory, as :func:`indexed` gave them.
         score: ``S_sem``.
     """
     return entries.near(asked, score) if isinstance(entries, IndexedEntries) else entries
@@ -138,7 +138,7 @@ def _numbered_keys(
     entries: Sequence[MemoryEntry],
 ) -> tuple[list[Key], NDArray[np.int64], NDArray[np.float64]]:
     """The different keys, which of them each entry has ``(n,)``, and the entries' qualities ``(n,)``."""
-    if isinstance(entries, EntryBank):
+    if isinstance(entries, StoredEntries):
         _, firsts, numbers = np.unique(entries.keys, return_index=True, return_inverse=True)
         return [entries[int(i)].key.sub_tasks for i in firsts], numbers, entries.qualities
     table: dict[Key, int] = {}

@@ -26,7 +26,6 @@ from safetensors.numpy import save as save_arrays
 from lerobot_openspm.errors import MemoryFormatError
 from lerobot_openspm.files import locked, rename, write_beside, written
 from lerobot_openspm.geometry.camera import cameras_from_dict, cameras_to_dict, load_cameras
-from lerobot_openspm.memory.bank import Columns, EntryBank, OpenFile, anchored_objects, write_entries
 from lerobot_openspm.memory.memory import Memory
 from lerobot_openspm.memory.schema import (
     AGAIN,
@@ -39,6 +38,13 @@ from lerobot_openspm.memory.schema import (
     memory_from,
     origin_of,
     record_of,
+)
+from lerobot_openspm.memory.stored_entries import (
+    Columns,
+    OpenFile,
+    StoredEntries,
+    anchored_objects,
+    write_entries,
 )
 from lerobot_openspm.perception.objects.base import KnownObject
 from lerobot_openspm.perception.objects.store import from_parts as object_from_parts
@@ -178,9 +184,11 @@ def _opened(directory: Path) -> tuple[OpenFile, Header, int]:
     """``memory.json``, its header, and where its first entry starts."""
     path = directory / MEMORY_JSON
     try:
-        file, blob = OpenFile(path), b""
-        while ENTRIES not in blob and len(blob) < min(file.n_bytes, MAX_HEADER_BYTES):
-            blob = file.read(0, max(2 * len(blob), FIRST_BYTES))
+        file, n_bytes = OpenFile(path), FIRST_BYTES
+        blob = file.read(0, n_bytes)
+        while ENTRIES not in blob and n_bytes < min(file.n_bytes, MAX_HEADER_BYTES):
+            n_bytes *= 2
+            blob = file.read(0, n_bytes)
     except NO_FILE as error:
         raise MemoryFormatError(_missing(path)) from error
     _check_version(blob, path)
@@ -213,13 +221,13 @@ def _loaded(file: OpenFile, header: Header, start: int, cameras_file: Path | Non
     where = str(file.path)
     arrays = _read_arrays(file.path.with_name(header.arrays))
     columns = Columns.from_arrays(arrays, str(file.path.with_name(header.arrays)))
-    bank = EntryBank(file, start, columns, frozenset(header.anchored))
-    if header.n_entries > len(bank):
+    stored = StoredEntries(file, start, columns, frozenset(header.anchored))
+    if header.n_entries > len(stored):
         raise MemoryFormatError(
-            f"{where}: 'n_entries' is {header.n_entries}, but it holds {len(bank)}; {AGAIN}"
+            f"{where}: 'n_entries' is {header.n_entries}, but it holds {len(stored)}; {AGAIN}"
         )
-    entries, superseded = bank[: header.n_entries], bank[header.n_entries :]
-    is_small = len(bank) <= READ_AT_LOAD
+    entries, superseded = stored[: header.n_entries], stored[header.n_entries :]
+    is_small = len(stored) <= READ_AT_LOAD
     cameras = cameras_from_dict(header.cameras, where) if cameras_file is None else load_cameras(cameras_file)
     return memory_from(
         header,

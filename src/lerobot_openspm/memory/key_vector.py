@@ -1,4 +1,4 @@
-"""Retrieval keys as vectors, so that of a large bank only the nearest keys have to be read.
+"""Retrieval keys as vectors, so that of a large memory only the nearest keys have to be read.
 
 The vectors decide nothing but which keys are looked at: what is found is scored by
 :func:`lerobot_openspm.memory.retrieval.semantic_score`.

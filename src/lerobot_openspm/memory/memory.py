@@ -25,7 +25,7 @@ class Memory:
     """What was mined from demonstrations.
 
     Attributes:
-        entries: The memory bank.
+        entries: The memory's entries.
         objects: Models of the objects by name.
         robot: The robot that gave the demonstrations.
         cameras: Calibration by camera key.

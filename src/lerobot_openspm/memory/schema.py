@@ -21,7 +21,7 @@ from lerobot_openspm.memory.memory import Memory
 from lerobot_openspm.memory.robot import RobotModel
 from lerobot_openspm.types import OWN_WORDS, SubTask
 
-VERSION = 7
+VERSION = 8
 AGAIN = "train or pull it again"
 # More than any robot, unit or count needs; sums and products of such numbers stay finite and exact.
 LIMIT = 1e9
@@ -117,7 +117,7 @@ class _Entry(Record, kw_only=True):
     trials: Count = 0
     successes: Count = 0
     key: _Key
-    layout: dict[Name, Transform]
+    object_poses: dict[Name, Transform]
     key_poses: Annotated[list[_KeyPose], Meta(min_length=1)]
     outcomes: list[_Outcome] = []
 
@@ -250,16 +250,16 @@ def _wrong(entry: MemoryEntry) -> str:
     last = max(one.sub_task for one in (*poses, *entry.outcomes))
     if entry.key.phases != tuple(pose.phase for pose in poses):
         return f"'phases' are {entry.key.phases}, but its 'key_poses' have others"
-    if unknown := sorted(needed - entry.layout.keys()):
-        return f"anchors {unknown} are not in its 'layout' {sorted(entry.layout)}"
+    if unknown := sorted(needed - entry.object_poses.keys()):
+        return f"anchors {unknown} are not in its 'object_poses' {sorted(entry.object_poses)}"
     if last >= n_sub_tasks:
         return f"'sub_task' is {last}, but the entry has {n_sub_tasks} sub-tasks from 0 on"
     if entry.successes > entry.trials:
         return f"'successes' is {entry.successes}, more than the {entry.trials} 'trials'"
     if not se3.is_rigid(np.stack([pose.T_obj_ee for pose in poses])):
         return "'T_obj_ee' of its 'key_poses' are not rigid transforms"
-    if entry.layout and not se3.is_rigid(np.stack(list(entry.layout.values()))):
-        return "'layout' holds other than rigid transforms"
+    if entry.object_poses and not se3.is_rigid(np.stack(list(entry.object_poses.values()))):
+        return "'object_poses' holds other than rigid transforms"
     directions = [pose.axis.direction for pose in poses if pose.axis is not None]
     if directions and not (np.abs(np.linalg.norm(directions, axis=1) - 1) < 1e-6).all():
         return f"'direction' of an 'axis' is {np.array(directions).tolist()}, expected unit vectors"

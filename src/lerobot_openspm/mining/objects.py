@@ -22,7 +22,7 @@ from lerobot_openspm.perception.objects.base import KnownObject, ShapeBackend
 from lerobot_openspm.perception.objects.kinds import learn_objects
 from lerobot_openspm.perception.oracle import name_simulator_poses
 from lerobot_openspm.perception.pipeline import detect
-from lerobot_openspm.types import ContactCue, PoseEstimate, Scene, Segmenter, Shape
+from lerobot_openspm.types import ContactCue, DemonstrationScene, PoseEstimate, Segmenter, Shape
 
 logger = logging.getLogger(__name__)
 
@@ -32,14 +32,14 @@ MIN_END_CONFIDENCE = 0.8
 
 def learn_scenes(
     demonstrations: Demonstrations, mined: Sequence[MinedEpisode], cameras: Mapping[str, Camera]
-) -> list[Scene]:
+) -> list[DemonstrationScene]:
     """What perception learns from: two frames of every episode, and where the hand touched what."""
     scenes = []
     for item in tqdm(mined, desc="Reading images", unit="episode"):
         later = _carried_off(item.key_poses)
         views = demonstrations.views(item.episode, 0, cameras)
         later_views = None if later is None else demonstrations.views(item.episode, later, cameras)
-        scenes.append(Scene(views, contact_cues(item), later_views))
+        scenes.append(DemonstrationScene(views, contact_cues(item), later_views))
     return scenes
 
 
@@ -59,7 +59,7 @@ class FoundObjects:
 
 
 def find_objects(
-    scenes: Sequence[Scene],
+    scenes: Sequence[DemonstrationScene],
     mined: Sequence[MinedEpisode],
     known: Mapping[str, KnownObject],
     rng: np.random.Generator,
@@ -98,7 +98,7 @@ def find_objects(
 
 
 def _ends(
-    scene: Scene,
+    scene: DemonstrationScene,
     item: MinedEpisode,
     poses: Mapping[str, Array],
     models: Mapping[str, KnownObject],

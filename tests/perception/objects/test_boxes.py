@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from tests.perception.builders import lesson, localise
+from tests.perception.builders import examples, localise
 from tests.perception.drawn_masks import (
     LABELS,
     body,
@@ -46,7 +46,7 @@ def scenes():
 
 @pytest.fixture(scope="module")
 def models(scenes):
-    return learn_boxes(lesson(NAMES, scenes, (), segmenter(), "box"))
+    return learn_boxes(examples(NAMES, scenes, (), segmenter(), "box"))
 
 
 @pytest.fixture(scope="module")
@@ -81,7 +81,7 @@ def test_objects_are_found_within_millimetres(models, unseen, name):
 
 
 def test_one_demonstration_is_enough(scenes, unseen):
-    learned = learn_boxes(lesson(NAMES, scenes[:1], (), segmenter(), "box"))
+    learned = learn_boxes(examples(NAMES, scenes[:1], (), segmenter(), "box"))
     assert learned["block"].yaw_period == pytest.approx(2 * np.pi)  # nothing showed that it looks alike
     for poses in unseen[:4]:
         views = masked_views(poses)
@@ -200,7 +200,7 @@ def test_what_is_never_seen_near_the_hints_is_left_out(scenes, caplog):
         )
         for s in scenes
     ]
-    assert learn_boxes(lesson(["block"], away, (), segmenter(), "box")) == {}
+    assert learn_boxes(examples(["block"], away, (), segmenter(), "box")) == {}
     assert "no mask of 'block' near where the hand touched it" in caplog.text
 
 
@@ -232,7 +232,7 @@ def test_a_segmenter_is_asked_once_for_all_objects(models, unseen, scenes):
     detect(masked_views(unseen[0]), models, Counting())
     detect(masked_views(unseen[0]), {}, Counting())
     assert asked == [list(NAMES)]
-    learn_boxes(lesson(NAMES, scenes[:2], (), Counting(), "box"))
+    learn_boxes(examples(NAMES, scenes[:2], (), Counting(), "box"))
     assert asked == [list(NAMES)] * 3
 
 
@@ -264,7 +264,7 @@ class Told:
 
 def test_a_shape_backend_tells_the_size_once_per_object_and_the_masks_the_rest(scenes, unseen):
     told = Told()
-    models = learn_boxes(lesson(NAMES, scenes, (), segmenter(), "sam3d", told))
+    models = learn_boxes(examples(NAMES, scenes, (), segmenter(), "sam3d", told))
     assert sorted(told.asked) == sorted(NAMES)
     for name in NAMES:
         assert models[name].size == pytest.approx(body(name, np.eye(4)).size, abs=1e-9)

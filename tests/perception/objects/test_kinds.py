@@ -31,8 +31,8 @@ class Marker:
         return {"kind": "marker", "name": self.name}, {"place": np.array([self.place])}
 
 
-def learn_markers(lesson):
-    return {name: Marker(name, 0.5) for name in lesson.names}
+def learn_markers(examples):
+    return {name: Marker(name, 0.5) for name in examples.names}
 
 
 def read_marker(fields, arrays, where):
@@ -42,7 +42,7 @@ def read_marker(fields, arrays, where):
 @pytest.fixture
 def marker(monkeypatch):
     for name in tuple(KINDS):
-        monkeypatch.setitem(KINDS, name, replace(KINDS[name], learn=lambda lesson: {}))
+        monkeypatch.setitem(KINDS, name, replace(KINDS[name], learn=lambda examples: {}))
     monkeypatch.setitem(KINDS, "marker", Kind("marker", learn_markers, read_marker))
 
 
@@ -64,12 +64,12 @@ def test_every_kind_is_written_under_a_name_of_the_table(known):
 def test_kinds_learn_in_turn_what_those_before_them_left(marker, monkeypatch):
     asked = {}
 
-    def learn_cups(lesson):
-        asked["before"] = list(lesson.names)
+    def learn_cups(examples):
+        asked["before"] = list(examples.names)
         return {"cup": Marker("cup", 0.1)}
 
-    def learn_rest(lesson):
-        asked["after"] = list(lesson.names)
+    def learn_rest(examples):
+        asked["after"] = list(examples.names)
         return {}
 
     monkeypatch.setitem(KINDS, "patches", replace(KINDS["patches"], learn=learn_cups))

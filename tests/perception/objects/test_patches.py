@@ -6,7 +6,7 @@ import json
 import cv2
 import numpy as np
 import pytest
-from tests.perception.builders import lesson, localise
+from tests.perception.builders import examples, localise
 from tests.perception.drawn_world import views_of
 
 from lerobot_openspm.errors import MemoryFormatError
@@ -15,7 +15,7 @@ from lerobot_openspm.perception.objects import store
 from lerobot_openspm.perception.objects.kinds import learn_objects
 from lerobot_openspm.perception.objects.patches.learn import learn_patches
 from lerobot_openspm.perception.objects.patches.model import PatchModel
-from lerobot_openspm.types import ContactCue, Scene
+from lerobot_openspm.types import ContactCue, DemonstrationScene
 
 MIDDLES = {"block": (0.02, -0.15, 0.4), "cup": (0.0, 0.15, 0.0), "distractor": (-0.02, 0.0, 0.0)}
 
@@ -34,7 +34,7 @@ def demonstration(rng):
     placed = poses(rng)
     grasp = placed["cup"][:3, 3] + [0.03, 0.0, 0.05] + rng.normal(0, 0.003, 3)
     release = placed["block"][:3, 3] + [0, 0, 0.12] + rng.normal(0, 0.003, 3)
-    return Scene(
+    return DemonstrationScene(
         views_of(placed), (ContactCue("cup", grasp, "grasp"), ContactCue("block", release, "release"))
     )
 
@@ -79,13 +79,13 @@ def several_tasks(n, T_moved=None):
         ContactCue("block", placed[1]["block"][:3, 3] + [0.0, 0.02, 0.04], "grasp", "second"),
     ]
     given = [(hints[i],) if i < len(hints) else () for i in range(n)]
-    return [Scene(views_of(T, m), g) for T, m, g in zip(placed, moved, given, strict=True)]
+    return [DemonstrationScene(views_of(T, m), g) for T, m, g in zip(placed, moved, given, strict=True)]
 
 
 @pytest.mark.parametrize("shift", [None, (0.008, -0.006, 0.004)])
 def test_one_demonstration_of_each_of_several_tasks_is_enough(unseen, shift):
     T_moved = None if shift is None else se3.transform(np.eye(3), np.array(shift))
-    models = learn_patches(lesson(["block", "cup"], several_tasks(10, T_moved)))
+    models = learn_patches(examples(["block", "cup"], several_tasks(10, T_moved)))
     for name in ("block", "cup"):
         assert place_errors(models[name], unseen, name).mean() < 0.002, name
 
@@ -94,18 +94,18 @@ def test_two_objects_never_follow_the_same_motion():
     scenes = several_tasks(10)
     hint = scenes[0].hints[0]
     twice = [dataclasses.replace(scenes[0], hints=(hint, dataclasses.replace(hint, name="mug"))), *scenes[1:]]
-    models = learn_patches(lesson(["block", "cup", "mug"], twice))
+    models = learn_patches(examples(["block", "cup", "mug"], twice))
     assert "block" in models
     assert len({"cup", "mug"} & set(models)) == 1
 
 
 def test_what_is_known_already_is_not_learned_again_under_another_name():
     scenes = several_tasks(10)
-    known = learn_patches(lesson(["cup"], scenes))["cup"]
+    known = learn_patches(examples(["cup"], scenes))["cup"]
     mug = dataclasses.replace(scenes[0].hints[0], name="mug")
     again = [dataclasses.replace(scenes[0], hints=(mug,)), *scenes[1:]]
-    assert "mug" in learn_patches(lesson(["mug"], again))
-    assert learn_patches(lesson(["mug"], again, [known])) == {}
+    assert "mug" in learn_patches(examples(["mug"], again))
+    assert learn_patches(examples(["mug"], again, [known])) == {}
 
 
 @pytest.mark.parametrize("noise", [0.001, 0.003])
@@ -115,8 +115,8 @@ def test_a_fixture_that_never_moves_is_known_by_patches(noise):
     for _ in range(8):
         placed = poses(rng) | {"block": se3.from_yaw([*MIDDLES["block"][:2], 0.0], MIDDLES["block"][2])}
         point = placed["block"][:3, 3] + [0.0, 0.02, 0.04] + rng.normal(0, noise, 3)
-        scenes.append(Scene(views_of(placed), (ContactCue("block", point, "grasp", "edge"),)))
-    block = learn_patches(lesson(["block"], scenes))["block"]
+        scenes.append(DemonstrationScene(views_of(placed), (ContactCue("block", point, "grasp", "edge"),)))
+    block = learn_patches(examples(["block"], scenes))["block"]
     found = [localise(scene.views, block) for scene in scenes]
     assert all(one.status == "found" for one in found)
     assert np.ptp([one.T_world_obj[:2, 3] for one in found], axis=0).max() < 0.001
@@ -130,7 +130,7 @@ def test_the_covariance_tells_how_far_off_places_are(models, unseen, name):
 
 
 def test_too_few_scenes_to_agree_teach_nothing():
-    assert learn_patches(lesson(["block", "cup"], several_tasks(4))) == {}
+    assert learn_patches(examples(["block", "cup"], several_tasks(4))) == {}
 
 
 def test_another_image_size_gives_the_same_place(models, unseen):

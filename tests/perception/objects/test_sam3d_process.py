@@ -57,6 +57,9 @@ def test_a_worker_that_misbehaves_is_one_error_and_no_process(tmp_path, seen, mo
     assert time.monotonic() - begun < 20
     assert not runs(pid(tmp_path))
     if mode == "hangs with a child":
+        # It is killed, but nobody waits for it: on a busy machine it may take a moment to end.
+        while runs(pid(tmp_path, "child")) and time.monotonic() - begun < 20:
+            time.sleep(0.05)
         assert not runs(pid(tmp_path, "child"))
     for part in (*parts, "fake_sam3d_worker.py", "--check"):
         assert part in str(caught.value)

@@ -19,7 +19,7 @@ from lerobot_openspm.geometry import se3
 from lerobot_openspm.geometry.camera import project
 from lerobot_openspm.geometry.se3 import Array
 from lerobot_openspm.perception.foreground import Bins, lab_bins
-from lerobot_openspm.types import Mask, PoseEstimate, Scene, Segmentation, Segmenter, Shape, View
+from lerobot_openspm.types import DemonstrationScene, Mask, PoseEstimate, Segmentation, Segmenter, Shape, View
 
 # Fingers close above the plane that objects stand on; where nothing else tells it, it is taken to lie this
 # far below the lowest point that they ever went to, metres.
@@ -188,7 +188,7 @@ class ShapeBackend(Protocol):
 
 
 @dataclass(frozen=True)
-class Lesson:
+class Examples:
     """What objects are learned from.
 
     Attributes:
@@ -202,7 +202,7 @@ class Lesson:
     """
 
     names: Sequence[str]
-    scenes: Sequence[Scene]
+    scenes: Sequence[DemonstrationScene]
     known: Collection[KnownObject]
     rng: Generator
     segmenter: Segmenter | None = None
@@ -221,11 +221,11 @@ class Kind:
 
     Attributes:
         name: As it is called in records.
-        learn: Learns the objects of a lesson that can be known this way; leaves the others out.
+        learn: From examples, the objects that can be known this way; leaves the others out.
         from_record: The object of a record's fields and arrays, all of them checked; the last argument names
             their origin in a MemoryFormatError.
     """
 
     name: str
-    learn: Callable[[Lesson], Mapping[str, KnownObject]]
+    learn: Callable[[Examples], Mapping[str, KnownObject]]
     from_record: Callable[[Mapping[str, Any], Mapping[str, NDArray[Any]], str], KnownObject]

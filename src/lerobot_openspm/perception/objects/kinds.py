@@ -8,18 +8,18 @@ from dataclasses import replace
 from numpy.random import Generator
 
 from lerobot_openspm.errors import DatasetError
-from lerobot_openspm.perception.objects.base import KnownObject, Lesson, ShapeBackend
+from lerobot_openspm.perception.objects.base import Examples, KnownObject, ShapeBackend
 from lerobot_openspm.perception.objects.box.learn import BOX
 from lerobot_openspm.perception.objects.patches.learn import PATCHES
 from lerobot_openspm.perception.objects.shape.learn import SHAPE
-from lerobot_openspm.types import Scene, Segmenter, Shape
+from lerobot_openspm.types import DemonstrationScene, Segmenter, Shape
 
 # In the order in which they are asked to learn: each gets the objects that those before it left.
 KINDS = {kind.name: kind for kind in (PATCHES, SHAPE, BOX)}
 
 
 def learn_objects(
-    scenes: Sequence[Scene],
+    scenes: Sequence[DemonstrationScene],
     rng: Generator,
     known: Collection[KnownObject] = (),
     segmenter: Segmenter | None = None,
@@ -50,9 +50,9 @@ def learn_objects(
             "no demonstration shows a grasp, contact or release; perception has nothing to learn from"
         )
     names = sorted(named - {one.name for one in known})
-    lesson = Lesson(names, scenes, known, rng, segmenter, source, shapes)
+    examples = Examples(names, scenes, known, rng, segmenter, source, shapes)
     learned: dict[str, KnownObject] = {}
     for kind in KINDS.values():
         left = [name for name in names if name not in learned]
-        learned |= kind.learn(replace(lesson, names=left))
+        learned |= kind.learn(replace(examples, names=left))
     return learned

@@ -11,7 +11,7 @@ from lerobot_openspm.geometry.camera import intersect_plane, project
 from lerobot_openspm.geometry.se3 import Array
 from lerobot_openspm.perception.foreground import Blob
 from lerobot_openspm.perception.objects.base import Instances
-from lerobot_openspm.types import ContactCue, Mask, Scene, Segmentation, Segmenter, View
+from lerobot_openspm.types import ContactCue, DemonstrationScene, Mask, Segmentation, Segmenter, View
 
 # By camera: one object's mask.
 ObjectMasks = dict[str, Segmentation]
@@ -77,8 +77,8 @@ def touched(
 
 
 def segmented(
-    phrases: Sequence[str], scenes: Sequence[Scene], segmenter: Segmenter
-) -> dict[str, list[tuple[Scene, Instances]]]:
+    phrases: Sequence[str], scenes: Sequence[DemonstrationScene], segmenter: Segmenter
+) -> dict[str, list[tuple[DemonstrationScene, Instances]]]:
     """By phrase, at most :data:`MAX_SCENES` scenes that hint at it, with what a segmenter found of it there.
 
     A scene is shown to the segmenter once, with all its phrases: large models encode an image once for all.
@@ -88,7 +88,7 @@ def segmented(
         hinted = [i for i, scene in enumerate(scenes) if any(hint.name == phrase for hint in scene.hints)]
         for i in hinted[:: max(1, -(-len(hinted) // MAX_SCENES))]:
             wanted.setdefault(i, []).append(phrase)
-    pairs: dict[str, list[tuple[Scene, Instances]]] = {phrase: [] for phrase in phrases}
+    pairs: dict[str, list[tuple[DemonstrationScene, Instances]]] = {phrase: [] for phrase in phrases}
     for i, names in sorted(wanted.items()):
         found = segmenter.segment(scenes[i].views, names)
         for name in names:

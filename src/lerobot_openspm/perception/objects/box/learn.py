@@ -11,9 +11,9 @@ import numpy as np
 from lerobot_openspm.geometry import se3
 from lerobot_openspm.perception.objects.base import (
     Appearance,
+    Examples,
     Instances,
     Kind,
-    Lesson,
     ObjectShape,
     ShapeBackend,
 )
@@ -23,7 +23,7 @@ from lerobot_openspm.perception.objects.box.model import BoxModel, box_period, f
 from lerobot_openspm.perception.objects.box.outline import OutlineFit, fit_outlines, outline
 from lerobot_openspm.perception.objects.mask_association import ObjectMasks, segmented, touched, whole_mask
 from lerobot_openspm.perception.objects.yaw import yaw_range
-from lerobot_openspm.types import Scene, Segmentation, View
+from lerobot_openspm.types import DemonstrationScene, Segmentation, View
 
 log = logging.getLogger(__name__)
 
@@ -66,32 +66,32 @@ class Seen:
         return float(np.median(heights)) if heights else floor
 
 
-def learn_boxes(lesson: Lesson) -> dict[str, BoxModel]:
+def learn_boxes(examples: Examples) -> dict[str, BoxModel]:
     """Learn the boxes of objects from where their demonstrations' first frames show them.
 
     The outlines of all an object's masks tell its size; for source "sam3d" the shape backend does, from the
     view that shows the object largest. One that is seen in no demonstration is left out, and the log says so.
     """
-    if lesson.segmenter is None or lesson.source == "demonstrations":
+    if examples.segmenter is None or examples.source == "demonstrations":
         return {}
-    floor, seen = lesson.floor, dict[str, list[Seen]]()
-    for name, pairs in segmented(lesson.names, lesson.scenes, lesson.segmenter).items():
+    floor, seen = examples.floor, dict[str, list[Seen]]()
+    for name, pairs in segmented(examples.names, examples.scenes, examples.segmenter).items():
         ones = [_see(scene, name, found, floor) for scene, found in pairs]
         if kept := [one for one in ones if one is not None]:
             seen[name] = kept
         else:
             log.warning("perception: no mask of %r near where the hand touched it", name)
-    if lesson.shapes is None:
+    if examples.shapes is None:
         trials = {name: _from_outlines(name, ones, floor) for name, ones in seen.items()}
     else:
-        trials = _described(seen, lesson.shapes)
+        trials = _described(seen, examples.shapes)
     return {name: _learn(trial, seen[name]) for name, trial in trials.items()}
 
 
 BOX = Kind(BoxModel.kind, learn_boxes, from_record)
 
 
-def _see(scene: Scene, name: str, instances: Instances, floor: float) -> Seen | None:
+def _see(scene: DemonstrationScene, name: str, instances: Instances, floor: float) -> Seen | None:
     hints = [hint for hint in scene.hints if hint.name == name]
     masks = {
         camera: Segmentation(blob.mask, one.confidence)

@@ -19,11 +19,11 @@ import numpy as np
 
 from lerobot_openspm.geometry.camera import project
 from lerobot_openspm.geometry.se3 import Array
-from lerobot_openspm.perception.objects.base import Kind, KnownObject, Lesson, Look
+from lerobot_openspm.perception.objects.base import Examples, Kind, KnownObject, Look
 from lerobot_openspm.perception.objects.patches.match import Patch, Probe, as_seen, cut, match
 from lerobot_openspm.perception.objects.patches.model import PatchModel, from_record
 from lerobot_openspm.perception.objects.patches.stillness import hardly_moving, places_of
-from lerobot_openspm.types import ContactCue, Scene, View
+from lerobot_openspm.types import ContactCue, DemonstrationScene, View
 
 # A place touched less often says nothing of how far its object moves.
 MIN_TOUCHES = 2
@@ -92,21 +92,21 @@ class _Candidate:
     """An object to learn: the scenes looked at, and its groups in them, the largest first."""
 
     name: str
-    scenes: Sequence[Scene]
+    scenes: Sequence[DemonstrationScene]
     groups: list[list[_Trail]]
 
 
-def learn_patches(lesson: Lesson) -> dict[str, PatchModel]:
+def learn_patches(examples: Examples) -> dict[str, PatchModel]:
     """Learn the objects that hardly move; where a segmenter finds the objects, none."""
-    if lesson.segmenter is not None:
+    if examples.segmenter is not None:
         return {}
-    scenes, still = lesson.scenes, hardly_moving(lesson.names, lesson.scenes, lesson.known)
-    candidates = [_candidate(name, scenes) for name in lesson.names if still[name] >= 0.5]
+    scenes, still = examples.scenes, hardly_moving(examples.names, examples.scenes, examples.known)
+    candidates = [_candidate(name, scenes) for name in examples.names if still[name] >= 0.5]
     # What many patches agree on is claimed first: what they follow is not another object.
     candidates.sort(key=lambda one: -max((len(group) for group in one.groups), default=0))
     learned: dict[str, PatchModel] = {}
     for one in candidates:
-        claimants = [*lesson.known, *learned.values()]
+        claimants = [*examples.known, *learned.values()]
         free = (group for group in one.groups if not _claimed(group[0], one.scenes, claimants))
         models = (_model(one.name, group, one.scenes) for group in free)
         if model := next((model for model in models if model is not None), None):
@@ -117,7 +117,7 @@ def learn_patches(lesson: Lesson) -> dict[str, PatchModel]:
 PATCHES = Kind(PatchModel.kind, learn_patches, from_record)
 
 
-def _candidate(name: str, scenes: Sequence[Scene]) -> _Candidate:
+def _candidate(name: str, scenes: Sequence[DemonstrationScene]) -> _Candidate:
     """Follow patches of all kinds at an object's touched places, and group those that agree."""
     own = [scene for scene in scenes if any(hint.name == name for hint in scene.hints)]
     others = [scene for scene in scenes if not any(hint.name == name for hint in scene.hints)]
@@ -142,7 +142,12 @@ def _spaced[T](things: Sequence[T], n: int) -> list[T]:
 
 
 def _follow(
-    place: int, first: int, camera: str, point_world: Array, radius: float, scenes: Sequence[Scene]
+    place: int,
+    first: int,
+    camera: str,
+    point_world: Array,
+    radius: float,
+    scenes: Sequence[DemonstrationScene],
 ) -> _Trail | None:
     """Cut a patch from one scene and find it in all; None where it is in too few."""
     view = scenes[first].views[camera]
@@ -227,7 +232,7 @@ def _residual(points: Array, hints: Sequence[ContactCue], places: Sequence[Seque
     return float(np.sqrt(squares / degrees)) if degrees else np.inf
 
 
-def _claimed(trail: _Trail, scenes: Sequence[Scene], known: Iterable[KnownObject]) -> bool:
+def _claimed(trail: _Trail, scenes: Sequence[DemonstrationScene], known: Iterable[KnownObject]) -> bool:
     """Whether a trail follows an object that is known by patches already."""
     size = float(np.nanmedian(np.linalg.norm(trail.motion, axis=1)))
     for model in known:
@@ -242,7 +247,7 @@ def _claimed(trail: _Trail, scenes: Sequence[Scene], known: Iterable[KnownObject
     return False
 
 
-def _model(name: str, group: Sequence[_Trail], scenes: Sequence[Scene]) -> PatchModel | None:
+def _model(name: str, group: Sequence[_Trail], scenes: Sequence[DemonstrationScene]) -> PatchModel | None:
     """The object that a group follows; None if it turns."""
     # Of one place, so that all know the same point of the object.
     kept = [trail for trail in group if trail.place == group[0].place]
@@ -259,7 +264,7 @@ def _model(name: str, group: Sequence[_Trail], scenes: Sequence[Scene]) -> Patch
     return PatchModel(name, tuple(probes), height, float(np.median([trail.correlation for trail in kept])))
 
 
-def _turns(trail: _Trail, scenes: Sequence[Scene]) -> bool:
+def _turns(trail: _Trail, scenes: Sequence[DemonstrationScene]) -> bool:
     """Whether the patch, turned either way, is found more clearly than as it is in many scenes."""
     patch, probe = trail.probe.patches[0], trail.probe
     height, width = patch.image.shape[:2]
@@ -279,7 +284,7 @@ def _turns(trail: _Trail, scenes: Sequence[Scene]) -> bool:
     return float(np.mean(better)) > TURN_SHARE
 
 
-def _references(trail: _Trail, scenes: Sequence[Scene]) -> tuple[Patch, ...]:
+def _references(trail: _Trail, scenes: Sequence[DemonstrationScene]) -> tuple[Patch, ...]:
     """The trail's patch, and the like from other scenes, as if all were seen from the first one's camera."""
     own, probe = trail.probe.patches[0], trail.probe
     followed = np.flatnonzero(np.isfinite(trail.points[:, 0]))

@@ -15,7 +15,7 @@ from scipy.stats import chi2
 
 from lerobot_openspm.perception.objects.base import KnownObject
 from lerobot_openspm.perception.objects.patches.model import PatchModel
-from lerobot_openspm.types import ContactCue, Scene
+from lerobot_openspm.types import ContactCue, DemonstrationScene
 
 # The hand's target moves with the object; if its standard deviation along an axis is below this, patches do.
 # It is that of a uniform distribution within 3 cm of the middle, about as far as a patch is sought.
@@ -23,7 +23,7 @@ MAX_STD_M = 0.03 / np.sqrt(3)
 
 
 def hardly_moving(
-    names: Sequence[str], scenes: Sequence[Scene], known: Collection[KnownObject] = ()
+    names: Sequence[str], scenes: Sequence[DemonstrationScene], known: Collection[KnownObject] = ()
 ) -> dict[str, float]:
     """Probability by name that an object hardly moves between demonstrations, given all touches.
 
@@ -46,7 +46,7 @@ def hardly_moving(
     return found
 
 
-def _hardly_moves(scenes: Sequence[Scene], name: str) -> float | None:
+def _hardly_moves(scenes: Sequence[DemonstrationScene], name: str) -> float | None:
     """Probability, by the touches of one object alone, that its standard deviation is small.
 
     The variance's posterior given n independent deviations is an inverse chi-squared distribution, where

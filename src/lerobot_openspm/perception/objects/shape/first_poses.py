@@ -18,7 +18,7 @@ from lerobot_openspm.perception.objects.shape import colour_bootstrap
 from lerobot_openspm.perception.objects.shape.colour_bootstrap import Picture
 from lerobot_openspm.perception.objects.shape.fitting import Evidence
 from lerobot_openspm.perception.objects.shape.hull import Posed
-from lerobot_openspm.types import Scene, View
+from lerobot_openspm.types import DemonstrationScene, View
 
 # Two rays that are to meet in an object may miss each other by this much, metres.
 MAX_RAY_GAP = 0.05
@@ -27,7 +27,7 @@ MAX_RAY_GAP = 0.05
 Patched = tuple[Evidence, Blob | None]
 
 
-def pictures_of(index: int, name: str, scene: Scene, floor: float) -> list[Picture]:
+def pictures_of(index: int, name: str, scene: DemonstrationScene, floor: float) -> list[Picture]:
     """A scene's views with the hints for one object and what changed when it was carried off."""
     hints = tuple(hint for hint in scene.hints if hint.name == name)
     look, later = Look(scene.views), scene.later_views or {}
@@ -53,7 +53,7 @@ def coloured(pictures: Sequence[Picture], log_odds: NDArray[np.float32]) -> dict
     return groups
 
 
-def masked(name: str, scene: Scene, floor: float, instances: Instances) -> list[Patched]:
+def masked(name: str, scene: DemonstrationScene, floor: float, instances: Instances) -> list[Patched]:
     """Each view's foreground by a segmenter: the instance that the hand touched, or nothing."""
     hints = [hint for hint in scene.hints if hint.name == name]
     seen = touched(scene.views, instances, hints, floor)

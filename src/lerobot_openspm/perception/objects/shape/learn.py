@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from lerobot_openspm.geometry import se3
 from lerobot_openspm.geometry.se3 import Array
-from lerobot_openspm.perception.objects.base import Kind, Lesson
+from lerobot_openspm.perception.objects.base import Examples, Kind
 from lerobot_openspm.perception.objects.mask_association import segmented
 from lerobot_openspm.perception.objects.shape import colour_bootstrap, hull
 from lerobot_openspm.perception.objects.shape.first_poses import (
@@ -37,7 +37,7 @@ from lerobot_openspm.perception.objects.shape.fitting import (
 from lerobot_openspm.perception.objects.shape.hull import Posed, Votes
 from lerobot_openspm.perception.objects.shape.model import ShapeModel, from_record
 from lerobot_openspm.perception.objects.yaw import search_range, yaw_range
-from lerobot_openspm.types import Scene, Segmenter
+from lerobot_openspm.types import DemonstrationScene, Segmenter
 
 log = logging.getLogger(__name__)
 
@@ -63,22 +63,24 @@ NEAR_YAWS = np.deg2rad([-30.0, -10.0, 10.0, 30.0])
 TURN_GAIN = 0.008
 
 
-def learn_shapes(lesson: Lesson) -> dict[str, ShapeModel]:
-    """Learn the shapes of a lesson's objects, from a segmenter's masks or from the objects' colours."""
-    if lesson.source != "demonstrations" and lesson.segmenter is not None:
+def learn_shapes(examples: Examples) -> dict[str, ShapeModel]:
+    """Learn the shapes of objects, from a segmenter's masks or from the objects' colours."""
+    if examples.source != "demonstrations" and examples.segmenter is not None:
         return {}
-    floor = min([lesson.floor, *(one.height for one in lesson.known)])
-    if lesson.segmenter is not None:
-        found = _learn_masked(lesson.names, lesson.scenes, floor, lesson.segmenter)
+    floor = min([examples.floor, *(one.height for one in examples.known)])
+    if examples.segmenter is not None:
+        found = _learn_masked(examples.names, examples.scenes, floor, examples.segmenter)
     else:
-        found = {name: _learn_coloured(name, lesson.scenes, floor, lesson.rng) for name in lesson.names}
+        found = {name: _learn_coloured(name, examples.scenes, floor, examples.rng) for name in examples.names}
     return {name: model for name, model in found.items() if model is not None}
 
 
 SHAPE = Kind(ShapeModel.kind, learn_shapes, from_record)
 
 
-def _learn_coloured(name: str, scenes: Sequence[Scene], floor: float, rng: Generator) -> ShapeModel | None:
+def _learn_coloured(
+    name: str, scenes: Sequence[DemonstrationScene], floor: float, rng: Generator
+) -> ShapeModel | None:
     """Colours and shape of an object from scenes with contact cues; None, with a warning, if in vain."""
     hinted = [i for i, scene in enumerate(scenes) if any(hint.name == name for hint in scene.hints)]
     if len(hinted) > MAX_SCENES:
@@ -89,7 +91,7 @@ def _learn_coloured(name: str, scenes: Sequence[Scene], floor: float, rng: Gener
 
 
 def _learn_masked(
-    names: Sequence[str], scenes: Sequence[Scene], floor: float, segmenter: Segmenter
+    names: Sequence[str], scenes: Sequence[DemonstrationScene], floor: float, segmenter: Segmenter
 ) -> dict[str, ShapeModel | None]:
     """Shapes of objects from a segmenter's masks."""
     models: dict[str, ShapeModel | None] = {}

@@ -38,11 +38,7 @@ Key = tuple[SubTask, ...]
 @lru_cache(KEPT_ENTRIES)
 def key_digest(key: Key) -> int:
     """A number below ``2**64`` that tells a key from others, the same on every machine."""
-    rows = [asdict(sub_task) for sub_task in key]
-    for row in rows:
-        if not row["words"]:
-            del row["words"]
-    text = json.dumps(rows, sort_keys=True)
+    text = json.dumps([asdict(sub_task) for sub_task in key], sort_keys=True)
     return int.from_bytes(hashlib.blake2b(text.encode(), digest_size=8).digest(), "little")
 
 
@@ -112,7 +108,7 @@ class OpenFile:
             raise MemoryFormatError(f"{self.path}: cannot be read: {error}; try again") from error
 
 
-class EntryBank(Sequence[MemoryEntry]):
+class StoredEntries(Sequence[MemoryEntry]):
     """Entries in a file, each read and checked when it is asked for.
 
     What is open stays readable when a newer memory takes the file's name. Reading raises MemoryFormatError
@@ -152,17 +148,17 @@ class EntryBank(Sequence[MemoryEntry]):
     @overload
     def __getitem__(self, index: int) -> MemoryEntry: ...
     @overload
-    def __getitem__(self, index: slice) -> EntryBank: ...
-    def __getitem__(self, index: int | slice) -> MemoryEntry | EntryBank:
+    def __getitem__(self, index: slice) -> StoredEntries: ...
+    def __getitem__(self, index: int | slice) -> MemoryEntry | StoredEntries:
         if isinstance(index, slice):
-            return EntryBank(self._file, self._start, self._columns, self.objects, self._rows[index])
+            return StoredEntries(self._file, self._start, self._columns, self.objects, self._rows[index])
         return self._entry(self._rows[index])
 
     def __iter__(self) -> Iterator[MemoryEntry]:
         # Without the cache: a pass over all entries must not hold them all, nor push out those in use.
         return (self._read(row) for row in self._rows)
 
-    def __deepcopy__(self, _: dict[int, Any]) -> EntryBank:
+    def __deepcopy__(self, _: dict[int, Any]) -> StoredEntries:
         return self  # nothing of it ever changes
 
     def __reduce__(self) -> tuple[Any, ...]:
@@ -214,14 +210,14 @@ class EntryBank(Sequence[MemoryEntry]):
         return entry
 
 
-def _reopened(path: Path, *rest: Any) -> EntryBank:
-    """A bank in another process."""
-    return EntryBank(OpenFile(path), *rest)
+def _reopened(path: Path, *rest: Any) -> StoredEntries:
+    """The entries in another process."""
+    return StoredEntries(OpenFile(path), *rest)
 
 
 def anchored_objects(entries: Sequence[MemoryEntry]) -> frozenset[str]:
     """Names of all objects that entries have key poses at."""
-    if isinstance(entries, EntryBank):
+    if isinstance(entries, StoredEntries):
         return entries.objects
     return frozenset(name for entry in entries for name in entry.objects)
 
@@ -257,7 +253,7 @@ def write_entries(file: BinaryIO, groups: Sequence[Sequence[MemoryEntry]]) -> Co
 
 
 def _lines(entries: Sequence[MemoryEntry]) -> Iterator[tuple[bytes, int, float]]:
-    if isinstance(entries, EntryBank):  # their lines are copied, not parsed
+    if isinstance(entries, StoredEntries):  # their lines are copied, not parsed
         return entries.lines()
     return ((entry_to_json(e), key_digest(e.key.sub_tasks), e.quality) for e in entries)
 

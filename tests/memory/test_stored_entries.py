@@ -15,36 +15,36 @@ from tests.memory.memory_files import edit_arrays, edit_entries, names
 
 from lerobot_openspm.errors import MemoryFormatError
 from lerobot_openspm.memory import io as module
-from lerobot_openspm.memory.bank import MAX_LINE_BYTES, EntryBank, key_digest
 from lerobot_openspm.memory.indexed_entries import IndexedEntries
 from lerobot_openspm.memory.io import read_memory, write_memory
 from lerobot_openspm.memory.retrieval import semantic_score
+from lerobot_openspm.memory.stored_entries import MAX_LINE_BYTES, StoredEntries, key_digest
 
 MANY = tuple(entry(source=f"local/demos#{i}", quality=i / 10) for i in range(10))
 
 
 @pytest.fixture
-def bank(tmp_path, monkeypatch):
+def entries(tmp_path, monkeypatch):
     monkeypatch.setattr(module, "READ_AT_LOAD", 5)
     write_memory(a_memory(entries=MANY), tmp_path)
     return read_memory(tmp_path).entries
 
 
-def test_a_large_memorys_entries_are_a_sequence_read_when_asked_for(bank):
-    assert isinstance(bank, EntryBank)
-    assert len(bank) == 10
-    assert same(tuple(bank), MANY)
-    assert same(bank[3], MANY[3])
-    assert same(bank[-1], MANY[-1])
-    assert bank[3] is bank[3]
-    assert same(tuple(bank[7:2:-2]), MANY[7:2:-2])
+def test_a_large_memorys_entries_are_a_sequence_read_when_asked_for(entries):
+    assert isinstance(entries, StoredEntries)
+    assert len(entries) == 10
+    assert same(tuple(entries), MANY)
+    assert same(entries[3], MANY[3])
+    assert same(entries[-1], MANY[-1])
+    assert entries[3] is entries[3]
+    assert same(tuple(entries[7:2:-2]), MANY[7:2:-2])
     with pytest.raises(IndexError):
-        _ = bank[10]
+        _ = entries[10]
 
 
-def test_it_can_be_copied_and_sent_to_other_processes(bank):
-    assert copy.deepcopy(bank) is bank
-    assert same(pickle.loads(pickle.dumps(bank[2:4]))[1], MANY[3])
+def test_it_can_be_copied_and_sent_to_other_processes(entries):
+    assert copy.deepcopy(entries) is entries
+    assert same(pickle.loads(pickle.dumps(entries[2:4]))[1], MANY[3])
 
 
 def test_superseded_entries_are_not_among_those_in_use(tmp_path, monkeypatch):
@@ -57,9 +57,9 @@ def test_superseded_entries_are_not_among_those_in_use(tmp_path, monkeypatch):
     assert same(tuple(read_memory(tmp_path).superseded), MANY[7:])
 
 
-def test_what_is_open_stays_readable_when_a_newer_memory_is_saved(bank, tmp_path):
+def test_what_is_open_stays_readable_when_a_newer_memory_is_saved(entries, tmp_path):
     write_memory(a_memory(), tmp_path)
-    assert same(tuple(bank), MANY)
+    assert same(tuple(entries), MANY)
 
 
 def test_an_entry_at_an_object_that_the_header_does_not_list_is_refused(tmp_path, monkeypatch):
@@ -79,12 +79,12 @@ def test_what_is_kept_to_find_entries_by_is_what_reading_them_would_say(tmp_path
     monkeypatch.setattr(module, "READ_AT_LOAD", 5)
     stove = entry("put the bowl on the stove", source="local/demos#10", quality=0.25)
     write_memory(a_memory(entries=(*MANY, stove), superseded=MANY[:1]), tmp_path)
-    bank = read_memory(tmp_path).entries
+    stored = read_memory(tmp_path).entries
     for some, entries in (
-        (bank, (*MANY, stove)),
-        (bank[8:], (*MANY[8:], stove)),
-        (bank[::-2], [*MANY, stove][::-2]),
-        (pickle.loads(pickle.dumps(bank[5:9])), MANY[5:9]),
+        (stored, (*MANY, stove)),
+        (stored[8:], (*MANY[8:], stove)),
+        (stored[::-2], [*MANY, stove][::-2]),
+        (pickle.loads(pickle.dumps(stored[5:9])), MANY[5:9]),
         (read_memory(tmp_path).superseded, MANY[:1]),
     ):
         assert some.keys.tolist() == [key_digest(one.key.sub_tasks) for one in entries]
@@ -111,7 +111,7 @@ def test_another_quality_or_key_than_the_entrys_is_refused(tmp_path, name, value
         read_memory(tmp_path)
 
 
-def test_saving_again_makes_equal_files(bank, tmp_path):
+def test_saving_again_makes_equal_files(entries, tmp_path):
     again = tmp_path / "again"
     write_memory(read_memory(tmp_path), again)
     assert [(again / name).read_bytes() for name in names(again)] == [
@@ -124,8 +124,8 @@ def test_one_entry_of_each_key_is_read_to_index_them(tmp_path, monkeypatch):
     made = synthetic_memory(300, np.random.default_rng(0))
     write_memory(made, tmp_path)
     read = []
-    text = EntryBank._text
-    monkeypatch.setattr(EntryBank, "_text", lambda bank, row: read.append(row) or text(bank, row))
+    text = StoredEntries._text
+    monkeypatch.setattr(StoredEntries, "_text", lambda entries, row: read.append(row) or text(entries, row))
     indexed = IndexedEntries(read_memory(tmp_path).entries)
     assert len(read) == len({entry.key.sub_tasks for entry in made.entries}) == 3
     asked = made.entries[150].key.sub_tasks
@@ -152,9 +152,9 @@ def test_a_line_that_is_too_long_is_refused_with_what_is_expected(tmp_path):
         read_memory(tmp_path)
 
 
-def test_a_file_truncated_after_it_was_loaded_is_an_error_and_no_crash(bank, tmp_path):
+def test_a_file_truncated_after_it_was_loaded_is_an_error_and_no_crash(entries, tmp_path):
     os.truncate(tmp_path / "memory.json", 5000)
-    for read in (lambda: bank[0], lambda: bank[9], lambda: list(bank[3:].lines())):
+    for read in (lambda: entries[0], lambda: entries[9], lambda: list(entries[3:].lines())):
         with pytest.raises(MemoryFormatError, match=r"entries\[\d\] is not what its digest says: truncated"):
             read()
 
