@@ -176,11 +176,11 @@ class OpenSPMPolicy(PreTrainedPolicy):
     # Learning.
 
     @property
-    def outcomes(self) -> list[bool | None]:
+    def successes(self) -> list[bool | None]:
         """Whether each running episode is seen to have done what was asked; None where that is not known."""
         return [episode.controller.state.succeeded for episode in self.episodes]
 
-    def report_outcomes(self, successes: Sequence[bool | None] | None = None) -> None:
+    def report_successes(self, successes: Sequence[bool | None] | None = None) -> None:
         """Tell how the running episodes ended, before the next :meth:`reset`; the memory learns from it.
 
         The quality of the entries that each episode was acted by changes, for later episodes and in what is
@@ -189,24 +189,24 @@ class OpenSPMPolicy(PreTrainedPolicy):
 
         Args:
             successes: For every environment whether its episode succeeded, None where that is not known; what
-                the policy has seen itself (:attr:`outcomes`) if not given.
+                the policy has seen itself (:attr:`successes`) if not given.
 
         Raises:
             OpenSPMError: There are more or fewer environments.
         """
-        successes = self.outcomes if successes is None else successes
+        successes = self.successes if successes is None else successes
         if len(successes) != len(self.episodes):
             raise OpenSPMError(
-                f"got {len(successes)} outcomes, but {len(self.episodes)} episodes are running; report one "
+                f"got {len(successes)} successes, but {len(self.episodes)} episodes are running; report one "
                 "for every environment, after acting and before reset()"
             )
-        outcomes = []
+        counted = []
         for episode, success in zip(self.episodes, successes, strict=True):
             if success is not None and not episode.is_reported:
                 episode.is_reported = True
-                outcomes += episode.controller.state.entry_outcomes(success)
-        if outcomes:
-            self.memory = self.require_memory().with_outcomes(outcomes)
+                counted += episode.controller.state.entry_successes(success)
+        if counted:
+            self.memory = self.require_memory().with_successes(counted)
 
     def _learn(self, dataset_meta: Any) -> TrainingSet:
         """Mine a dataset: the memory begins or goes on with it, and the flow model learns from it."""

@@ -35,7 +35,7 @@ PLATE, BOX = entry(source="local/demos#0"), entry("put the box in the bowl", sou
 def fared(success, used, ended, now, n_parts=2):
     """Successes by source, of parts that ended with some verdicts and one that is carried out now."""
     state = EpisodeState(parts=((),) * n_parts, part=len(ended), used=used, verdicts=ended, verdict=now)
-    return {one.source: done for one, done in state.entry_outcomes(success)}
+    return {one.source: done for one, done in state.entry_successes(success)}
 
 
 @pytest.mark.parametrize(
@@ -61,4 +61,4 @@ def test_a_part_that_was_never_begun_is_not_held_against_the_one_that_was_seen_t
 
 def test_an_entry_that_was_used_for_two_parts_counts_once_and_by_the_worse_one():
     assert fared(False, (PLATE, PLATE), (True,), False) == {PLATE.source: False}
-    assert len(EpisodeState(used=(PLATE, PLATE)).entry_outcomes(success=True)) == 1
+    assert len(EpisodeState(used=(PLATE, PLATE)).entry_successes(success=True)) == 1

@@ -8,7 +8,7 @@ from tests.memory.memories import SLIDE
 
 from lerobot_openspm.geometry import se3
 from lerobot_openspm.memory.merging import mean_pose, merge, merge_near_duplicates
-from lerobot_openspm.memory.quality import PRIOR_TRIALS, with_outcome
+from lerobot_openspm.memory.quality import PRIOR_TRIALS, with_success
 
 
 def shifted(steps, source="local/demos#0", **changes):
@@ -78,8 +78,8 @@ def test_merging_step_by_step_is_merging_at_once():
 
 
 def test_outcomes_are_pooled():
-    won = with_outcome(shifted([0] * 6, quality=0.8), True)
-    lost = with_outcome(with_outcome(shifted([0] * 6, quality=0.4), False), False)
+    won = with_success(shifted([0] * 6, quality=0.8), True)
+    lost = with_success(with_success(shifted([0] * 6, quality=0.4), False), False)
     merged = merge([won, lost])
     assert (merged.trials, merged.successes) == (3, 1)
     assert merged.quality == pytest.approx((0.6 * PRIOR_TRIALS + 1) / (PRIOR_TRIALS + 3))

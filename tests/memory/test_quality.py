@@ -1,13 +1,13 @@
 import pytest
 from tests.memory.builders import entry
 
-from lerobot_openspm.memory.quality import PRIOR_TRIALS, pooled_quality, prior_quality, with_outcome
+from lerobot_openspm.memory.quality import PRIOR_TRIALS, pooled_quality, prior_quality, with_success
 
 
 def after(quality, outcomes):
     rated = entry(quality=quality)
     for success in outcomes:
-        rated = with_outcome(rated, success)
+        rated = with_success(rated, success)
     return rated
 
 
@@ -34,6 +34,6 @@ def test_quality_stays_within_0_and_1_and_ends_at_the_rate_of_success():
 
 def test_nothing_else_changes():
     before = entry(quality=0.7)
-    rated = with_outcome(before, True)
+    rated = with_success(before, True)
     assert rated.key_poses is before.key_poses
     assert (rated.version, rated.source, rated.language) == (before.version, before.source, before.language)

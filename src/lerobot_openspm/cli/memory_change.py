@@ -18,7 +18,7 @@ from lerobot_openspm.memory.exchange import combined, read_import
 from lerobot_openspm.memory.io import changing, read_memory, write_memory
 from lerobot_openspm.memory.memory import Memory
 from lerobot_openspm.memory.merging import merge_near_duplicates
-from lerobot_openspm.memory.quality import with_outcome
+from lerobot_openspm.memory.quality import with_success
 
 MAX_NAMED = 20
 
@@ -155,7 +155,7 @@ def rate(args: list[str]) -> None:
     def rated(memory: Memory) -> Memory:
         nonlocal index
         index = _the_one(memory, config)
-        entries = (with_outcome(e, success) if i == index else e for i, e in enumerate(memory.entries))
+        entries = (with_success(e, success) if i == index else e for i, e in enumerate(memory.entries))
         return replace(memory, entries=tuple(entries))
 
     _, after = _changed(config.path, rated)

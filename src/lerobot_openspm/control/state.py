@@ -125,7 +125,7 @@ class EpisodeState:
         is_known = self.status is Status.DONE and all(verdict is True for verdict in self.verdicts)
         return self.verdict if is_known else None
 
-    def entry_outcomes(self, success: bool) -> list[tuple[MemoryEntry, bool]]:
+    def entry_successes(self, success: bool) -> list[tuple[MemoryEntry, bool]]:
         """How the entries fared that were acted by, each once, given whether the episode succeeded.
 
         A failure does not count for the parts that were seen to be done, but for all others that were begun.

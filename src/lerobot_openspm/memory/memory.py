@@ -13,7 +13,7 @@ from lerobot_openspm.errors import MemoryFormatError
 from lerobot_openspm.geometry.camera import Camera
 from lerobot_openspm.geometry.vector_layout import VectorLayout
 from lerobot_openspm.memory.entry import MemoryEntry
-from lerobot_openspm.memory.quality import with_outcome
+from lerobot_openspm.memory.quality import with_success
 from lerobot_openspm.memory.robot import RobotModel
 from lerobot_openspm.perception.objects.base import KnownObject
 
@@ -100,7 +100,7 @@ class Memory:
         kept = [e for e in self.entries if (e.source, e.language) != task]
         return replace(self, entries=(*kept, replace(entry, version=version)), superseded=(*old, *replaced))
 
-    def with_outcomes(self, outcomes: Iterable[tuple[MemoryEntry, bool]]) -> Memory:
+    def with_successes(self, successes: Iterable[tuple[MemoryEntry, bool]]) -> Memory:
         """This memory after some of its entries were acted by, each with whether it succeeded.
 
         All entries are read and kept, also those of a large memory (about 0.3 ms each).
@@ -109,10 +109,10 @@ class Memory:
         by_source: dict[str, list[int]] = defaultdict(list)
         for i, entry in enumerate(entries):
             by_source[entry.source].append(i)
-        for used, success in outcomes:
+        for used, success in successes:
             for i in by_source[used.source]:
                 if entries[i].version == used.version and _same_demonstration(entries[i], used):
-                    entries[i] = with_outcome(entries[i], success)
+                    entries[i] = with_success(entries[i], success)
                     break
         return replace(self, entries=tuple(entries))
 

@@ -11,7 +11,7 @@ from lerobot_openspm.memory.entry import MemoryEntry
 PRIOR_TRIALS = 5
 
 
-def with_outcome(entry: MemoryEntry, success: bool) -> MemoryEntry:
+def with_success(entry: MemoryEntry, success: bool) -> MemoryEntry:
     """An entry after it was acted by once more.
 
     ``r`` is the mean of a Beta distribution whose prior has the demonstrations' agreement as its mean and
