@@ -21,6 +21,7 @@ from lerobot_openspm.language.instruction import parse_instruction
 from lerobot_openspm.language.meaning import same_meaning
 from lerobot_openspm.memory.compose import plan_parts
 from lerobot_openspm.memory.entry import MemoryEntry, RetrievalKey
+from lerobot_openspm.memory.retrieval import read_instruction
 from lerobot_openspm.types import Reference, SubTask
 
 INSTRUCTIONS = Path(__file__).with_name("instructions")
@@ -122,7 +123,7 @@ def _elements() -> dict[str, tuple[SubTask, ...]]:
 def is_refused(row: Row, entries: Sequence[MemoryEntry]) -> bool:
     """Whether an instruction is not read, or nothing in the memory is about it."""
     try:
-        plan_parts(row["instruction"], entries)
+        plan_parts(row["instruction"], read_instruction(row["instruction"], entries), entries)
     except InstructionError:
         return True
     return False
@@ -131,7 +132,7 @@ def is_refused(row: Row, entries: Sequence[MemoryEntry]) -> bool:
 def is_first(row: Row, entries: Sequence[MemoryEntry]) -> bool:
     """Whether the best entries for a paraphrase are all of its original's meaning."""
     try:
-        found = plan_parts(row["paraphrase"], entries)
+        found = plan_parts(row["paraphrase"], read_instruction(row["paraphrase"], entries), entries)
     except InstructionError:
         return False
     if len(found) != 1:

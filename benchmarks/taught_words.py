@@ -20,6 +20,7 @@ from lerobot_openspm.language.instruction import read_tasks
 from lerobot_openspm.memory.compose import plan_parts
 from lerobot_openspm.memory.entry import MemoryEntry
 from lerobot_openspm.memory.indexed_entries import known_names
+from lerobot_openspm.memory.retrieval import read_instruction
 from lerobot_openspm.memory.robot import RobotModel
 from lerobot_openspm.memory.schema import entry_from_json, entry_to_json
 from lerobot_openspm.mining.anchors import Demonstration
@@ -124,7 +125,7 @@ def acted_entries(
     """
     rated = [replace(one, quality=_MEANT_QUALITY if is_meant(one) else _RIVAL_QUALITY) for one in entries]
     try:
-        parts = plan_parts(instruction, rated)
+        parts = plan_parts(instruction, read_instruction(instruction, rated), rated)
     except InstructionError:
         return ()
     context = PlanningContext(rated, {}, ROBOT)

@@ -83,7 +83,7 @@ def search_memory(
     entries = near(asked, entries, score)
     refusal, plan = "", tuple[tuple[Candidate, ...], ...]()
     try:
-        plan = plan_parts(instruction, entries, names)
+        plan = plan_parts(instruction, asked, entries, names)
     except InstructionError as error:
         refusal = str(error)
     parts = tuple(_ranked(part, names) for part in plan)

@@ -5,6 +5,7 @@ import numpy as np
 from lerobot_openspm.geometry import se3
 from lerobot_openspm.language.instruction import read_task
 from lerobot_openspm.language.names import TABLE_NAMES
+from lerobot_openspm.memory.compose import plan_parts
 from lerobot_openspm.memory.entry import Anchor, MemoryEntry, MemoryKeyPose, RetrievalKey
 from lerobot_openspm.memory.retrieval import candidates_for, read_instruction
 from lerobot_openspm.memory.robot import RobotModel
@@ -67,3 +68,8 @@ def entry(instruction="put the bowl on the plate", key_poses=None, object_poses=
 def semantic_candidates(instruction, entries, names=TABLE_NAMES):
     """Entries that are about all that an instruction says, with their semantic score."""
     return candidates_for(read_instruction(instruction, entries), instruction, entries, names)
+
+
+def planned(instruction, entries):
+    """By what an instruction is carried out, part by part."""
+    return plan_parts(instruction, read_instruction(instruction, entries), entries)

@@ -4,11 +4,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from tests.memory.builders import entry, hand_pose, key_pose, pick_and_place
+from tests.memory.builders import entry, hand_pose, key_pose, pick_and_place, planned
 
 from lerobot_openspm.errors import InstructionError
 from lerobot_openspm.geometry import se3
-from lerobot_openspm.memory.compose import parts, plan_parts, sub_task_index
+from lerobot_openspm.memory.compose import parts, sub_task_index
 from lerobot_openspm.types import SubTask
 
 DRAWER = "open the top drawer and put the bowl inside"
@@ -80,7 +80,7 @@ def test_a_sub_task_takes_two_transitions_and_leaving_is_part_of_it(contact, pha
 
 
 def languages(instruction, *entries):
-    return [[one.entry.language for one in part] for part in plan_parts(instruction, entries)]
+    return [[one.entry.language for one in part] for part in planned(instruction, entries)]
 
 
 PLATE, STOVE = (
@@ -107,18 +107,18 @@ def test_what_was_demonstrated_as_a_whole_wins():
 
 def test_a_part_of_something_else_is_experience_too_and_remembers_its_source():
     whole = drawer_entry()
-    ((only,),) = plan_parts("open the top drawer of the cabinet", [whole, PLATE])
+    ((only,),) = planned("open the top drawer of the cabinet", [whole, PLATE])
     assert only.source is whole
     assert only.semantic == pytest.approx(1)
     assert only.entry.key.phases == ("approach", "grasp", "open", "release", "retreat")
-    first, second = plan_parts("open the top drawer and put the bowl on the plate", [whole, PLATE])
+    first, second = planned("open the top drawer and put the bowl on the plate", [whole, PLATE])
     assert first[0].source is whole
     assert second[0].source is second[0].entry is PLATE
 
 
 def test_a_part_without_experience_is_named():
     with pytest.raises(InstructionError) as caught:
-        plan_parts("put the bowl on the plate and put the mug on the plate", [PLATE, drawer_entry()])
+        planned("put the bowl on the plate and put the mug on the plate", [PLATE, drawer_entry()])
     message = str(caught.value)
     assert message.startswith("'put the mug on the plate' is a part of")
     assert "open the top drawer of the cabinet; put the bowl in the top drawer of the cabinet" in message
@@ -127,9 +127,9 @@ def test_a_part_without_experience_is_named():
 @pytest.mark.parametrize("instruction", ["put the mug on the plate", "dance"])
 def test_a_single_instruction_without_experience_is_refused_as_ever(instruction):
     with pytest.raises(InstructionError, match=instruction):
-        plan_parts(instruction, [PLATE])
+        planned(instruction, [PLATE])
     with pytest.raises(InstructionError):
-        plan_parts("put the bowl on the plate and turn on the stove", [])
+        planned("put the bowl on the plate and turn on the stove", [])
 
 
 def test_what_may_mean_different_things_is_asked_back_alone_and_as_a_part():
@@ -138,8 +138,8 @@ def test_what_may_mean_different_things_is_asked_back_alone_and_as_a_part():
     middle = entry("open the middle drawer of the cabinet", opened(), cabinet)
     for instruction in ("open the drawer", "open the drawer and turn on the stove"):
         with pytest.raises(InstructionError, match="did you mean"):
-            plan_parts(instruction, [top, middle, STOVE])
-        assert plan_parts(instruction, [top, STOVE])[0][0].source is top
+            planned(instruction, [top, middle, STOVE])
+        assert planned(instruction, [top, STOVE])[0][0].source is top
 
 
 def test_parts_can_be_carried_over_to_a_scene():
@@ -157,18 +157,18 @@ WIPE, SINK = "wipe the table with the sponge", "put the sponge in the sink"
 def test_what_the_grammar_cannot_read_is_carried_out_sentence_by_sentence():
     entries = [entry(WIPE, source="wipe"), entry(SINK, source="sink")]
     for asked in (f"{WIPE}, and then {SINK}", f"Please {WIPE}. Then {SINK}!", f"{WIPE} and {SINK}"):
-        chain = plan_parts(asked, entries)
+        chain = planned(asked, entries)
         assert [[one.source.source for one in part] for part in chain] == [["wipe"], ["sink"]]
-    chain = plan_parts(f"{SINK} and {WIPE}", entries)
+    chain = planned(f"{SINK} and {WIPE}", entries)
     assert [[one.source.source for one in part] for part in chain] == [["sink"], ["wipe"]]
     for asked in (f"sing, then {SINK}", f"{WIPE} and then sing", f"do not {WIPE}, then {SINK}"):
         with pytest.raises(InstructionError, match="it knows"):
-            plan_parts(asked, entries)
+            planned(asked, entries)
 
 
 def test_an_instruction_kept_by_its_words_is_one_part_however_much_it_moved():
     shown = entry("set the table")
     two = replace(shown, key=replace(shown.key, sub_tasks=shown.key.sub_tasks * 2))
-    ((one,),) = plan_parts("please set the table", [two])
+    ((one,),) = planned("please set the table", [two])
     assert (one.entry, one.asked, one.semantic) == (two, two.key.sub_tasks, 1.0)
     assert parts(two) == (two,)

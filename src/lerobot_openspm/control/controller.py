@@ -22,6 +22,7 @@ from lerobot_openspm.errors import InstructionError
 from lerobot_openspm.geometry.se3 import Array
 from lerobot_openspm.memory.compose import plan_parts
 from lerobot_openspm.memory.entry import Outcome
+from lerobot_openspm.memory.retrieval import read_instruction
 from lerobot_openspm.perception.tracking.tracker import TrackStatus
 from lerobot_openspm.types import Detections, Hand
 
@@ -119,10 +120,11 @@ class EpisodeController:
 
     def _look_for_plan(self, hand: Hand) -> LookRequest | None:
         """Look for the objects of the present part, and of those to come, which it may hide."""
-        state, scene = self.state, self.scene
+        state, scene, context = self.state, self.scene, self._context
         if not state.parts:
             try:
-                state.parts = plan_parts(self.instruction, self._context.entries, self._context.names)
+                asked = read_instruction(self.instruction, context.entries, context.names)
+                state.parts = plan_parts(self.instruction, asked, context.entries, context.names)
             except InstructionError as error:
                 return self._refuse(error)
             state.start_height = float(hand.T_world_ee[2, 3])

@@ -11,10 +11,11 @@ from lerobot_openspm.language.phrases import (
     PLACE_OF_RELATION,
     WHICH,
     Noun,
-    Preposition,
+    Phrase,
     match_preposition,
     read_noun,
     read_nouns,
+    split_phrases,
 )
 from lerobot_openspm.language.sentences import Clause, has_object
 from lerobot_openspm.types import Reference
@@ -45,35 +46,122 @@ class Said:
 
 
 @dataclass(frozen=True)
-class _Phrase:
-    """A preposition with the words after it."""
+class Told:
+    """The verb of a clause, and the words that it holds for.
 
-    preposition: Preposition
+    Attributes:
+        verb: The verb; where none is said, what is meant to be done.
+        words: What it is done to, with the phrases behind it.
+        is_state: See :class:`Said`.
+        is_same: Whether all but the thing is as in the clause before.
+        goes_on: Whether the verb is that of the clause before.
+    """
+
+    verb: Verb
     words: Words
+    is_state: bool = False
+    is_same: bool = False
+    goes_on: bool = False
 
 
-def read_clause(lex: Lexicon, clause: Clause, before: Said | None) -> Said:
-    """Read one clause; `before` is the clause before it, whose verb may hold here too.
+def find_verb(lex: Lexicon, clause: Clause, before: Said | None) -> Told:
+    """Find what is done in a clause; `before` is the clause before it, whose verb may hold here too.
 
     Raises:
-        InstructionError: It has no verb, or nothing that it is done to.
+        InstructionError: It has no verb.
     """
     words = clause.words
     if clause.is_same and before is not None:
-        return replace(before, targets=tuple(read_nouns(lex, words)))
+        return Told(_unsaid(""), words, is_same=True)
     if not clause.is_seen:
         words = _verb_first(lex, words)
         forms: tuple[Form, ...] = ("base", "gerund", "participle") if clause.is_done else ("base", "gerund")
         if verb := lex.match_verb(words, 0, *forms):
-            said = _read_verb(lex, verb, words[verb.length :])
-            lifts = verb.word == "slide" and said.relation in _LIFTING_RELATIONS
-            return replace(said, operation="put") if lifts else said
-    said = _without_verb(lex, clause, words, before)
-    if said is not None:
-        return said
+            return Told(verb, words[verb.length :])
+    if told := _without_verb(lex, clause, words, before):
+        return told
     if clause.is_seen or words[0] in lex.determiners or len(words) == 1 or WHICH in words:
-        return _topic(lex, words)  # "the bowl is on the plate", or a thing alone
+        return Told(_unsaid(""), _spoken_of(lex, words))  # "the bowl is on the plate", or a thing alone
     raise InstructionError(f"has no verb I know in {' '.join(words)!r} (such as {_USUAL_VERBS})")
+
+
+def read_phrases(lex: Lexicon, told: Told, before: Said | None) -> Said:
+    """Read what is done to what, and where that goes; `before` is the clause before.
+
+    Raises:
+        InstructionError: Nothing is named that it is done to, or a noun phrase cannot be read.
+    """
+    if told.is_same and before is not None:
+        return replace(before, targets=tuple(read_nouns(lex, told.words)))
+    operation, words = _operation(lex, told)
+    head, *phrases = split_phrases(lex, words)
+    if not operation:
+        return Said("", (_which(lex, read_noun(lex, head.words), phrases[:1]),))
+    targets = tuple(read_nouns(lex, head.words)) or (IMPLIED,)
+    if not all(noun.name or noun.pronoun for noun in targets):
+        raise InstructionError(f"names no object after {operation!r}")
+    if _may_open(told.verb) and words == told.words:
+        drawer = _which(lex, targets[-1], phrases)
+        if drawer.part and drawer.where is None:
+            return Said("open", (drawer,), is_state=told.is_state)
+        operation = _own_operation(told.verb)
+    at = _goal_at(operation, phrases)
+    sources = [phrase for phrase in phrases[at + 1 :] if phrase.preposition.is_source]
+    targets = (*targets[:-1], _which(lex, targets[-1], [*phrases[:at], *sources]))
+    if at == len(phrases):
+        is_taken = operation == "put" and any(phrase.preposition.is_source for phrase in phrases)
+        said = Said("pick" if is_taken else operation, targets)  # "bring the bowl down from the cabinet"
+    else:
+        relation, noun = _goal(lex, phrases[at])
+        after = [phrase for phrase in phrases[at + 1 :] if not phrase.preposition.is_source]
+        said = Said(operation, targets, relation, _which(lex, noun, after))
+    if told.verb.word == "slide" and said.relation in _LIFTING_RELATIONS and not told.is_state:
+        return replace(said, operation="put")
+    if told.goes_on and before is not None:
+        return _of_other_place(said, before)
+    return replace(said, is_state=told.is_state)
+
+
+def _operation(lex: Lexicon, told: Told) -> tuple[str, Words]:
+    """What a verb means, which may be split around its object: "turn the stove on"; and the words left."""
+    verb, words = told.verb, told.words
+    end = words[-1] if len(words) > 1 else ""
+    if verb.length == 1 and verb.word in lex.switches and end in ("on", "off"):
+        return f"turn {end}", words[:-1]
+    if verb.length == 1 and verb.word in lex.motions:
+        if end in lex.results:
+            return lex.results[end], words[:-1]
+        thing = words[:-2] if words[-2:-1] == ("back",) else words[:-1]
+        if end in lex.drawer_results and read_noun(lex, thing).part:
+            return lex.drawer_results[end], thing
+    return "open" if _may_open(verb) else _own_operation(verb), words
+
+
+def _may_open(verb: Verb) -> bool:
+    """Whether a verb opens what has a part to open: "pull the top drawer"."""
+    return verb.length == 1 and verb.word in ("pull", "draw")
+
+
+def _own_operation(verb: Verb) -> str:
+    """What a verb means by itself."""
+    if verb.operation == HALF_A_VERB:
+        raise InstructionError(
+            f"has no verb I know in {verb.word!r} alone; say what becomes of it: open, on, off"
+        )
+    return verb.operation
+
+
+def _goal(lex: Lexicon, phrase: Phrase) -> tuple[str, Noun]:
+    """The relation and the landmark that a phrase says."""
+    relation = phrase.preposition.relation
+    noun = read_noun(lex, phrase.words) if phrase.words else Noun(pronoun="there")
+    if relation == "center":
+        relation = "on"  # "in the middle of the plate"
+    elif relation == "at" and noun.part:
+        relation = "in"  # "to the right compartment"
+    if phrase.preposition.is_inside and (part := lex.parts_by_place.get(lex.kind(noun.name))):
+        return "in", replace(noun, part=f"{PLACE_OF_RELATION[relation]} {part}")
+    return relation, noun
 
 
 def _verb_first(lex: Lexicon, words: Words) -> Words:
@@ -88,15 +176,13 @@ def _verb_first(lex: Lexicon, words: Words) -> Words:
     return words
 
 
-def _topic(lex: Lexicon, words: Words) -> Said:
+def _spoken_of(lex: Lexicon, words: Words) -> Words:
     at = next((i for i, word in enumerate(words) if word in ("is", "are")), len(words))
     has_phrase = any(match_preposition(lex, words, i) for i in range(at, len(words) - 1))
-    words = (*words[:at], *words[at + 1 :]) if has_phrase else words[:at]  # "the drawer is open"
-    head, *phrases = _phrases(lex, words)
-    return Said("", (_which(lex, read_noun(lex, head.words), phrases[:1]),))
+    return (*words[:at], *words[at + 1 :]) if has_phrase else words[:at]  # "the drawer is open"
 
 
-def _without_verb(lex: Lexicon, clause: Clause, words: Words, before: Said | None) -> Said | None:
+def _without_verb(lex: Lexicon, clause: Clause, words: Words, before: Said | None) -> Told | None:
     """Read "the soup goes in the basket", "the bowl should be put on the plate", "the stove on"."""
     if words[0] in ("could", "would") and words[1:]:
         words = words[1:]
@@ -112,7 +198,7 @@ def _without_verb(lex: Lexicon, clause: Clause, words: Words, before: Said | Non
     return _verbless(lex, clause, words, before)
 
 
-def _predicate(lex: Lexicon, clause: Clause, words: Words, at: int) -> Said | None:
+def _predicate(lex: Lexicon, clause: Clause, words: Words, at: int) -> Told | None:
     """Read a subject and, from a word on, what it is to be: "the bowl | should be put on the plate"."""
     end = at
     while end < len(words) and words[end] in lex.auxiliaries and words[end + 1 : end + 2] != ("the",):
@@ -122,25 +208,26 @@ def _predicate(lex: Lexicon, clause: Clause, words: Words, at: int) -> Said | No
     is_told = bool(set(words[at:end]) & lex.modals) or clause.is_done or clause.is_wanted
     subject, rest = words[:at], words[end:]
     if rest[:1] and rest[0] in lex.goes:
-        return _read(lex, "put", subject, rest[1:])
+        return Told(_unsaid("put"), (*subject, *rest[1:]))
     return _state(lex, subject, rest) if is_told and rest else None
 
 
-def _verbless(lex: Lexicon, clause: Clause, words: Words, before: Said | None) -> Said | None:
+def _verbless(lex: Lexicon, clause: Clause, words: Words, before: Said | None) -> Told | None:
     """Read a thing and where it goes: "and the bottle on the rack", "ketchup into the basket"."""
     relations = [i for i in range(1, len(words)) if match_preposition(lex, words, i)]
     if not relations:
         return None
     if before is not None and before.operation in ("put", "push"):
-        return _of_other_place(lex, _read(lex, before.operation, words, ()), before)
+        return Told(_unsaid(before.operation), words, goes_on=True)
     last = match_preposition(lex, words, relations[-1])
     is_thing = relations[0] == 1 or words[0] in lex.determiners
     if not clause.is_wanted and not (last and last.is_goal and is_thing):
         return None
-    said = _read(lex, "put", words, ())
-    if said.landmark is None and WHICH in words:  # "I'd like the bottle standing on the cabinet"
-        return _read(lex, "put", tuple(word for word in words if word != WHICH), ())
-    return said
+    told = Told(_unsaid("put"), words)
+    if WHICH in words and read_phrases(lex, told, before).landmark is None:
+        # "I'd like the bottle standing on the cabinet"
+        return replace(told, words=tuple(word for word in words if word != WHICH))
+    return told
 
 
 def _is_participle(lex: Lexicon, words: Words, at: int) -> bool:
@@ -150,7 +237,7 @@ def _is_participle(lex: Lexicon, words: Words, at: int) -> bool:
     return end > at and (end == len(words) or match_preposition(lex, words, end) is not None)
 
 
-def _of_other_place(lex: Lexicon, said: Said, before: Said) -> Said:
+def _of_other_place(said: Said, before: Said) -> Said:
     """Complete "and the other mug on the right", after "the mug on the left plate"."""
     where = said.targets[-1].where
     if said.landmark is not None or before.landmark is None or where is None or where.landmarks:
@@ -161,118 +248,24 @@ def _of_other_place(lex: Lexicon, said: Said, before: Said) -> Said:
     )
 
 
-def _state(lex: Lexicon, subject: Words, rest: Words) -> Said | None:
+def _state(lex: Lexicon, subject: Words, rest: Words) -> Told | None:
     """What is to be done so that a subject is as said: "open", "on", "placed on it", "on the plate"."""
     at = next((i for i, word in enumerate(rest[:-1]) if word not in lex.stands | lex.goes), len(rest) - 1)
-    said = _made(lex, subject, rest[at:])
-    return None if said is None else replace(said, is_state=True)
-
-
-def _made(lex: Lexicon, subject: Words, rest: Words) -> Said | None:
+    rest = rest[at:]
     if verb := lex.match_verb(rest, 0, "participle", "gerund"):
-        return _read_verb(lex, verb, (*subject, *rest[verb.length :]))
-    if rest in (("on",), ("off",)):
-        return _read(lex, f"turn {rest[0]}", subject, ())
-    if " ".join(rest) in lex.results:
-        return _read(lex, lex.results[" ".join(rest)], subject, ())
-    return _read(lex, "put", subject, rest) if match_preposition(lex, rest, 0) else None
+        return Told(verb, (*subject, *rest[verb.length :]), is_state=True)
+    if operation := f"turn {rest[0]}" if rest in (("on",), ("off",)) else lex.results.get(" ".join(rest)):
+        return Told(_unsaid(operation), subject, is_state=True)
+    is_place = match_preposition(lex, rest, 0) is not None
+    return Told(_unsaid("put"), (*subject, *rest), is_state=True) if is_place else None
 
 
-def _read_verb(lex: Lexicon, verb: Verb, rest: Words) -> Said:
-    """Read what follows a verb; it may be split around its object: "turn the stove on"."""
-    end = rest[-1] if len(rest) > 1 else ""
-    if verb.length == 1 and verb.word in lex.switches and end in ("on", "off"):
-        return _read(lex, f"turn {end}", rest[:-1], ())
-    if verb.word in lex.motions and verb.length == 1:
-        if end in lex.results:
-            return _read(lex, lex.results[end], rest[:-1], ())
-        thing = rest[:-2] if rest[-2:-1] == ("back",) else rest[:-1]
-        if end in lex.drawer_results and read_noun(lex, thing).part:
-            return _read(lex, lex.drawer_results[end], thing, ())
-        drawer = _read(lex, "open", rest, ()).targets[-1] if verb.word in ("pull", "draw") else IMPLIED
-        if drawer.part and drawer.where is None:
-            return Said("open", (drawer,))
-    if verb.operation == HALF_A_VERB:
-        raise InstructionError(
-            f"has no verb I know in {verb.word!r} alone; say what becomes of it: open, on, off"
-        )
-    return _read(lex, verb.operation, rest, ())
+def _unsaid(operation: str) -> Verb:
+    """What is meant where no verb is said; "" for what is only spoken of."""
+    return Verb(operation, "", 0)
 
 
-def _read(lex: Lexicon, operation: str, words: Words, more: Words) -> Said:
-    """Read what something is done to, and the phrases behind it."""
-    head, *phrases = _phrases(lex, (*words, *more))
-    targets = tuple(read_nouns(lex, head.words)) or (IMPLIED,)
-    if any(not noun.name and not noun.pronoun for noun in targets):
-        raise InstructionError(f"names no object after {operation!r}")
-    at = _goal_at(operation, phrases)
-    sources = [phrase for phrase in phrases[at + 1 :] if phrase.preposition.is_source]
-    targets = (*targets[:-1], _which(lex, targets[-1], [*phrases[:at], *sources]))
-    if at == len(phrases):
-        is_taken = operation == "put" and any(phrase.preposition.is_source for phrase in phrases)
-        return Said("pick" if is_taken else operation, targets)  # "bring the bowl down from the cabinet"
-    goal, relation = phrases[at], phrases[at].preposition.relation
-    noun = read_noun(lex, goal.words) if goal.words else Noun(pronoun="there")
-    if relation == "center":
-        relation = "on"  # "in the middle of the plate"
-    elif relation == "at" and noun.part:
-        relation = "in"  # "to the right compartment"
-    if goal.preposition.is_inside and (part := lex.parts_by_place.get(lex.kind(noun.name))):
-        noun, relation = replace(noun, part=f"{PLACE_OF_RELATION[relation]} {part}"), "in"
-    after = [phrase for phrase in phrases[at + 1 :] if not phrase.preposition.is_source]
-    return Said(operation, targets, relation, _which(lex, noun, after))
-
-
-def _phrases(lex: Lexicon, words: Words) -> list[_Phrase]:
-    """Split words at their prepositions; the first phrase has none.
-
-    A part is joined with the phrase that says where on its thing it is: "the compartment at the back of the
-    caddy" becomes "the back compartment of the caddy".
-    """
-    found: list[_Phrase] = []
-    preposition, start = Preposition(""), 0
-    for i in range(len(words) + 1):
-        following = match_preposition(lex, words, i) if start <= i < len(words) else None
-        if i < start or (following is None and i < len(words)):
-            continue
-        piece = _without_particles(lex, words[start:i])
-        before = found[-1].words if found else ()
-        if together := _part_and_place(lex, before, preposition, piece):
-            found[-1] = _Phrase(found[-1].preposition, together)
-        else:
-            found.append(_Phrase(preposition, piece))
-        if following is not None:
-            preposition, start = following, i + following.length
-    return found
-
-
-def _without_particles(lex: Lexicon, words: Words) -> Words:
-    while words and (words[-1] in lex.particles - {"right", "back"} or words[-1] == ","):
-        words = words[:-1]
-    while words and words[0] in ("up", "down", "over", ","):
-        words = words[1:]
-    return words
-
-
-def _part_and_place(lex: Lexicon, words: Words, preposition: Preposition, following: Words) -> Words:
-    """Join a part with where it is; nothing where a phrase says something else."""
-    head = lex.singular(words[-1]) if words else ""
-    is_part = head in lex.parts or head in lex.part_synonyms or head in lex.named_parts
-    has_place = any(map(lex.is_position, words)) or "of" in words or "'s" in words
-    place = preposition.place or PLACE_OF_RELATION.get(preposition.relation, "")
-    if not is_part or preposition.is_goal or preposition.is_source:
-        return ()
-    is_owner = bool(following) and lex.kind(lex.singular(following[-1])) in ("cabinet", "caddy")
-    if is_owner and (preposition.relation == "in" or (preposition.relation == "on" and has_place)):
-        return (*words, "of", *following)
-    if has_place or not place:
-        return ()
-    if preposition.place or (preposition.relation == "on" and not following):  # "the drawer on top"
-        return (*words[:-1], place, words[-1])
-    return (*words[:-1], place, words[-1], "of", *following) if following and head != "shelf" else ()
-
-
-def _goal_at(operation: str, phrases: list[_Phrase]) -> int:
+def _goal_at(operation: str, phrases: list[Phrase]) -> int:
     """Which phrase says where the target goes; behind the last if none does."""
     said = [(i, phrase.preposition) for i, phrase in enumerate(phrases)]
     free = [(i, one) for i, one in said if not (one.place or one.is_source or one.is_relative)]
@@ -287,7 +280,7 @@ def _goal_at(operation: str, phrases: list[_Phrase]) -> int:
     return supporting[-1] if supporting else free[-1][0]
 
 
-def _which(lex: Lexicon, noun: Noun, phrases: list[_Phrase]) -> Noun:
+def _which(lex: Lexicon, noun: Noun, phrases: list[Phrase]) -> Noun:
     """Give a noun the phrase that tells which of several it is."""
     if not phrases:
         return noun

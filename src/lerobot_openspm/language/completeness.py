@@ -8,7 +8,7 @@ from itertools import pairwise
 
 from lerobot_openspm.language.lexicon import FORMS, Lexicon, Words
 from lerobot_openspm.language.phrases import Preposition, match_preposition
-from lerobot_openspm.language.wording import plain_words
+from lerobot_openspm.language.sentences import plain_words
 from lerobot_openspm.types import SubTask
 
 # Operations that say all of what becomes of a thing.
@@ -44,8 +44,10 @@ def says_all(lex: Lexicon, sub_tasks: Sequence[SubTask], instruction: str) -> bo
         return False
     moves = frozenset(sub_task.operation for sub_task in sub_tasks if not sub_task.landmark)
     ends = [i for i, word in enumerate(words) if word in (",", ";", "and", "then")]
-    pieces = (words[i + 1 : j] for i, j in pairwise([-1, *ends, len(words)]))
-    return all(_Piece(lex, piece, names, moves, goes).is_said() for piece in pieces)
+    for i, j in pairwise([-1, *ends, len(words)]):
+        if not _Piece(lex, words[i + 1 : j], names, moves, goes).is_said():
+            return False
+    return True
 
 
 def _is_another(lex: Lexicon, words: Words) -> bool:

@@ -161,8 +161,10 @@ class Lexicon:
 
     def longest(self, words: Words, at: int, phrases: Table | WordSet) -> str:
         """The longest of some phrases that begins at a word; "" if none does."""
-        found = (" ".join(words[at : at + n]) for n in range(min(_LONGEST, len(words) - at), 0, -1))
-        return next((phrase for phrase in found if phrase in phrases), "")
+        for n in range(min(_LONGEST, len(words) - at), 0, -1):
+            if (phrase := " ".join(words[at : at + n])) in phrases:
+                return phrase
+        return ""
 
     def number(self, words: str) -> int:
         """The number that words say from 2 on; 0 if they say none."""
@@ -203,7 +205,7 @@ class Lexicon:
         return self.short_names.get(short) or _replace_ending(short, self.aliases) or name
 
     @cached_property
-    def rewrites(self) -> dict[str, tuple[tuple[re.Pattern[str], str], ...]]:
+    def rewrites(self) -> dict[str, list[tuple[re.Pattern[str], str]]]:
         """Compiled rules by step: "spelling", "courtesies", "constructions"; what is "refused", and why."""
         greetings, headings = "|".join(self.greetings), "|".join(self.headings)
         # Before "of" is read as "belonging to", whatever names the memory has.
@@ -222,18 +224,14 @@ class Lexicon:
                 for reason in dict.fromkeys(self.refused.values())
             ],
         }
-        found = {
-            step: tuple((re.compile(self._expanded(pattern)), other) for pattern, other in pairs)
-            for step, pairs in rules.items()
-        }
-        return found
-
-    def _expanded(self, pattern: str) -> str:
-        """A pattern with its fragments in place of their names."""
         lists = {key: "|".join(sorted(getattr(self, key))) for key in ("colours", "surfaces")}
-        for name, fragment in {**self.fragments, **lists}.items():
-            pattern = pattern.replace(f"{{{name}}}", fragment)
-        return pattern
+        found: dict[str, list[tuple[re.Pattern[str], str]]] = {step: [] for step in rules}
+        for step, pairs in rules.items():
+            for pattern, other in pairs:
+                for name, fragment in {**self.fragments, **lists}.items():
+                    pattern = pattern.replace(f"{{{name}}}", fragment)
+                found[step].append((re.compile(pattern), other))
+        return found
 
 
 def _replace_ending(name: str, table: Table) -> str:

@@ -109,15 +109,12 @@ def semantic_score(
         return words_similarity(asked[0].words, known[0].words, names)
     if len(asked) != len(known) or not asked:
         return 0.0
-    best = _in_order(asked, known, names)
+    best = min([_sub_task_score(a, k, names) for a, k in zip(asked, known, strict=True)])
     if best < OTHER_ORDER and 1 < len(asked) <= MAX_REORDERED and _may_be_reordered(names.lexicon, asked):
-        reordered = max(_in_order(order, known, names) for order in permutations(asked))
-        best = max(best, OTHER_ORDER * reordered)
+        scores = [[_sub_task_score(a, k, names) for k in known] for a in asked]
+        for order in permutations(scores):
+            best = max(best, OTHER_ORDER * min([row[i] for i, row in enumerate(order)]))
     return best
-
-
-def _in_order(asked: Sequence[SubTask], known: Sequence[SubTask], names: NameSimilarity) -> float:
-    return min(_sub_task_score(a, k, names) for a, k in zip(asked, known, strict=True))
 
 
 def _may_be_reordered(lex: Lexicon, sub_tasks: Sequence[SubTask]) -> bool:
@@ -129,7 +126,9 @@ def _may_be_reordered(lex: Lexicon, sub_tasks: Sequence[SubTask]) -> bool:
 def _sub_task_score(asked: SubTask, known: SubTask, names: NameSimilarity) -> float:
     if asked.words or known.words:
         return 0.0  # one is read by the grammar, the other is not
-    score = names.similarity(asked.target, known.target) * _landmarks_agree(asked, known, names)
+    score = names.similarity(asked.target, known.target)
+    if asked.landmark or known.landmark:
+        score *= names.similarity(asked.landmark, known.landmark)
     if score == 0.0:
         return 0.0
     a, k = canonical(asked, names.lexicon), canonical(known, names.lexicon)
@@ -144,12 +143,6 @@ def _sub_task_score(asked: SubTask, known: SubTask, names: NameSimilarity) -> fl
         * _wheres_agree(a.target_where, k.target_where)
         * _wheres_agree(a.landmark_where, k.landmark_where)
     )
-
-
-def _landmarks_agree(asked: SubTask, known: SubTask, names: NameSimilarity) -> float:
-    if not asked.landmark and not known.landmark:
-        return 1.0
-    return names.similarity(asked.landmark, known.landmark)
 
 
 def _parts_agree(asked: str, known: str) -> float:

@@ -15,7 +15,7 @@ from functools import lru_cache
 from lerobot_openspm.errors import InstructionError
 from lerobot_openspm.language.lexicon import ENGLISH, Lexicon, Words
 from lerobot_openspm.language.names import NameSimilarity
-from lerobot_openspm.language.wording import plain_words, spelled
+from lerobot_openspm.language.sentences import plain_words, spelled
 from lerobot_openspm.types import OWN_WORDS, SubTask
 
 # One phrase fewer than the demonstration's instruction has: "wipe the table" for "... with the sponge".

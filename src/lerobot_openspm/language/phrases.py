@@ -89,9 +89,9 @@ def _place(lex: Lexicon, words: Words, at: int, length: int, goal: bool = False)
     end = at + length
     end += end < len(words) and words[end] in ("the", "its", "far", "very")
     end += end < len(words) and words[end] in ("far", "very")
-    if end >= len(words) or not lex.is_position(words[end]) or words[at:end] == ("on",):
+    place = lex.places.get(words[end]) or lex.heights.get(words[end]) if end < len(words) else ""
+    if not place or words[at:end] == ("on",):
         return None
-    place = lex.position(words[end])
     end += 1
     end += end < len(words) and words[end] == "hand"
     end += end < len(words) and words[end] in ("side", "edge", "end", "part")
@@ -101,6 +101,63 @@ def _place(lex: Lexicon, words: Words, at: int, length: int, goal: bool = False)
     if after and after != "," and match_preposition(lex, words, end) is None:
         return None  # "on the left plate"
     return Preposition("", place, length=end - at)
+
+
+@dataclass(frozen=True)
+class Phrase:
+    """A preposition with the words after it."""
+
+    preposition: Preposition
+    words: Words
+
+
+def split_phrases(lex: Lexicon, words: Words) -> list[Phrase]:
+    """Split words at their prepositions; the first phrase has none.
+
+    A part is joined with the phrase that says where on its thing it is: "the compartment at the back of the
+    caddy" becomes "the back compartment of the caddy".
+    """
+    found: list[Phrase] = []
+    preposition, start = Preposition(""), 0
+    for i in range(len(words) + 1):
+        following = match_preposition(lex, words, i) if start <= i < len(words) else None
+        if i < start or (following is None and i < len(words)):
+            continue
+        piece = _without_particles(lex, words[start:i])
+        before = found[-1].words if found else ()
+        if together := _part_and_place(lex, before, preposition, piece):
+            found[-1] = Phrase(found[-1].preposition, together)
+        else:
+            found.append(Phrase(preposition, piece))
+        if following is not None:
+            preposition, start = following, i + following.length
+    return found
+
+
+def _without_particles(lex: Lexicon, words: Words) -> Words:
+    while words and (words[-1] in lex.particles - {"right", "back"} or words[-1] == ","):
+        words = words[:-1]
+    while words and words[0] in ("up", "down", "over", ","):
+        words = words[1:]
+    return words
+
+
+def _part_and_place(lex: Lexicon, words: Words, preposition: Preposition, following: Words) -> Words:
+    """Join a part with where it is; nothing where a phrase says something else."""
+    head = lex.singular(words[-1]) if words else ""
+    is_part = head in lex.parts or head in lex.part_synonyms or head in lex.named_parts
+    has_place = any(map(lex.is_position, words)) or "of" in words or "'s" in words
+    place = preposition.place or PLACE_OF_RELATION.get(preposition.relation, "")
+    if not is_part or preposition.is_goal or preposition.is_source:
+        return ()
+    is_owner = bool(following) and lex.kind(lex.singular(following[-1])) in ("cabinet", "caddy")
+    if is_owner and (preposition.relation == "in" or (preposition.relation == "on" and has_place)):
+        return (*words, "of", *following)
+    if has_place or not place:
+        return ()
+    if preposition.place or (preposition.relation == "on" and not following):  # "the drawer on top"
+        return (*words[:-1], place, words[-1])
+    return (*words[:-1], place, words[-1], "of", *following) if following and head != "shelf" else ()
 
 
 @dataclass(frozen=True)
@@ -186,9 +243,8 @@ def _split_count(lex: Lexicon, words: Words) -> tuple[Words, int]:
     count = 1
     while words and not _is_in_name(lex, words):
         one, two = words[0], " ".join(words[:2])
-        counts_next = any(
-            lex.number(said) or said in ("one", "1") for said in (*words[1:2], " ".join(words[1:3]))
-        )
+        following = {*words[1:2], " ".join(words[1:3])}
+        counts_next = not following.isdisjoint(("one", "1")) or any(map(lex.number, following))
         if number := lex.number(two) or lex.number(one):
             count, words = number, words[2 if lex.number(two) else 1 :]
             words = words[1:] if words[:1] == ("of",) else words
@@ -209,7 +265,7 @@ def _is_in_name(lex: Lexicon, words: Words) -> bool:
         return False
     holds = len(words) > 2 and words[1] in lex.containers and words[2] != "of"
     counts_one = int(words[0]) == 1 or words[-1] in lex.uncountable
-    is_one = not counts_one and all(lex.singular(word) == word for word in words)
+    is_one = not counts_one and tuple(map(lex.singular, words)) == words
     return lex.singular(words[1]) in lex.units or holds or is_one
 
 

@@ -1,20 +1,25 @@
-"""An instruction's clauses, in the order they are said in and with the order they are to be done in."""
+"""An instruction's sentences in plain wording, and their clauses with the order they are to be done in."""
 
 from __future__ import annotations
 
 import re
+import unicodedata
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
 
 from lerobot_openspm.errors import InstructionError
 from lerobot_openspm.language.lexicon import Lexicon, Words
 from lerobot_openspm.language.phrases import SAME, SEEN, WANTED, match_preposition
-from lerobot_openspm.language.wording import plain_wording
 
 # Nobody reads out more than this; and some patterns take time with the square of the length.
 MAX_CHARACTERS = 500
 _SUBJECTS = re.compile(
     r"^(?:you|it|that|this|they) (?:have|has|are|is)(?: (?:finished|done|been|through))?(?: with)? "
 )
+
+# How a clause is joined to the others ("before", "after", "first", "then" or ""), and its words.
+Piece = tuple[str, Words]
 
 
 @dataclass(frozen=True)
@@ -38,8 +43,46 @@ class Clause:
     is_done: bool = False
 
 
-def read_clauses(lex: Lexicon, instruction: str) -> list[Clause]:
-    """Split an instruction into clauses.
+@lru_cache(maxsize=4096)
+def plain_words(lex: Lexicon, text: str) -> str:
+    """Words as :func:`spelled`, without courtesies."""
+    return _rewritten(lex, "courtesies", _collapsed(spelled(lex, text)))
+
+
+def spelled(lex: Lexicon, text: str) -> str:
+    """Lower-case words with "," and ";" between clauses and sentences.
+
+    Letters keep their accents and vowel signs, which tell words apart; signs such as "+" become words.
+    """
+    text = unicodedata.normalize("NFC", text).lower()
+    if re.match(r"\s*\(?1[.):]", text):  # "1. open the drawer 2. put the bowl in it", but not "block 1."
+        text = re.sub(r"(?:^|\s)\(?\d[.):]\s+", " ; ", text)
+    for pattern, other in lex.rewrites["spelling"]:
+        text = pattern.sub(other, text)
+    # No regular expression knows combining marks.
+    return "".join(c if c in ",;'" or unicodedata.category(c)[0] in "LMN" else " " for c in text)
+
+
+@lru_cache(maxsize=4096)
+def plain_wording(lex: Lexicon, text: str) -> str:
+    """Plain words with other constructions made imperatives, and the marks of :mod:`phrases`."""
+    return _rewritten(lex, "constructions", plain_words(lex, text))
+
+
+def _rewritten(lex: Lexicon, step: str, text: str) -> str:
+    for pattern, other in lex.rewrites[step]:
+        text = _collapsed(pattern.sub(other, text))
+    return text
+
+
+def _collapsed(text: str) -> str:
+    text = re.sub(r"\s+", " ", text)
+    text = re.sub(r"(?: ?,)+(?= ?[,;]|$)|(?<=;)(?: ?,)+", "", text.strip())
+    return re.sub(r"(?:; ?)+(?=;)|^[ ,;]+|[ ,;]+$", "", text).strip()
+
+
+def read_sentences(lex: Lexicon, instruction: str) -> list[Words]:
+    """The sentences of an instruction in plain wording.
 
     Raises:
         InstructionError: It asks, forbids, depends on a condition, or says nothing.
@@ -52,38 +95,44 @@ def read_clauses(lex: Lexicon, instruction: str) -> list[Clause]:
     for pattern, reason in lex.rewrites["refused"]:
         if match := pattern.search(text):
             raise InstructionError(f"{reason} (it says {match[0]!r})")
-    found: list[Clause] = []
-    for sentence in text.split(";"):
-        if words := tuple(sentence.split()):
-            found += _read_sentence(lex, words, len(found))
-    polite = re.search(r"\bplease\b|\bkindly\b", instruction.lower())
-    if polite and not any(
-        lex.match_verb(clause.words, 0) for clause in found
-    ):  # "soup in the basket, please"
-        found = [replace(clause, is_wanted=True) for clause in found]
+    found = [tuple(sentence.split()) for sentence in text.split(";") if sentence.strip()]
+    for words in found:
+        # "could the bowl go on the stove" and "when the drawer is open, ..." ask for something.
+        asks_for = words[0] in ("could", "would", "when") or words[:2] == ("have", "the")
+        if words[0] in lex.question_words and not asks_for:
+            raise InstructionError("is a question; say what to do")
     return found
 
 
-def _read_sentence(lex: Lexicon, words: Words, first_step: int) -> list[Clause]:
-    # "could the bowl go on the stove" and "when the drawer is open, ..." ask for something.
-    asks_for = words[0] in ("could", "would", "when") or words[:2] == ("have", "the")
-    if words[0] in lex.question_words and not asks_for:
-        raise InstructionError("is a question; say what to do")
-    pieces = _split(lex, words)
-    order = list(range(len(pieces)))
-    for i, (marker, _) in enumerate(pieces):
-        if marker == "before" and i == 0:  # "before closing the drawer, put the bowl in"
-            order.append(order.pop(0))
-        elif marker in ("after", "first") and i > 0:  # "put the bowl in after opening the drawer"
-            order.remove(i)
-            order.insert(0, i)
-    clauses = [_clause(words, marker) for marker, words in pieces]
-    told = next((i for i, one in enumerate(clauses) if one.is_wanted or lex.telling & set(one.words)), -1)
-    return [
-        replace(one, step=first_step + order.index(i), is_wanted=one.is_wanted or 0 <= told < i)
-        for i, one in enumerate(clauses)
-        if one.words
-    ]
+def as_clauses(lex: Lexicon, sentences: Iterable[Sequence[Piece]], is_polite: bool) -> list[Clause]:
+    """The clauses that sentences were split into, with the order in which they are to be done.
+
+    Args:
+        lex: The words.
+        sentences: Each as :func:`split_sentence` split it.
+        is_polite: Whether something is asked for, also where no verb says so: "soup in the basket, please".
+    """
+    found: list[Clause] = []
+    for pieces in sentences:
+        order = list(range(len(pieces)))
+        for i, (marker, _) in enumerate(pieces):
+            if marker == "before" and i == 0:  # "before closing the drawer, put the bowl in"
+                order.append(order.pop(0))
+            elif marker in ("after", "first") and i > 0:  # "put the bowl in after opening the drawer"
+                order.remove(i)
+                order.insert(0, i)
+        clauses = [_clause(words, marker) for marker, words in pieces]
+        wanting = (i for i, one in enumerate(clauses) if one.is_wanted or lex.telling & set(one.words))
+        told = next(wanting, -1)
+        first_step = len(found)
+        found += [
+            replace(one, step=first_step + order.index(i), is_wanted=one.is_wanted or 0 <= told < i)
+            for i, one in enumerate(clauses)
+            if one.words
+        ]
+    if is_polite and not any(lex.match_verb(clause.words, 0) for clause in found):
+        found = [replace(clause, is_wanted=True) for clause in found]
+    return found
 
 
 def _clause(words: Words, marker: str) -> Clause:
@@ -95,9 +144,9 @@ def _clause(words: Words, marker: str) -> Clause:
     return Clause(words, 0, WANTED in marks, SEEN in marks, SAME in marks, marker == "after")
 
 
-def _split(lex: Lexicon, words: Words) -> list[tuple[str, Words]]:
+def split_sentence(lex: Lexicon, words: Words) -> list[Piece]:
     """Split a sentence where another clause begins; each with how it is joined to the others."""
-    pieces: list[tuple[str, Words]] = []
+    pieces: list[Piece] = []
     current: list[str] = []
     marker, i = "", 0
     while i < len(words):
@@ -146,6 +195,7 @@ def has_object(lex: Lexicon, words: Words, at: int) -> bool:
 
 
 def _is_boundary(lex: Lexicon, words: Words, at: int, end: int, marker: str, current: Words) -> bool:
+    """Whether another clause begins behind the joining words from `at` to `end`; `current` is before them."""
     if end >= len(words) or marker in ("after", "before"):
         return True
     if words[at] == "and" and {words[at - 1], words[end]} <= lex.colours:
@@ -154,7 +204,30 @@ def _is_boundary(lex: Lexicon, words: Words, at: int, end: int, marker: str, cur
         return False  # "on the plate, put the bowl"
     if words[at] == "first" and end == at + 1 and marker == "first":  # "open the drawer first, then ..."
         return lex.match_verb(words, end) is not None
-    return marker == "then" or words[end] == SAME or _begins_clause(lex, words, end, current)
+    if marker == "then" or words[end] == SAME:
+        return True
+    if words[end] in lex.predicates:
+        return False  # "the bowl, which is on the stove, goes on the plate"
+    if lex.match_verb(words, end, "base", "gerund") or words[end] in (WANTED, SEEN):
+        return True
+    relations = [i for i in range(1, len(current)) if match_preposition(lex, current, i)]
+    says_more = current[-1] in lex.results or bool(relations or lex.predicates & set(current))
+    pairs = "between" in current[-4:] and "and" not in current[-4:]
+    if pairs or not (says_more or lex.match_verb(current, 0)):
+        return False  # the first half of "the yellow and white mug"
+    rest = words[end:]
+    stop = next(
+        (i for i, word in enumerate(rest) if (i and word == ",") or lex.match_verb(rest, i)), len(rest)
+    )
+    if any(word in lex.predicates for word in rest[1:stop]):
+        return True
+    if match_preposition(lex, words, end) is not None:
+        return False
+    if rest[stop - 1] in lex.results or any(lex.match_verb(rest, i, "participle") for i in range(1, stop)):
+        return says_more
+    # "put the bowl on the plate and the bottle on the rack"
+    relations = [i for i in range(1, stop) if match_preposition(lex, rest[:stop], i)]
+    return says_more and bool(relations)
 
 
 def _is_fronted(lex: Lexicon, words: Words) -> bool:
@@ -163,34 +236,3 @@ def _is_fronted(lex: Lexicon, words: Words) -> bool:
         lex.match_verb(words, i) and words[i + 1 : i + 2] and words[i + 1] in lex.determiners
         for i in range(len(words))
     )
-
-
-def _begins_clause(lex: Lexicon, words: Words, at: int, current: Words) -> bool:
-    if words[at] in lex.predicates:
-        return False  # "the bowl, which is on the stove, goes on the plate"
-    if lex.match_verb(words, at, "base", "gerund") or words[at] in (WANTED, SEEN):
-        return True
-    says_more = (
-        current[-1] in lex.results or _has_relation(lex, current) or bool(lex.predicates & set(current))
-    )
-    pairs = "between" in current[-4:] and "and" not in current[-4:]
-    if pairs or not (says_more or lex.match_verb(current, 0)):
-        return False  # the first half of "the yellow and white mug"
-    rest = words[at:]
-    end = next(
-        (i for i, word in enumerate(rest) if (i and word == ",") or lex.match_verb(rest, i)), len(rest)
-    )
-    if any(word in lex.predicates for word in rest[1:end]):
-        return True
-    if match_preposition(lex, words, at) is not None:
-        return False
-    # "put the bowl on the plate and the bottle on the rack"
-    is_told = rest[end - 1] in lex.results or any(
-        lex.match_verb(rest, i, "participle") for i in range(1, end)
-    )
-    return says_more and (is_told or _has_relation(lex, rest[:end]))
-
-
-def _has_relation(lex: Lexicon, words: Words) -> bool:
-    """Whether there is a preposition behind the first word."""
-    return any(match_preposition(lex, words, i) for i in range(1, len(words)))

@@ -90,7 +90,10 @@ def _part(entry: MemoryEntry, number: int) -> MemoryEntry | None:
 
 
 def plan_parts(
-    instruction: str, entries: Sequence[MemoryEntry], names: NameSimilarity = TABLE_NAMES
+    instruction: str,
+    asked: tuple[SubTask, ...],
+    entries: Sequence[MemoryEntry],
+    names: NameSimilarity = TABLE_NAMES,
 ) -> tuple[tuple[Candidate, ...], ...]:
     """What an instruction can be carried out by: for each part, in order, the entries that are about it.
 
@@ -99,6 +102,7 @@ def plan_parts(
 
     Args:
         instruction: What is asked.
+        asked: Its sub-tasks, as :func:`read_instruction` reads it.
         entries: The memory.
         names: Says which names mean the same thing.
 
@@ -106,7 +110,6 @@ def plan_parts(
         InstructionError: There is no memory of the instruction or of one of its sub-tasks; the error
             says why it could not be read or names the sub-task, and lists what the memory knows.
     """
-    asked = read_instruction(instruction, entries, names)
     if asked[0].words:
         return _plan_by_words(instruction, asked, entries, names)
     entries = near(asked, entries, partial(semantic_score, names=names))
@@ -131,9 +134,10 @@ def _plan_by_words(
     instruction: str, asked: tuple[SubTask, ...], entries: Sequence[MemoryEntry], names: NameSimilarity
 ) -> tuple[tuple[Candidate, ...], ...]:
     """Likewise where the grammar cannot read: as a whole, else each of what "then" or "and" joins."""
-    close = near(asked, entries, partial(semantic_score, names=names))
     try:
-        return (_about(asked, instruction, [Candidate(entry, 0.0, entry) for entry in close], names),)
+        # By their words things are not told from others of their name, so what is asked is what was shown.
+        found = candidates_for(asked, instruction, entries, names)
+        return (tuple(Candidate(one, score, one, one.key.sub_tasks) for one, score in found),)
     except InstructionError as error:
         splits = (
             [one for one in joint.split(instruction) if normal_words(one, names.lexicon)]
@@ -141,7 +145,10 @@ def _plan_by_words(
         )
         with suppress(InstructionError):
             if sentences := next((pieces for pieces in splits if len(pieces) > 1), None):
-                return tuple(part for one in sentences for part in plan_parts(one, entries, names))
+                chain: list[tuple[Candidate, ...]] = []
+                for one in sentences:
+                    chain += plan_parts(one, read_instruction(one, entries, names), entries, names)
+                return tuple(chain)
         why = why_unread(instruction, entries, names)
         raise InstructionError(f"{why}; and {error}" if why else str(error)) from error
 
@@ -155,22 +162,12 @@ def _longest_run(
         InstructionError: There are none for the first one, which is called as ``said``, or entries about
             different things fit it as well.
     """
-    whole = [Candidate(entry, 0.0, entry) for entry in entries]
     for n_sub_tasks in range(len(asked), 0, -1):
+        run = tuple(asked[:n_sub_tasks])
         with suppress(InstructionError):
-            return _about(asked[:n_sub_tasks], said, whole, names)
-    singles = [Candidate(part, 0.0, entry) for entry in entries for part in parts(entry)]
-    return _about(asked[:1], said, singles, names)
-
-
-def _about(
-    asked: Sequence[SubTask], said: str, candidates: Sequence[Candidate], names: NameSimilarity
-) -> tuple[Candidate, ...]:
-    """Those of some candidates that are about what is asked, with their score; InstructionError if none."""
-    by_entry = {id(one.entry): one for one in candidates}
-    found = candidates_for(asked, said, [one.entry for one in candidates], names)
-    return tuple(
-        # By their words things are not told from others of their name, so what is asked is what was shown.
-        replace(by_entry[id(e)], semantic=score, asked=e.key.sub_tasks if asked[0].words else tuple(asked))
-        for e, score in found
-    )
+            found = candidates_for(run, said, entries, names)
+            return tuple(Candidate(one, score, one, run) for one, score in found)
+    sources = [(part, entry) for entry in entries for part in parts(entry)]
+    source_of = {id(part): entry for part, entry in sources}
+    found = candidates_for(asked[:1], said, [part for part, _ in sources], names)
+    return tuple(Candidate(one, score, source_of[id(one)], tuple(asked[:1])) for one, score in found)

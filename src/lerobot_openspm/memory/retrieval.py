@@ -107,33 +107,22 @@ def candidates_for(
     best = max(scores, key=lambda key: scores[key], default=())
     if scores.get(best, 0.0) < MIN_SEMANTIC:
         raise InstructionError(_unknown(instruction, entries, scores))
-    if scores[best] < 1.0:  # else just that is known
-        _check_rivals(instruction, entries, scores, best, names)
-    alike = {key for key, score in scores.items() if score >= MIN_SEMANTIC and _is_alike(best, key, names)}
-    return [(entry, scores[entry.key.sub_tasks]) for entry in entries if entry.key.sub_tasks in alike]
-
-
-def _is_alike(one: Sequence[SubTask], other: Sequence[SubTask], names: NameSimilarity) -> bool:
-    """Whether two keys may mean the same thing, one perhaps said with fewer words."""
-    return max(semantic_score(one, other, names), semantic_score(other, one, names)) >= MIN_SEMANTIC
-
-
-def _check_rivals(
-    instruction: str,
-    entries: Sequence[MemoryEntry],
-    scores: Mapping[tuple[SubTask, ...], float],
-    best: tuple[SubTask, ...],
-    names: NameSimilarity,
-) -> None:
-    """Raise InstructionError where something else is nearly as likely to be meant as the best."""
-    close = [key for key, score in scores.items() if score >= max(scores[best] - MARGIN, MIN_SEMANTIC)]
-    rivals = [key for key in close if not _is_alike(best, key, names)]
-    if rivals:
+    # What may mean the same as the best, one of the two perhaps said with fewer words.
+    alike = {
+        key
+        for key, score in scores.items()
+        if score >= MIN_SEMANTIC
+        and max(semantic_score(best, key, names), semantic_score(key, best, names)) >= MIN_SEMANTIC
+    }
+    least = max(scores[best] - MARGIN, MIN_SEMANTIC)
+    rivals = {key for key, score in scores.items() if score >= least} - alike
+    if rivals and scores[best] < 1.0:  # else just that is known
         meant = sorted({entry.language for entry in entries if entry.key.sub_tasks in {best, *rivals}})
         raise InstructionError(
             f"the instruction {instruction!r} may mean different things; did you mean "
             f"{' or '.join(repr(language) for language in _shortened(meant))}? Say it in those words"
         )
+    return [(entry, scores[entry.key.sub_tasks]) for entry in entries if entry.key.sub_tasks in alike]
 
 
 def _unknown(
