@@ -103,5 +103,5 @@ def test_mistakes_are_one_line(
     code, out, err = openspm("memory", "search", *arguments, *path)
     assert code == 2
     assert "{" not in out  # LeRobot says on stdout that it loads weights
-    assert err.splitlines()[-1].startswith("openspm memory: ")
+    assert err.splitlines()[-1].startswith("openspm memory search: ")
     assert message in err.splitlines()[-1]
