@@ -56,7 +56,7 @@ def main(args: list[str]) -> None:
     episodes = evaluate(checkpoint, evaluation, config.episodes, EVALUATION_SEED)
     result: dict[str, Any] = {
         **rate(sum(e.success for e in episodes), len(episodes)),
-        "mean_steps": round(mean_steps(episodes), 1),
+        "mean_steps": mean_steps(episodes),
         "train_s": train_s,
         "demos": config.demos,
         "episodes": config.episodes,

@@ -242,16 +242,13 @@ def success(episodes: Sequence[Episode]) -> dict[str, Any]:
     own = {task: [e for e in episodes if e.task == task] for task in dict.fromkeys(e.task for e in episodes)}
     return {
         **rate(sum(e.success for e in episodes), len(episodes)),
-        "mean_steps": round(mean_steps(episodes), 1) if any(e.success for e in episodes) else None,
+        "mean_steps": mean_steps(episodes),
         "per_task": {task: sum(e.success for e in es) / len(es) for task, es in own.items()},
         "failed": [[e.task, e.seed, e.status] for e in episodes if not e.success],
     }
 
 
-def mean_steps(episodes: Sequence[Episode]) -> float:
-    """Mean steps of the successful episodes; NaN if there is none."""
-    return (
-        float(np.mean([e.steps for e in episodes if e.success]))
-        if any(e.success for e in episodes)
-        else float("nan")
-    )
+def mean_steps(episodes: Sequence[Episode]) -> float | None:
+    """Mean steps of the successful episodes, to a tenth; None if there is none."""
+    steps = [episode.steps for episode in episodes if episode.success]
+    return round(float(np.mean(steps)), 1) if steps else None
