@@ -12,10 +12,9 @@ from lerobot_openspm.errors import PhaseLabelError
 from lerobot_openspm.memory.entry import PHASES
 from lerobot_openspm.mining.phase_labels.base import PhaseLabel, PhaseLabels, PhaseQuestion
 from lerobot_openspm.mining.phase_labels.prompt import AS_LINES, WORDING, Prompt, phase_prompt
-from lerobot_openspm.perception.segmentation.pretrained import fetch, load_model, load_processor
+from lerobot_openspm.perception.segmentation.pretrained import load
 
 WEIGHTS = "Qwen/Qwen3-VL-2B-Instruct"
-MODEL_CLASS, PROCESSOR_CLASS = "Qwen3VLForConditionalGeneration", "Qwen3VLProcessor"
 MAX_NEW_TOKENS = 4096
 
 # The alternatives for the next piece, given the pieces written so far; none at the end.
@@ -54,9 +53,7 @@ class Qwen3VL:
         Raises:
             PerceptionError: transformers, the device or the weights are missing, or some of the weights.
         """
-        checkpoint = fetch(name, MODEL_CLASS, device)
-        model = load_model(MODEL_CLASS, checkpoint, device)
-        return cls(model, load_processor(PROCESSOR_CLASS, checkpoint), name)
+        return cls(*load(name, "Qwen3VLForConditionalGeneration", "Qwen3VLProcessor", device), name)
 
     def write(self, prompt: Prompt, grammar: Grammar) -> list[Piece]:
         """Write greedily what a grammar allows.
