@@ -12,14 +12,15 @@ from tests.mining.phase_labels.loopback_chat import LoopbackChat, Reply, complet
 from tests.mining.phase_labels.questions import PHASES, pick_and_place
 
 from lerobot_openspm.errors import PhaseLabelError
-from lerobot_openspm.mining.phase_labels.endpoint import API_KEY_VARIABLE, ChatEndpoint, EndpointJudge
+from lerobot_openspm.mining.phase_labels.base import PhaseJudge
+from lerobot_openspm.mining.phase_labels.endpoint import API_KEY_VARIABLE, ChatEndpoint, endpoint_judge
 
 KEY = "sk-very-secret"
 N = len(PHASES)
 
 
-def judge(api_base: str, timeout_s: float = 10.0) -> EndpointJudge:
-    return EndpointJudge(ChatEndpoint(api_base, "tiny-vl", timeout_s, backoff_s=0.0))
+def judge(api_base: str, timeout_s: float = 10.0) -> PhaseJudge:
+    return endpoint_judge(ChatEndpoint(api_base, "tiny-vl", timeout_s, backoff_s=0.0))
 
 
 def asked(answer, timeout_s: float = 10.0):

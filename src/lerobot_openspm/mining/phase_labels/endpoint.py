@@ -6,14 +6,13 @@ import base64
 import json
 import os
 import time
-from dataclasses import dataclass
 from typing import Any
 
 import cv2
 import httpx
 
 from lerobot_openspm.errors import PhaseLabelError
-from lerobot_openspm.mining.phase_labels.base import PhaseLabels, PhaseQuestion, Picture
+from lerobot_openspm.mining.phase_labels.base import PhaseJudge, PhaseLabels, PhaseQuestion, Picture
 from lerobot_openspm.mining.phase_labels.prompt import AS_JSON, WORDING, Prompt, phase_prompt, read_phases
 
 # lerobot-annotate's default.
@@ -140,19 +139,11 @@ def _data_url(picture: Picture) -> str:
     return "data:image/jpeg;base64," + base64.b64encode(jpeg.tobytes()).decode()
 
 
-@dataclass(frozen=True)
-class EndpointJudge:
+def endpoint_judge(endpoint: ChatEndpoint) -> PhaseJudge:
     """Phase labels from an endpoint, with the confidences that the model writes down."""
 
-    endpoint: ChatEndpoint
-    looks: bool = True
-
-    @property
-    def name(self) -> str:
-        """See :class:`lerobot_openspm.mining.phase_labels.base.PhaseJudge`."""
-        return f"openai {self.endpoint.model_id} v{WORDING}"
-
-    def judge(self, question: PhaseQuestion) -> PhaseLabels:
-        """See :class:`lerobot_openspm.mining.phase_labels.base.PhaseJudge`."""
-        text = self.endpoint.complete(phase_prompt(question, AS_JSON))
+    def judge(question: PhaseQuestion) -> PhaseLabels:
+        text = endpoint.complete(phase_prompt(question, AS_JSON))
         return read_phases(text, len(question.candidates))
+
+    return PhaseJudge(f"openai {endpoint.model_id} v{WORDING}", judge)

@@ -20,12 +20,12 @@ from lerobot_openspm.files import write_json
 from lerobot_openspm.memory.robot import RobotModel
 from lerobot_openspm.mining.dataset import Demonstrations
 from lerobot_openspm.mining.mined import MinedEpisode
-from lerobot_openspm.mining.phase_labels.annotations import AnnotationJudge
+from lerobot_openspm.mining.phase_labels.annotations import annotation_judge
 from lerobot_openspm.mining.phase_labels.base import PhaseJudge, PhaseLabel, PhaseLabels, PhaseQuestion
-from lerobot_openspm.mining.phase_labels.endpoint import API_BASE, TIMEOUT_S, ChatEndpoint, EndpointJudge
+from lerobot_openspm.mining.phase_labels.endpoint import API_BASE, TIMEOUT_S, ChatEndpoint, endpoint_judge
 from lerobot_openspm.mining.phase_labels.merge import merge
 from lerobot_openspm.mining.phase_labels.question import ask_about
-from lerobot_openspm.mining.phase_labels.qwen3vl import WEIGHTS, Qwen3VL, Qwen3VLJudge
+from lerobot_openspm.mining.phase_labels.qwen3vl import WEIGHTS, Qwen3VL, qwen3vl_judge
 
 # A judge is given up after this many failures in a row, so that many episodes do not wait for nothing.
 MAX_FAILURES = 3
@@ -56,14 +56,14 @@ def make_judge(
         PerceptionError: Qwen3-VL cannot be loaded.
     """
     if kind == "annotations":
-        return AnnotationJudge(demonstrations.subtask_rows)
+        return annotation_judge(demonstrations.subtask_rows)
     if kind == "qwen3vl":
-        return Qwen3VLJudge(Qwen3VL.from_pretrained(model_id or WEIGHTS, device))
+        return qwen3vl_judge(Qwen3VL.from_pretrained(model_id or WEIGHTS, device))
     if kind != "openai" or not model_id:
         raise PhaseLabelError(
             f"no judge {kind!r} with model {model_id!r}; name both, see docs/phase_labels.md"
         )
-    return EndpointJudge(ChatEndpoint(api_base or API_BASE, model_id, timeout_s))
+    return endpoint_judge(ChatEndpoint(api_base or API_BASE, model_id, timeout_s))
 
 
 @dataclass(frozen=True)
