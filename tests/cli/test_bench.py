@@ -6,15 +6,15 @@ from pathlib import Path
 import pytest
 from tests.cli.conftest import Openspm
 
-from lerobot_openspm.cli.bench import MEASURES
+from lerobot_openspm.cli.bench import COMMANDS
 
 
 @pytest.mark.parametrize("arguments", [(), ("--help",), ("-h",)])
 def test_it_lists_what_it_measures(openspm: Openspm, arguments: tuple[str, ...]):
     code, out, _ = openspm("bench", *arguments)
     assert code == 0
-    assert "usage: openspm bench MEASURE" in out
-    assert all(f"  {name} " in out for name in MEASURES)
+    assert "usage: openspm bench COMMAND" in out
+    assert all(f"  {name} " in out for name in COMMANDS)
 
 
 def test_a_measure_lists_its_options_under_its_name(openspm: Openspm):
@@ -27,7 +27,7 @@ def test_a_measure_lists_its_options_under_its_name(openspm: Openspm):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (("speed",), "got 'speed', expected one of latency"),
+        (("speed",), "unknown command 'speed'; expected one of latency"),
         (("latency", "--policy.path=x", "--threads=0"), "threads and repeats must be at least 1, got 0"),
         (("latency", "--policy.path=nowhere"), "no checkpoint of this policy at nowhere"),
     ],

@@ -87,7 +87,7 @@ def test_a_mined_memory_can_be_searched_too(openspm: Openspm, checkpoint: Path, 
         ((), "search for what? expected an instruction in quotes before the options"),
         ((BOWL, "--path=nowhere"), "no memory at nowhere"),
         (("...",), "says nothing"),
-        ((BOWL, "--dataset.root=nowhere"), "no dataset at --dataset.root=nowhere"),
+        ((BOWL, "--dataset.root=nowhere"), "no dataset in nowhere: it has no meta/info.json"),
         ((BOWL, "--dataset.root={dataset}", "--episode=6"), "has episodes 0 to 5, got --episode=6"),
         ((BOWL, "--dataset.root={dataset}", "--frame=-1"), "got --frame=-1"),
         ((BOWL, "--episode=1"), "--episode of which dataset? pass --dataset.root=FOLDER"),
@@ -103,5 +103,5 @@ def test_mistakes_are_one_line(
     code, out, err = openspm("memory", "search", *arguments, *path)
     assert code == 2
     assert "{" not in out  # LeRobot says on stdout that it loads weights
-    assert err.splitlines()[-1].startswith("openspm memory: ")
+    assert err.splitlines()[-1].startswith("openspm memory search: ")
     assert message in err.splitlines()[-1]

@@ -1,17 +1,14 @@
-"""`openspm bench MEASURE`: what users measure on their own checkpoint, dataset and machine."""
+"""`openspm bench COMMAND`: what users measure on their own checkpoint, dataset and machine."""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 import draccus
 
-from lerobot_openspm.cli.options import DatasetOption, require_checkpoint
-from lerobot_openspm.errors import OpenSPMError
+from lerobot_openspm.cli.options import DatasetOption, require_checkpoint, run_command
 
 
 @dataclass
@@ -48,8 +45,8 @@ class LatencyConfig:
             raise ValueError(f"threads and repeats must be at least 1, got {self.threads} and {self.repeats}")
 
 
-def latency(args: list[str]) -> dict[str, Any]:
-    """Time of a chunk of actions, and of an episode's first action, with images."""
+def latency(args: list[str]) -> None:
+    """Print the time of a chunk of actions, and of an episode's first action, with images."""
     config = draccus.parse(LatencyConfig, args=args)
     import torch
 
@@ -64,23 +61,12 @@ def latency(args: list[str]) -> dict[str, Any]:
     policy = OpenSPMPolicy.from_pretrained(config.policy.path)
     observation = observation_of(policy, dataset, config.episode, config.frame, config.instruction)
     found = measure.latency(policy, observation, 10 * config.repeats, config.repeats)
-    return {"instruction": observation.instruction, "threads": config.threads, **found}
+    print(json.dumps({"instruction": observation.instruction, "threads": config.threads, **found}))
 
 
-# Measure -> function that takes the arguments, and what it is for.
-MEASURES: dict[str, tuple[Callable[[list[str]], dict[str, Any]], str]] = {
-    "latency": (latency, "how long a checkpoint's decisions take on this machine"),
-}
+COMMANDS = {"latency": (__name__, "latency", "how long a checkpoint's decisions take on this machine")}
 
 
 def main(args: list[str]) -> None:
-    """Measure, and print one JSON object last."""
-    what, *options = args or ["--help"]
-    if what in ("-h", "--help"):
-        print("usage: openspm bench MEASURE [--option=value ...]\n\nmeasures:")
-        print("\n".join(f"  {name:8s} {told}" for name, (_, told) in MEASURES.items()))
-        print("\n`openspm bench MEASURE --help` lists the options of one.")
-        return
-    if what not in MEASURES:
-        raise OpenSPMError(f"bench what? got {what!r}, expected one of {', '.join(MEASURES)}")
-    print(json.dumps(MEASURES[what][0](options)))
+    """Run one measurement."""
+    run_command("openspm bench", COMMANDS, args)

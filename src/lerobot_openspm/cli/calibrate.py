@@ -81,14 +81,9 @@ def main(args: list[str]) -> None:
     _log(estimate)
     Path(config.output).parent.mkdir(parents=True, exist_ok=True)
     write_json(Path(config.output), cameras_to_dict({**known, config.camera: estimate.camera}))
-    summary = {
-        "camera": config.camera,
-        "reprojection_px": round(estimate.reprojection_px, 3),
-        "file": config.output,
-    }
-    if truth is not None:
-        summary |= errors(estimate.camera, truth)
-    print(json.dumps(summary))
+    found = {"reprojection_px": round(estimate.reprojection_px, 3), "file": config.output}
+    compared = {} if truth is None else errors(estimate.camera, truth)
+    print(json.dumps({"camera": config.camera, **found, **compared}))
 
 
 def choose_episodes(episodes: Sequence[Episode], count: int) -> list[Episode]:
@@ -132,13 +127,14 @@ def calibrate(
 
 def _truth(config: CalibrateConfig) -> Camera | None:
     """The calibration to compare with, if there is one. It enters no estimate."""
-    beside = Path(config.dataset.root or "") / "meta" / "openspm_cameras.json"
-    if config.truth is None and (config.dataset.root is None or not beside.exists()):
-        return None
-    path = beside if config.truth is None else Path(config.truth)
-    camera = load_cameras(path).get(config.camera)
-    if camera is None and config.truth is not None:
-        raise CalibrationError(f"{path} holds no camera {config.camera!r} to compare with")
+    if config.truth is None:
+        if config.dataset.root is None:
+            return None
+        beside = Path(config.dataset.root) / "meta" / "openspm_cameras.json"
+        return load_cameras(beside).get(config.camera) if beside.exists() else None
+    camera = load_cameras(Path(config.truth)).get(config.camera)
+    if camera is None:
+        raise CalibrationError(f"{config.truth} holds no camera {config.camera!r} to compare with")
     return camera
 
 

@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import json
-import logging
 import os
 import platform
 import time
-from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -17,8 +15,6 @@ import numpy as np
 
 from lerobot_openspm.cli.pipeline import EVALUATION_SEED, collect_dataset, evaluate, mean_steps, rate, train
 from lerobot_openspm.cli.report import write_report
-
-logger = logging.getLogger(__name__)
 
 
 @dataclass
@@ -56,7 +52,7 @@ def main(args: list[str]) -> None:
     episodes = evaluate(checkpoint, evaluation, config.episodes, EVALUATION_SEED)
     result: dict[str, Any] = {
         **rate(sum(e.success for e in episodes), len(episodes)),
-        "mean_steps": round(mean_steps(episodes), 1),
+        "mean_steps": mean_steps(episodes),
         "train_s": train_s,
         "demos": config.demos,
         "episodes": config.episodes,
@@ -64,8 +60,6 @@ def main(args: list[str]) -> None:
         "expert_steps": collected["frames"] / collected["episodes"],
     }
     report = write_report(run / "report", result, episodes, dataset, checkpoint, evaluation)
-    failed = Counter(e.task for e in episodes if not e.success)
-    logger.info("failures per task: %s", dict(failed) or "none")
     summary = {
         "success": round(result["success"], 4),
         "n": result["n"],

@@ -1,11 +1,10 @@
-"""Pictures for people: key poses drawn into a camera image, film strips of rollouts."""
+"""Pictures for people: key poses drawn into a camera image."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
 
-import av
 import cv2
 import numpy as np
 from numpy.typing import NDArray
@@ -42,15 +41,6 @@ def draw_key_poses(view: View, poses: Sequence[Array], phases: Sequence[str], sc
         cv2.circle(image, tip.tolist(), 4, colour, -1, cv2.LINE_AA)
     _write_legend(image, phases)
     return image
-
-
-def film_strip(video: Path, frames: int = 8) -> Image:
-    """Evenly spaced frames of a video, side by side."""
-    pictures = []
-    with av.open(str(video)) as container:
-        pictures += [frame.to_ndarray(format="rgb24") for frame in container.decode(video=0)]
-    chosen = np.linspace(0, len(pictures) - 1, frames).round().astype(int)
-    return np.hstack([cv2.resize(pictures[i], (192, 192), interpolation=cv2.INTER_AREA) for i in chosen])
 
 
 def save_png(image: Image, path: Path) -> None:

@@ -1,14 +1,12 @@
-"""``openspm memory COMMAND ...``: finds the command and hands it the rest of the line."""
+"""``openspm memory COMMAND ...``: its commands, and the options that they share."""
 
 from __future__ import annotations
 
-import importlib
 from dataclasses import dataclass
 
-from lerobot_openspm.errors import OpenSPMError
+from lerobot_openspm.cli.options import run_command
 
 SHOW, CHANGE = "lerobot_openspm.cli.memory_show", "lerobot_openspm.cli.memory_change"
-# Command -> module and function that takes the arguments, and what it is for.
 COMMANDS = {
     "list": (SHOW, "list_entries", "a line for every entry or task"),
     "show": (SHOW, "show", "entries with all their numbers"),
@@ -43,13 +41,4 @@ class LimitOption(MemoryOption):
 
 def main(args: list[str]) -> None:
     """Run one command on a memory."""
-    command, *options = args or ["--help"]
-    if command in ("-h", "--help"):
-        print("usage: openspm memory COMMAND --path=CHECKPOINT [--option=value ...]\n\ncommands:")
-        print("\n".join(f"  {name:7s} {what}" for name, (_, _, what) in COMMANDS.items()))
-        print("\n`openspm memory COMMAND --help` lists the options of one.")
-        return
-    if command not in COMMANDS:
-        raise OpenSPMError(f"unknown command {command!r}; expected one of {', '.join(COMMANDS)}")
-    module, function, _ = COMMANDS[command]
-    getattr(importlib.import_module(module), function)(options)
+    run_command("openspm memory", COMMANDS, args)

@@ -67,15 +67,12 @@ def _search(instruction: str, config: SearchConfig) -> Found:
     if config.dataset.root is None and config.dataset.repo_id is None:
         entries = read_memory(Path(config.path)).entries
         return search_memory(instruction, entries, _names(config.path))
-    if config.dataset.root is not None and not (Path(config.dataset.root) / "meta/info.json").is_file():
-        raise FileNotFoundError(f"no dataset at --dataset.root={config.dataset.root}")
-    from lerobot.datasets import LeRobotDataset
-
+    from lerobot_openspm.mining.dataset import dataset_metadata, open_dataset
     from lerobot_openspm.modeling_openspm import OpenSPMPolicy
 
-    policy = OpenSPMPolicy.from_pretrained(config.path)
     name = config.dataset.repo_id or f"local/{Path(str(config.dataset.root)).name}"
-    dataset = LeRobotDataset(name, root=config.dataset.root, video_backend="pyav")
+    dataset = open_dataset(dataset_metadata(name, config.dataset.root))
+    policy = OpenSPMPolicy.from_pretrained(config.path)
     episode, frame = config.episode or 0, config.frame or 0
     return search_scene(policy, observation_of(policy, dataset, episode, frame, instruction))
 

@@ -64,7 +64,10 @@ def list_entries(args: list[str]) -> None:
     n_listed = sum(map(len, tasks.values()))
     n_lines = len(tasks) if config.tasks else n_listed
     if config.tasks:
-        lines = [_task_line(language, qualities) for language, qualities in tasks.items()]
+        lines = [
+            f"{len(qualities):6d} entries  mean quality {np.mean(qualities):.2f}  {language!r}"
+            for language, qualities in tasks.items()
+        ]
     if config.all:
         old = [entry for entry in memory.superseded if config.instruction in entry.language]
         lines += [f"{_line(entry)}  superseded" for entry in old]
@@ -131,10 +134,6 @@ def _line(entry: MemoryEntry) -> str:
         f"quality {entry.quality:.2f}  succeeded {outcomes:>9s}  version {entry.version}  "
         f"{len(entry.key_poses):2d} key poses  {entry.source}  {entry.language!r}"
     )
-
-
-def _task_line(language: str, qualities: list[float]) -> str:
-    return f"{len(qualities):6d} entries  mean quality {np.mean(qualities):.2f}  {language!r}"
 
 
 def _table(entry: MemoryEntry) -> list[str]:

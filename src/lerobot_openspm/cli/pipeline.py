@@ -124,11 +124,17 @@ def evaluate(
     output.mkdir(parents=True, exist_ok=True)
     finished = Counter(e.task for e in read_episodes(log, seeds))
     left = [task for task in tasks if finished[task] < episodes]
-    runs = [
-        _start_evaluation(checkpoint, output / f"lerobot_eval_{half}", some, log, episodes, seed, options)
-        for half, some in enumerate((left[::2], left[1::2]))
-        if some
-    ]
+    command = [
+        "lerobot-eval", f"--policy.path={checkpoint}", "--env.type=openspm_tabletop",
+        f"--env.episode_log={log.resolve()}", f"--eval.n_episodes={episodes}", "--eval.batch_size=1",
+        "--policy.device=cpu", f"--seed={seed}",
+    ]  # fmt: skip
+    runs = []
+    for half, some in enumerate((left[::2], left[1::2])):
+        if some:
+            folder = output / f"lerobot_eval_{half}"
+            own = [f"--env.task={','.join(some)}", f"--output_dir={folder}"]
+            runs.append(_started(folder, [*command, *own, *options]))
     _wait(runs, log, len(left) * episodes)
     found = read_episodes(log, seeds)
     if len(found) != len(tasks) * episodes:
@@ -165,21 +171,8 @@ def discard_unless(output: Path, made_of: str) -> None:
     write_beside(kept, made_of.encode())
 
 
-def _start_evaluation(
-    checkpoint: Path,
-    folder: Path,
-    tasks: Sequence[str],
-    log: Path,
-    episodes: int,
-    seed: int,
-    options: Sequence[str],
-) -> subprocess.Popen[bytes]:
-    command = [
-        "lerobot-eval", f"--policy.path={checkpoint}", "--env.type=openspm_tabletop",
-        f"--env.task={','.join(tasks)}", f"--env.episode_log={log.resolve()}",
-        f"--eval.n_episodes={episodes}", "--eval.batch_size=1", "--policy.device=cpu",
-        f"--seed={seed}", f"--output_dir={folder}", *options,
-    ]  # fmt: skip
+def _started(folder: Path, command: Sequence[str]) -> subprocess.Popen[bytes]:
+    """One of LeRobot's command lines, started; what it prints goes to a file in the folder."""
     logger.info("%s", " ".join(command))
     folder.mkdir(exist_ok=True)
     with (folder / LOG).open("wb") as file:
@@ -242,16 +235,13 @@ def success(episodes: Sequence[Episode]) -> dict[str, Any]:
     own = {task: [e for e in episodes if e.task == task] for task in dict.fromkeys(e.task for e in episodes)}
     return {
         **rate(sum(e.success for e in episodes), len(episodes)),
-        "mean_steps": round(mean_steps(episodes), 1) if any(e.success for e in episodes) else None,
+        "mean_steps": mean_steps(episodes),
         "per_task": {task: sum(e.success for e in es) / len(es) for task, es in own.items()},
         "failed": [[e.task, e.seed, e.status] for e in episodes if not e.success],
     }
 
 
-def mean_steps(episodes: Sequence[Episode]) -> float:
-    """Mean steps of the successful episodes; NaN if there is none."""
-    return (
-        float(np.mean([e.steps for e in episodes if e.success]))
-        if any(e.success for e in episodes)
-        else float("nan")
-    )
+def mean_steps(episodes: Sequence[Episode]) -> float | None:
+    """Mean steps of the successful episodes, to a tenth; None if there is none."""
+    steps = [episode.steps for episode in episodes if episode.success]
+    return round(float(np.mean(steps)), 1) if steps else None

@@ -1,4 +1,4 @@
-"""The page that a person opens first: success per task, film strips, key poses drawn into a camera image."""
+"""The page that a person opens first: success per task, films, key poses drawn into a camera image."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from jinja2 import Environment, select_autoescape
 from lerobot.datasets import LeRobotDataset
 from tqdm import tqdm
 
-from lerobot_openspm.cli.drawing import draw_key_poses, film_strip, save_png
+from lerobot_openspm.cli.drawing import draw_key_poses, save_png
 from lerobot_openspm.cli.pipeline import REPO_ID, Episode, mean_steps, rate
 from lerobot_openspm.configuration_openspm import OpenSPMConfig
 from lerobot_openspm.envs.tabletop.tasks import TASKS
@@ -49,7 +49,7 @@ def write_report(
             {
                 "instruction": instruction,
                 **rate(sum(e.success for e in own), len(own)),
-                "mean_steps": _rounded(mean_steps(own)),
+                "mean_steps": mean_steps(own),
                 "entries": len(entries),
                 "anchors": ", ".join(best.objects) if best else "",
                 "poses": poses.name if best else None,
@@ -75,7 +75,7 @@ def _key_pose_picture(entry: MemoryEntry, memory: Memory, dataset: LeRobotDatase
 
 
 def _films(episodes: Sequence[Episode], evaluation: Path, folder: Path) -> list[dict[str, Any]]:
-    """Film strips of a few rollouts; lerobot-eval films the first ten of a task, in the order of seeds."""
+    """A few rollouts; lerobot-eval films the first ten of a task, in the order of seeds."""
     task_id = list(TASKS).index(episodes[0].task)
     videos = next(evaluation.glob(f"lerobot_eval_*/videos/openspm_tabletop_{task_id}"), evaluation)
     filmed = [
@@ -85,21 +85,12 @@ def _films(episodes: Sequence[Episode], evaluation: Path, folder: Path) -> list[
     ]
     successes = [item for item in filmed if item[0].success][:SHOWN_SUCCESSES]
     failures = [item for item in filmed if not item[0].success][:SHOWN_FAILURES]
-    films = []
-    for episode, video in successes + failures:
-        strip = folder / f"{episode.task}_{episode.seed}.png"
-        save_png(film_strip(video), strip)
-        outcome = "success" if episode.success else f"failed ({episode.status.replace('_', ' ')})"
-        films.append(
-            {
-                "video": os.path.relpath(video, folder),
-                "seed": episode.seed,
-                "outcome": f"{outcome} after {episode.steps} steps",
-                "strip": strip.name,
-            }
-        )
-    return films
-
-
-def _rounded(value: float) -> str:
-    return "-" if value != value else f"{value:.0f}"
+    return [
+        {
+            "video": os.path.relpath(video, folder),
+            "seed": episode.seed,
+            "outcome": "success" if episode.success else f"failed ({episode.status.replace('_', ' ')})",
+            "steps": episode.steps,
+        }
+        for episode, video in successes + failures
+    ]

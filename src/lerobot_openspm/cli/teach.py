@@ -6,7 +6,6 @@ import json
 import shutil
 import time
 from collections import Counter
-from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -62,7 +61,7 @@ def main(args: list[str]) -> None:
     policy = _policy(config)
     known, lesson = policy.require_memory(), policy.teach(meta, config.dataset.episodes)
     if output is None:
-        memory, lesson = _appended(known, lesson, into, lambda now: _taught(policy, now, meta, config))
+        memory, lesson = _appended(policy, known, lesson, meta, config)
     else:
         memory = policy.require_memory()
         _write_copy(memory, into, output)
@@ -85,34 +84,27 @@ def _policy(config: TeachConfig) -> OpenSPMPolicy:
     from lerobot_openspm.modeling_openspm import OpenSPMPolicy
 
     policy = OpenSPMPolicy.from_pretrained(config.into)
-    places, saved = config.policy.segmenter, policy.config.segmenter
-    segmenter = replace(
-        saved,
-        sam3d_python=places.sam3d_python or saved.sam3d_python,
-        sam3d_checkout=places.sam3d_checkout or saved.sam3d_checkout,
-    )
+    places = {name: place for name, place in vars(config.policy.segmenter).items() if place}
+    segmenter = replace(policy.config.segmenter, **places)
     cameras = config.policy.cameras or policy.config.cameras
     policy.config = replace(policy.config, cameras=cameras, segmenter=segmenter)
     return policy
 
 
-def _taught(policy: OpenSPMPolicy, known: Memory, meta: Any, config: TeachConfig) -> Lesson:
-    policy.memory = known
-    return policy.teach(meta, config.dataset.episodes)
-
-
 def _appended(
-    known: Memory, lesson: Lesson, into: Path, again: Callable[[Memory], Lesson]
+    policy: OpenSPMPolicy, known: Memory, lesson: Lesson, meta: Any, config: TeachConfig
 ) -> tuple[Memory, Lesson]:
     """Append a lesson to what the memory holds by now; what is saved, and the lesson.
 
     A lesson takes long, so others may change the memory meanwhile. Its key poses mean nothing in the frames
     of other models of its objects, so where these have changed the lesson is given again.
     """
+    into = Path(config.into)
     with changing(into):
         now = read_memory(into)
         if not all(_same_model(known, now, name) for name in lesson.learned.objects):
-            lesson = again(now)
+            policy.memory = now
+            lesson = policy.teach(meta, config.dataset.episodes)
         memory = now.appended(lesson.learned)
         write_memory(memory, into)
     before = Counter(entry.language for entry in now.entries)
@@ -144,10 +136,4 @@ def _lines(lesson: Lesson) -> list[str]:
         lines.append(f"{task!r}: {counts[task]} new {'entries' if counts[task] > 1 else 'entry'}{known}")
         entry = next(entry for entry in lesson.entries if entry.language == task)
         lines.append(f"  {' > '.join(pose.phase for pose in entry.key_poses)}")
-    if lesson.objects_learned:
-        lines.append(f"objects learned: {', '.join(lesson.objects_learned)}")
-    if lesson.objects_recognised:
-        lines.append(f"objects recognised: {', '.join(lesson.objects_recognised)}")
-    if lesson.skipped:
-        lines.append(f"skipped episodes, see the warnings above: {', '.join(map(str, lesson.skipped))}")
     return lines

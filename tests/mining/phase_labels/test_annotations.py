@@ -3,11 +3,11 @@
 import pytest
 from tests.mining.phase_labels.questions import pick_and_place
 
-from lerobot_openspm.mining.phase_labels.annotations import CONFIDENCE, AnnotationJudge
+from lerobot_openspm.mining.phase_labels.annotations import CONFIDENCE, annotation_judge
 
 
 def judged(*rows: tuple[float, str]):
-    answers = AnnotationJudge(lambda index: rows).judge(pick_and_place())
+    answers = annotation_judge(lambda index: rows).judge(pick_and_place())
     return [None if a is None else (a.phase, a.confidence) for a in answers]
 
 

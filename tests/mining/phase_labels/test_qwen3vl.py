@@ -9,7 +9,7 @@ from lerobot_openspm.errors import PerceptionError, PhaseLabelError
 from lerobot_openspm.memory.entry import PHASES as CLOSED_SET
 from lerobot_openspm.mining.phase_labels import qwen3vl
 from lerobot_openspm.mining.phase_labels.prompt import Prompt
-from lerobot_openspm.mining.phase_labels.qwen3vl import Qwen3VL, Qwen3VLJudge
+from lerobot_openspm.mining.phase_labels.qwen3vl import Qwen3VL, qwen3vl_judge
 
 
 @pytest.fixture(scope="module")
@@ -25,18 +25,18 @@ def one_of(*alternatives: str):
 
 
 def test_phases_are_of_the_closed_set_with_a_confidence_each(model: Qwen3VL):
-    answers = Qwen3VLJudge(model).judge(pick_and_place(n=3))
+    answers = qwen3vl_judge(model).judge(pick_and_place(n=3))
     assert len(answers) == 3
     assert all(a.phase in CLOSED_SET and 0 < a.confidence < 1 for a in answers)
 
 
 def test_the_pictures_are_looked_at(model: Qwen3VL):
-    first, other = (Qwen3VLJudge(model).judge(pick_and_place(1, episode, n=2)) for episode in (0, 1))
+    first, other = (qwen3vl_judge(model).judge(pick_and_place(1, episode, n=2)) for episode in (0, 1))
     assert [a.confidence for a in first] != [a.confidence for a in other]
 
 
 def test_a_question_without_pictures_is_text_alone(model: Qwen3VL):
-    assert len(Qwen3VLJudge(model).judge(pick_and_place(cameras=0, n=2))) == 2
+    assert len(qwen3vl_judge(model).judge(pick_and_place(cameras=0, n=2))) == 2
 
 
 def test_the_alternatives_probabilities_add_up_to_one(model: Qwen3VL):
@@ -87,7 +87,7 @@ def test_a_grammar_without_end_is_an_error(model: Qwen3VL, monkeypatch: pytest.M
 def test_it_is_loaded_from_its_files(tiny_qwen3vl_folder: Path, model: Qwen3VL):
     loaded = Qwen3VL.from_pretrained(str(tiny_qwen3vl_folder))
     assert loaded.model_id == str(tiny_qwen3vl_folder)
-    for ours, theirs in zip(*(Qwen3VLJudge(m).judge(QUESTION) for m in (model, loaded)), strict=True):
+    for ours, theirs in zip(*(qwen3vl_judge(m).judge(QUESTION) for m in (model, loaded)), strict=True):
         assert (ours.phase, ours.confidence) == (theirs.phase, pytest.approx(theirs.confidence, rel=1e-3))
 
 

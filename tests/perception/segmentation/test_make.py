@@ -9,7 +9,7 @@ from tests.perception.segmentation import tiny_models
 from lerobot_openspm.errors import PerceptionError
 from lerobot_openspm.perception.segmentation.given import GivenSegmenter
 from lerobot_openspm.perception.segmentation.grounded_sam2 import GroundedSam2Segmenter
-from lerobot_openspm.perception.segmentation.make import BACKENDS, make_segmenter
+from lerobot_openspm.perception.segmentation.make import WEIGHTS, make_segmenter
 from lerobot_openspm.perception.segmentation.sam3 import Sam3Segmenter
 
 
@@ -35,13 +35,13 @@ def test_nothing_heavy_is_imported_before_it_is_needed():
 
 def test_each_name_makes_its_backend(folders):
     weights = {"sam3": [folders["sam3"]], "grounded_sam2": [folders["grounding_dino"], folders["sam2"]]}
-    made = [make_segmenter(name, {}, weights.get(name, ())) for name in BACKENDS]
+    made = [make_segmenter(name, {}, weights.get(name, ())) for name in WEIGHTS]
     assert [type(one) for one in made] == [Sam3Segmenter, GroundedSam2Segmenter, GivenSegmenter]
 
 
 def test_the_default_weights_are_the_ones_that_the_authors_publish():
-    assert BACKENDS["sam3"].weights == ("facebook/sam3",)
-    assert BACKENDS["grounded_sam2"].weights == (
+    assert WEIGHTS["sam3"] == ("facebook/sam3",)
+    assert WEIGHTS["grounded_sam2"] == (
         "IDEA-Research/grounding-dino-tiny",
         "facebook/sam2.1-hiera-tiny",
     )

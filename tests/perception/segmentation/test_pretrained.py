@@ -15,7 +15,8 @@ from tests.hub.loopback_hub import LoopbackHub, Repo
 from tests.perception.segmentation import tiny_models
 
 from lerobot_openspm.errors import PerceptionError
-from lerobot_openspm.perception.segmentation.pretrained import fetch, load_model, load_processor
+from lerobot_openspm.perception.segmentation.pretrained import fetch
+from lerobot_openspm.perception.segmentation.pretrained import load as load_pretrained
 from lerobot_openspm.perception.segmentation.sam3 import Sam3Segmenter
 
 # Loads each of the named weights in a process of its own: huggingface_hub reads at import where the Hub is.
@@ -197,14 +198,14 @@ def truncate(name: str):
 def test_a_folder_that_is_no_checkpoint_is_named(copy: Path, spoil):
     spoil(copy)
     with pytest.raises(PerceptionError, match=r"'/.*' is no checkpoint of Sam3Model: .*Give the name"):
-        load_model("Sam3Model", fetch(str(copy), "Sam3Model", "cpu"), "cpu")
+        load_pretrained(str(copy), "Sam3Model", "Sam3Processor", "cpu")
 
 
 @pytest.mark.parametrize("spoil", [remove("tokenizer.json"), truncate("processor_config.json")])
 def test_a_folder_without_a_processor_is_named(copy: Path, spoil):
     spoil(copy)
     with pytest.raises(PerceptionError, match=r"'/.*' is no checkpoint of Sam3Processor: "):
-        load_processor("Sam3Processor", fetch(str(copy), "Sam3Model", "cpu"))
+        load_pretrained(str(copy), "Sam3Model", "Sam3Processor", "cpu")
 
 
 @pytest.mark.parametrize("name", ["/nowhere/at/all", "not a name", ""])

@@ -8,36 +8,31 @@ not the one that it may be mistaken for: picking up ends in no retreat, and putt
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 
 from lerobot_openspm.language.descriptions import phases_of
-from lerobot_openspm.mining.phase_labels.base import PhaseLabel, PhaseLabels, PhaseQuestion
+from lerobot_openspm.mining.phase_labels.base import PhaseJudge, PhaseLabel, PhaseLabels, PhaseQuestion
 from lerobot_openspm.mining.phase_labels.merge import SIBLINGS
 
 # Of a sub-task that covers the whole way to a candidate. Its beginning is exact to about half a second.
 CONFIDENCE = 0.9
 
 
-@dataclass(frozen=True)
-class AnnotationJudge:
+def annotation_judge(rows: Callable[[int], Sequence[tuple[float, str]]]) -> PhaseJudge:
     """Phase labels from the dataset's own annotations.
 
-    Attributes:
+    Args:
         rows: Gives an episode's sub-tasks by its index: the second at which each begins, and its words.
     """
 
-    rows: Callable[[int], Sequence[tuple[float, str]]]
-    name: str = "annotations"
-    looks: bool = False
-
-    def judge(self, question: PhaseQuestion) -> PhaseLabels:
-        """See :class:`lerobot_openspm.mining.phase_labels.base.PhaseJudge`."""
-        rows = self.rows(question.episode)
+    def judge(question: PhaseQuestion) -> PhaseLabels:
+        said = rows(question.episode)
         times = [0.0, *(moment.time_s for moment in question.candidates)]
         return tuple(
-            _label(kinematic, *_covering(rows, begin, end))
+            _label(kinematic, *_covering(said, begin, end))
             for kinematic, begin, end in zip(question.kinematic, times[:-1], times[1:], strict=True)
         )
+
+    return PhaseJudge("annotations", judge, looks=False)
 
 
 def _covering(rows: Sequence[tuple[float, str]], begin: float, end: float) -> tuple[tuple[str, ...], float]:

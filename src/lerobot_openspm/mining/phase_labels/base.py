@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field
-from typing import Any, Protocol
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,8 +30,8 @@ class Moment:
     """
 
     time_s: float
-    position: tuple[float, float, float]
-    rotation: tuple[float, float, float]
+    position: tuple[float, ...]
+    rotation: tuple[float, ...]
     opening: float
     closing: bool
 
@@ -82,10 +82,13 @@ class PhaseQuestion:
 
 def _rounded(moment: Moment) -> dict[str, object]:
     """A moment as JSON, to a tenth of a millimetre and to a millisecond."""
-    fields = asdict(moment)
-    for name in ("position", "rotation"):
-        fields[name] = [round(float(x), 4) for x in fields[name]]
-    return {**fields, "time_s": round(moment.time_s, 3), "opening": round(moment.opening, 3)}
+    return {
+        "time_s": round(moment.time_s, 3),
+        "position": [round(x, 4) for x in moment.position],
+        "rotation": [round(x, 4) for x in moment.rotation],
+        "opening": round(moment.opening, 3),
+        "closing": moment.closing,
+    }
 
 
 @dataclass(frozen=True)
@@ -127,23 +130,16 @@ class PhaseLabel:
 PhaseLabels = tuple[PhaseLabel | None, ...]
 
 
-class PhaseJudge(Protocol):
-    """A source of phase labels."""
+@dataclass(frozen=True)
+class PhaseJudge:
+    """A source of phase labels.
 
-    @property
-    def name(self) -> str:
-        """Kind, model and prompt version. Cached labels of different names are never mixed."""
-        ...
+    Attributes:
+        name: Kind, model and prompt version. Cached labels of different names are never mixed.
+        judge: Labels each candidate of an episode; raises PhaseLabelError where there is no usable answer.
+        looks: Whether it needs pictures.
+    """
 
-    @property
-    def looks(self) -> bool:
-        """Whether it needs pictures."""
-        ...
-
-    def judge(self, question: PhaseQuestion) -> PhaseLabels:
-        """Label each candidate of an episode.
-
-        Raises:
-            PhaseLabelError: There is no usable answer.
-        """
-        ...
+    name: str
+    judge: Callable[[PhaseQuestion], PhaseLabels]
+    looks: bool = True

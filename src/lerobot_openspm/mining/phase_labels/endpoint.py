@@ -2,19 +2,17 @@
 
 from __future__ import annotations
 
-import asyncio
 import base64
 import json
 import os
-from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+import time
 from typing import Any
 
 import cv2
 import httpx
 
 from lerobot_openspm.errors import PhaseLabelError
-from lerobot_openspm.mining.phase_labels.base import PhaseLabels, PhaseQuestion, Picture
+from lerobot_openspm.mining.phase_labels.base import PhaseJudge, PhaseLabels, PhaseQuestion, Picture
 from lerobot_openspm.mining.phase_labels.prompt import AS_JSON, WORDING, Prompt, phase_prompt, read_phases
 
 # lerobot-annotate's default.
@@ -22,7 +20,6 @@ API_BASE = "http://localhost:8000/v1"
 API_KEY_VARIABLE = "OPENSPM_JUDGE_API_KEY"
 TIMEOUT_S, MAX_CONNECT_S = 60.0, 5.0
 ATTEMPTS = 3
-MAX_ANSWER_BYTES = 1_000_000
 MAX_ANSWER_TOKENS = 4096
 JPEG_QUALITY = 90
 # Status codes of servers that do not know JSON schemas.
@@ -64,43 +61,22 @@ class ChatEndpoint:
         Raises:
             PhaseLabelError: The server is gone, too slow, refuses, or gives no completion.
         """
-        # In a thread of its own, because in a notebook this one already runs an event loop.
-        with ThreadPoolExecutor(1) as thread:
-            return thread.submit(asyncio.run, self._complete(prompt)).result()
-
-    async def _complete(self, prompt: Prompt) -> str:
-        # Answers are not compressed: unpacked they would have no bound.
-        headers = {"Accept-Encoding": "identity"}
-        if self._key:
-            headers["Authorization"] = f"Bearer {self._key}"
-        # httpx's timeouts start again with every byte; asyncio's ends a request whatever it is doing.
-        timeout = httpx.Timeout(None, connect=MAX_CONNECT_S)
-        try:
-            async with (
-                asyncio.timeout(self._timeout_s) as limit,
-                httpx.AsyncClient(headers=headers, timeout=timeout, verify=self._tls) as http,
-            ):
-                return await self._attempts(http, prompt, limit.when() or 0.0)
-        except TimeoutError as error:
-            raise PhaseLabelError(f"{self._url} took longer than {self._timeout_s:g} s") from error
-
-    async def _attempts(self, http: httpx.AsyncClient, prompt: Prompt, deadline: float) -> str:
-        """Ask until there is an answer, no attempt is left, or no time for another one."""
+        deadline = time.monotonic() + self._timeout_s
         attempt, wait_s = 1, self._backoff_s
         while True:
             try:
-                return await self._ask(http, prompt)
+                return self._ask(prompt, deadline)
             except _TryAgainError as error:
-                if attempt == ATTEMPTS or asyncio.get_running_loop().time() + wait_s >= deadline:
+                if attempt == ATTEMPTS or time.monotonic() + wait_s >= deadline:
                     raise PhaseLabelError(f"{error}, {attempt} times") from error
-            await asyncio.sleep(wait_s)
+            time.sleep(wait_s)
             attempt, wait_s = attempt + 1, 2 * wait_s
 
-    async def _ask(self, http: httpx.AsyncClient, prompt: Prompt) -> str:
-        status, body = await self._post(http, prompt)
+    def _ask(self, prompt: Prompt, deadline: float) -> str:
+        status, body = self._post(prompt, deadline)
         if self._with_schema and status in NO_SCHEMA:
             self._with_schema = False
-            status, body = await self._post(http, prompt)
+            status, body = self._post(prompt, deadline)
         if status != 200:
             kind = _TryAgainError if status in BUSY else PhaseLabelError
             raise kind(f"{self._url} answered with code {status}: {self._shown(body)}")
@@ -112,16 +88,24 @@ class ChatEndpoint:
             raise PhaseLabelError(f"{self._url} gave a completion without text: {self._shown(body)}")
         return content
 
-    async def _post(self, http: httpx.AsyncClient, prompt: Prompt) -> tuple[int, bytes]:
-        """Status and body of one request. A body over the limit is not read to its end."""
+    def _post(self, prompt: Prompt, deadline: float) -> tuple[int, bytes]:
+        """Status and body of one request."""
+        headers = {"Authorization": f"Bearer {self._key}"} if self._key else {}
+        left_s = max(0.0, deadline - time.monotonic())
+        timeout = httpx.Timeout(left_s, connect=min(left_s, MAX_CONNECT_S))
         body = bytearray()
         try:
-            async with http.stream("POST", self._url, json=self._request(prompt)) as response:
-                async for piece in response.aiter_raw():
+            with (
+                httpx.Client(headers=headers, timeout=timeout, verify=self._tls) as http,
+                http.stream("POST", self._url, json=self._request(prompt)) as response,
+            ):
+                for piece in response.iter_bytes():
                     body += piece
-                    if len(body) > MAX_ANSWER_BYTES:
-                        raise PhaseLabelError(f"{self._url} answered with more than {MAX_ANSWER_BYTES} bytes")
+                    if time.monotonic() > deadline:  # httpx's own limit begins again with every piece
+                        raise httpx.ReadTimeout("the answer comes too slowly")
                 return response.status_code, bytes(body)
+        except (httpx.ReadTimeout, httpx.WriteTimeout) as error:
+            raise PhaseLabelError(f"{self._url} took longer than {self._timeout_s:g} s") from error
         except (httpx.TransportError, httpx.InvalidURL) as error:
             kind = PhaseLabelError if isinstance(error, httpx.ConnectTimeout) else _TryAgainError
             raise kind(f"{self._url} could not be asked ({type(error).__name__}: {error})") from error
@@ -155,19 +139,11 @@ def _data_url(picture: Picture) -> str:
     return "data:image/jpeg;base64," + base64.b64encode(jpeg.tobytes()).decode()
 
 
-@dataclass(frozen=True)
-class EndpointJudge:
+def endpoint_judge(endpoint: ChatEndpoint) -> PhaseJudge:
     """Phase labels from an endpoint, with the confidences that the model writes down."""
 
-    endpoint: ChatEndpoint
-    looks: bool = True
-
-    @property
-    def name(self) -> str:
-        """See :class:`lerobot_openspm.mining.phase_labels.base.PhaseJudge`."""
-        return f"openai {self.endpoint.model_id} v{WORDING}"
-
-    def judge(self, question: PhaseQuestion) -> PhaseLabels:
-        """See :class:`lerobot_openspm.mining.phase_labels.base.PhaseJudge`."""
-        text = self.endpoint.complete(phase_prompt(question, AS_JSON))
+    def judge(question: PhaseQuestion) -> PhaseLabels:
+        text = endpoint.complete(phase_prompt(question, AS_JSON))
         return read_phases(text, len(question.candidates))
+
+    return PhaseJudge(f"openai {endpoint.model_id} v{WORDING}", judge)

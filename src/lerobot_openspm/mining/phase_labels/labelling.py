@@ -20,12 +20,12 @@ from lerobot_openspm.files import write_json
 from lerobot_openspm.memory.robot import RobotModel
 from lerobot_openspm.mining.dataset import Demonstrations
 from lerobot_openspm.mining.mined import MinedEpisode
-from lerobot_openspm.mining.phase_labels.annotations import AnnotationJudge
+from lerobot_openspm.mining.phase_labels.annotations import annotation_judge
 from lerobot_openspm.mining.phase_labels.base import PhaseJudge, PhaseLabel, PhaseLabels, PhaseQuestion
-from lerobot_openspm.mining.phase_labels.endpoint import API_BASE, TIMEOUT_S, ChatEndpoint, EndpointJudge
+from lerobot_openspm.mining.phase_labels.endpoint import API_BASE, TIMEOUT_S, ChatEndpoint, endpoint_judge
 from lerobot_openspm.mining.phase_labels.merge import merge
 from lerobot_openspm.mining.phase_labels.question import ask_about
-from lerobot_openspm.mining.phase_labels.qwen3vl import WEIGHTS, Qwen3VL, Qwen3VLJudge
+from lerobot_openspm.mining.phase_labels.qwen3vl import WEIGHTS, Qwen3VL, qwen3vl_judge
 
 # A judge is given up after this many failures in a row, so that many episodes do not wait for nothing.
 MAX_FAILURES = 3
@@ -56,14 +56,14 @@ def make_judge(
         PerceptionError: Qwen3-VL cannot be loaded.
     """
     if kind == "annotations":
-        return AnnotationJudge(demonstrations.subtask_rows)
+        return annotation_judge(demonstrations.subtask_rows)
     if kind == "qwen3vl":
-        return Qwen3VLJudge(Qwen3VL.from_pretrained(model_id or WEIGHTS, device))
+        return qwen3vl_judge(Qwen3VL.from_pretrained(model_id or WEIGHTS, device))
     if kind != "openai" or not model_id:
         raise PhaseLabelError(
             f"no judge {kind!r} with model {model_id!r}; name both, see docs/phase_labels.md"
         )
-    return EndpointJudge(ChatEndpoint(api_base or API_BASE, model_id, timeout_s))
+    return endpoint_judge(ChatEndpoint(api_base or API_BASE, model_id, timeout_s))
 
 
 @dataclass(frozen=True)
@@ -127,11 +127,8 @@ def label_phases(
         threshold: Labels of less confidence change nothing.
         cache: Keeps the labels of a judge that looks at pictures.
     """
-    asked, labelled, counts = (
-        _Asked(judge, cache if judge.looks else None),
-        list[MinedEpisode](),
-        Counter[str](),
-    )
+    asked = _Asked(judge, cache if judge.looks else None)
+    labelled, counts = list[MinedEpisode](), Counter[str]()
     for item in tqdm(mined, desc="Labelling phases", unit="episode"):
         labels = asked.labels(ask_about(demonstrations, item, robot, judge.looks))
         counts["episodes"] += labels is not None
@@ -146,12 +143,12 @@ def label_phases(
 def _merged(item: MinedEpisode, labels: PhaseLabels, threshold: float, counts: Counter[str]) -> MinedEpisode:
     """An episode's key poses with merged names and confidences; counts what changed."""
     merged = merge([PhaseLabel(p.phase, p.confidence) for p in item.key_poses], labels, threshold)
-    for pose, label in zip(item.key_poses, merged, strict=True):
+    pairs = list(zip(item.key_poses, merged, strict=True))
+    for pose, label in pairs:
         if label.phase != pose.phase:
             counts["renamed"] += 1
         elif label.confidence != pose.confidence:
             counts["surer" if label.confidence > pose.confidence else "less sure"] += 1
-    pairs = zip(item.key_poses, merged, strict=True)
     return replace(item, key_poses=tuple(replace(pose, **vars(label)) for pose, label in pairs))
 
 
@@ -162,7 +159,6 @@ class _Asked:
     judge: PhaseJudge
     cache: LabelCache | None
     failures: int = 0
-    is_told: bool = False
 
     def labels(self, question: PhaseQuestion) -> PhaseLabels | None:
         """The judge's labels, cached or new; None where it fails."""
@@ -174,19 +170,15 @@ class _Asked:
         try:
             labels = self.judge.judge(question)
         except PhaseLabelError as error:
-            self._failed(error)
+            self.failures += 1
+            if self.failures == 1:
+                logger.warning("%s gave no answer, mining goes on without it: %s", name, error)
+            if self.failures == MAX_FAILURES:
+                logger.warning(
+                    "%s failed %d times in a row and is asked no more: %s", name, MAX_FAILURES, error
+                )
             return None
         self.failures = 0
         if self.cache:
             self.cache.save(question, name, labels)
         return labels
-
-    def _failed(self, error: PhaseLabelError) -> None:
-        self.failures += 1
-        if not self.is_told:
-            logger.warning("%s gave no answer, mining goes on without it: %s", self.judge.name, error)
-            self.is_told = True
-        if self.failures == MAX_FAILURES:
-            logger.warning(
-                "%s failed %d times in a row and is asked no more: %s", self.judge.name, MAX_FAILURES, error
-            )

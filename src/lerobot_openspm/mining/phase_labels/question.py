@@ -54,18 +54,13 @@ def moments(episode: Episode, frames: Sequence[int], fps: float, robot: RobotMod
     return tuple(
         Moment(
             frame / fps,
-            _triple(episode.T_world_ee[frame, :3, 3]),
-            _triple(se3.log_so3(episode.T_world_ee[frame, :3, :3])),
+            tuple(episode.T_world_ee[frame, :3, 3].tolist()),
+            tuple(se3.log_so3(episode.T_world_ee[frame, :3, :3]).tolist()),
             float(np.clip(episode.opening[frame] / wide, 0, 1)),
             bool(closing[frame]),
         )
         for frame in frames
     )
-
-
-def _triple(values: np.ndarray) -> tuple[float, float, float]:
-    x, y, z = (float(value) for value in values)
-    return x, y, z
 
 
 def contact_sheets(pictures: Sequence[Picture]) -> tuple[Picture, ...]:

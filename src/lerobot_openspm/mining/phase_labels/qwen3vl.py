@@ -10,12 +10,11 @@ import numpy as np
 
 from lerobot_openspm.errors import PhaseLabelError
 from lerobot_openspm.memory.entry import PHASES
-from lerobot_openspm.mining.phase_labels.base import PhaseLabel, PhaseLabels, PhaseQuestion
+from lerobot_openspm.mining.phase_labels.base import PhaseJudge, PhaseLabel, PhaseLabels, PhaseQuestion
 from lerobot_openspm.mining.phase_labels.prompt import AS_LINES, WORDING, Prompt, phase_prompt
-from lerobot_openspm.perception.segmentation.pretrained import fetch, load_model, load_processor
+from lerobot_openspm.perception.segmentation.pretrained import load
 
 WEIGHTS = "Qwen/Qwen3-VL-2B-Instruct"
-MODEL_CLASS, PROCESSOR_CLASS = "Qwen3VLForConditionalGeneration", "Qwen3VLProcessor"
 MAX_NEW_TOKENS = 4096
 
 # The alternatives for the next piece, given the pieces written so far; none at the end.
@@ -54,9 +53,7 @@ class Qwen3VL:
         Raises:
             PerceptionError: transformers, the device or the weights are missing, or some of the weights.
         """
-        checkpoint = fetch(name, MODEL_CLASS, device)
-        model = load_model(MODEL_CLASS, checkpoint, device)
-        return cls(model, load_processor(PROCESSOR_CLASS, checkpoint), name)
+        return cls(*load(name, "Qwen3VLForConditionalGeneration", "Qwen3VLProcessor", device), name)
 
     def write(self, prompt: Prompt, grammar: Grammar) -> list[Piece]:
         """Write greedily what a grammar allows.
@@ -169,25 +166,17 @@ class _Speller:
         return self._spelled[text]
 
 
-@dataclass(frozen=True)
-class Qwen3VLJudge:
+def qwen3vl_judge(model: Qwen3VL) -> PhaseJudge:
     """Phase labels from Qwen3-VL, with the probabilities that it gives the phases it writes."""
 
-    model: Qwen3VL
-    looks: bool = True
-
-    @property
-    def name(self) -> str:
-        """See :class:`lerobot_openspm.mining.phase_labels.base.PhaseJudge`."""
-        return f"qwen3vl {self.model.model_id} v{WORDING}"
-
-    def judge(self, question: PhaseQuestion) -> PhaseLabels:
-        """See :class:`lerobot_openspm.mining.phase_labels.base.PhaseJudge`."""
+    def judge(question: PhaseQuestion) -> PhaseLabels:
         n = len(question.candidates)
 
         def lines(written: tuple[str, ...]) -> tuple[str, ...]:
             number = len(written) + 1
             return () if number > n else tuple(f"{number}: {phase}\n" for phase in PHASES)
 
-        written = self.model.write(phase_prompt(question, AS_LINES), lines)
+        written = model.write(phase_prompt(question, AS_LINES), lines)
         return tuple(PhaseLabel(one.text.strip().partition(": ")[2], one.probability) for one in written)
+
+    return PhaseJudge(f"qwen3vl {model.model_id} v{WORDING}", judge)

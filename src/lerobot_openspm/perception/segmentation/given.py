@@ -14,19 +14,10 @@ class GivenSegmenter:
 
     Args:
         labels: Number of each phrase in the label images, from 1 on.
-
-    Raises:
-        PerceptionError: A number is none from 1 on.
     """
 
     def __init__(self, labels: Mapping[str, int]) -> None:
         self._labels = dict(labels)
-        for phrase, number in self._labels.items():
-            # By type(), for a bool is an int to Python; 0 is what no object shows.
-            if type(number) is not int or number < 1:
-                raise PerceptionError(
-                    f"the label of {phrase!r} is {number!r}, expected a number from 1 on; 0 is no object"
-                )
 
     def segment(
         self, views: Mapping[str, View], phrases: Sequence[str]

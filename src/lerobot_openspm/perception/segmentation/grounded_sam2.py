@@ -6,7 +6,6 @@ Smaller than SAM 3, and the weights need no permission.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -14,21 +13,13 @@ import numpy as np
 from lerobot_openspm.errors import PerceptionError
 from lerobot_openspm.geometry.se3 import Array
 from lerobot_openspm.perception.segmentation.instances import check_query, distinct_instances
-from lerobot_openspm.perception.segmentation.pretrained import fetch, load_model, load_processor
+from lerobot_openspm.perception.segmentation.pretrained import load
 from lerobot_openspm.types import Segmentation, View
 
 DETECTOR_WEIGHTS = "IDEA-Research/grounding-dino-tiny"
 MASK_WEIGHTS = "facebook/sam2.1-hiera-tiny"
 # What the detector's authors take.
 MIN_CONFIDENCE = 0.35
-
-
-@dataclass(frozen=True)
-class _Boxes:
-    """Boxes ``(n, 4)`` of a phrase, u_min, v_min, u_max, v_max in pixels, and their confidences ``(n,)``."""
-
-    corners: Array
-    confidences: Array
 
 
 class GroundedSam2Segmenter:
@@ -67,14 +58,9 @@ class GroundedSam2Segmenter:
             PerceptionError: transformers, the device or the weights are missing, or a checkpoint lacks some
                 of its weights.
         """
-        finder = fetch(detector, "GroundingDinoForObjectDetection", device)
-        cutter = fetch(masks, "Sam2Model", device)
-        return cls(
-            load_model("GroundingDinoForObjectDetection", finder, device),
-            load_processor("GroundingDinoProcessor", finder),
-            load_model("Sam2Model", cutter, device),
-            load_processor("Sam2Processor", cutter),
-        )
+        finder = load(detector, "GroundingDinoForObjectDetection", "GroundingDinoProcessor", device)
+        cutter = load(masks, "Sam2Model", "Sam2Processor", device)
+        return cls(*finder, *cutter)
 
     def segment(
         self, views: Mapping[str, View], phrases: Sequence[str]
@@ -96,7 +82,8 @@ class GroundedSam2Segmenter:
                     found[phrase][camera] = instances
         return found
 
-    def _detect(self, view: View, phrase: str) -> _Boxes:
+    def _detect(self, view: View, phrase: str) -> tuple[Array, Array]:
+        """Boxes ``(n, 4)`` of a phrase, u_min, v_min, u_max, v_max in pixels, and confidences ``(n,)``."""
         # The detector was trained on lower case, and on a full stop after each phrase.
         text = " ".join(phrase.lower().replace(".", " ").split()) + "."
         inputs = self._detector_processor(images=view.image, text=text, return_tensors="pt")
@@ -118,18 +105,20 @@ class GroundedSam2Segmenter:
         corners = np.clip(corners, 0, [width, height, width, height])
         # Boxes that lie wholly outside have no inside left.
         inside = ((corners[:, 2:] - corners[:, :2]) >= 1).all(axis=1)
-        return _Boxes(corners[inside], result["scores"].float().cpu().numpy().astype(float)[inside])
+        return corners[inside], result["scores"].float().cpu().numpy().astype(float)[inside]
 
-    def _cut_out(self, view: View, boxes: Mapping[str, _Boxes]) -> dict[str, tuple[Segmentation, ...]]:
-        if not any(len(one.corners) for one in boxes.values()):
+    def _cut_out(
+        self, view: View, boxes: Mapping[str, tuple[Array, Array]]
+    ) -> dict[str, tuple[Segmentation, ...]]:
+        if not any(len(corners) for corners, _ in boxes.values()):
             return dict.fromkeys(boxes, ())
         pixels = self._mask_processor(images=view.image, return_tensors="pt").pixel_values
         encoded = self._mask_model.get_image_embeddings(
             pixels.to(self._mask_model.device, self._mask_model.dtype)
         )
         return {
-            phrase: distinct_instances(self._masks(encoded, one.corners, view), one.confidences)
-            for phrase, one in boxes.items()
+            phrase: distinct_instances(self._masks(encoded, corners, view), confidences)
+            for phrase, (corners, confidences) in boxes.items()
         }
 
     def _masks(self, encoded: Any, corners: Array, view: View) -> np.ndarray:

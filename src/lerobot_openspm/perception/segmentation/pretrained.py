@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Generator, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -36,20 +35,7 @@ NO_CHECKPOINT = (
 )
 
 
-@dataclass(frozen=True)
-class Checkpoint:
-    """A pretrained model on this machine.
-
-    Attributes:
-        name: On the Hugging Face Hub, or a folder.
-        folder: Where its files are.
-    """
-
-    name: str
-    folder: Path
-
-
-def fetch(name: str, class_name: str, device: str) -> Checkpoint:
+def fetch(name: str, class_name: str, device: str) -> Path:
     """Bring a model's files to this machine; everything else reads them from there.
 
     All at once, because transformers asks the Hub for one file after the other, and where there is no network
@@ -67,41 +53,39 @@ def fetch(name: str, class_name: str, device: str) -> Checkpoint:
     transformers_class(class_name)
     check_device(device)
     if name and Path(name).is_dir():
-        return Checkpoint(name, Path(name))
+        return Path(name)
     from huggingface_hub import snapshot_download
 
-    with _explained(Checkpoint(name, Path()), class_name):
-        return Checkpoint(name, Path(snapshot_download(name, allow_patterns=list(FILES))))
+    with _explained(name, class_name):
+        return Path(snapshot_download(name, allow_patterns=list(FILES)))
 
 
-def load_model(class_name: str, checkpoint: Checkpoint, device: str) -> Any:
-    """A pretrained model of `transformers` in evaluation mode, with every one of its weights.
+def load(name: str, model_name: str, processor_name: str, device: str) -> tuple[Any, Any]:
+    """A pretrained model of `transformers` in evaluation mode, with all its weights, and its processor.
+
+    Args:
+        name: On the Hugging Face Hub, or a folder.
+        model_name: The model's class.
+        processor_name: The class of the processor of images and texts that belongs to it.
+        device: Where the model is to run.
 
     Raises:
-        PerceptionError: The checkpoint is of something else, is damaged, or lacks weights.
+        PerceptionError: See :func:`fetch`; or the checkpoint is of something else, is damaged, or lacks
+            weights.
     """
-    model_class = transformers_class(class_name)
-    with _explained(checkpoint, class_name):
-        if not (checkpoint.folder / "config.json").is_file():
+    folder = fetch(name, model_name, device)
+    with _explained(name, model_name):
+        if not (folder / "config.json").is_file():
             # transformers takes a model of the usual size then, and weights of another shape for random ones.
-            raise FileNotFoundError(f"there is no config.json in {checkpoint.folder}")
+            raise FileNotFoundError(f"there is no config.json in {folder}")
         # Weights of another shape are reported like missing ones then, instead of a traceback.
-        model, report = model_class.from_pretrained(
-            checkpoint.folder, output_loading_info=True, ignore_mismatched_sizes=True, use_safetensors=True
+        model, report = transformers_class(model_name).from_pretrained(
+            folder, output_loading_info=True, ignore_mismatched_sizes=True, use_safetensors=True
         )
-    _check_complete(report, checkpoint)
-    return model.to(device).eval()
-
-
-def load_processor(class_name: str, checkpoint: Checkpoint) -> Any:
-    """The processor of images and texts that belongs to a pretrained model.
-
-    Raises:
-        PerceptionError: The processor's files are missing or damaged.
-    """
-    processor_class = transformers_class(class_name)
-    with _explained(checkpoint, class_name):
-        return processor_class.from_pretrained(checkpoint.folder)
+    _check_complete(report, name)
+    processor_class = transformers_class(processor_name)
+    with _explained(name, processor_name):
+        return model.to(device).eval(), processor_class.from_pretrained(folder)
 
 
 def transformers_class(name: str) -> Any:
@@ -133,7 +117,7 @@ def check_device(device: str) -> None:
         raise PerceptionError(f"device {device!r} cannot be used: {error}. Use 'cpu'") from error
 
 
-def _check_complete(report: Mapping[str, Any], checkpoint: Checkpoint) -> None:
+def _check_complete(report: Mapping[str, Any], name: str) -> None:
     """Refuse a model that was loaded in part: transformers fills gaps with random weights, and only warns.
 
     Some releases, for example, look for SAM 3's text encoder under names that its checkpoint does not use.
@@ -146,14 +130,14 @@ def _check_complete(report: Mapping[str, Any], checkpoint: Checkpoint) -> None:
         if keys:
             more = f" and {len(keys) - 3} more" if len(keys) > 3 else ""
             raise PerceptionError(
-                f"{checkpoint.name!r} {what} {len(keys)} weights that transformers "
+                f"{name!r} {what} {len(keys)} weights that transformers "
                 f"{transformers.__version__} expects: {', '.join(keys[:3])}{more}; the model would be random "
                 f"there. Install the release that was tested: {INSTALL} 'transformers=={TESTED_RELEASE}'"
             )
 
 
 @contextmanager
-def _explained(checkpoint: Checkpoint, class_name: str) -> Generator[None]:
+def _explained(name: str, class_name: str) -> Generator[None]:
     """Turn what goes wrong while loading into one PerceptionError that keeps the cause."""
     from httpx import TransportError
     from safetensors import SafetensorError
@@ -166,9 +150,9 @@ def _explained(checkpoint: Checkpoint, class_name: str) -> Generator[None]:
     ) as error:  # fmt: skip
         first_line = (str(error).splitlines() or [type(error).__name__])[0]
         known = {kind.__name__ for cause in _causes(error) for kind in type(cause).__mro__}
-        remedy = next((text for name, text in REMEDIES.items() if name in known), NO_CHECKPOINT)
+        remedy = next((text for kind, text in REMEDIES.items() if kind in known), NO_CHECKPOINT)
         raise PerceptionError(
-            remedy.format(name=checkpoint.name, include=INCLUDE, class_name=class_name, error=first_line)
+            remedy.format(name=name, include=INCLUDE, class_name=class_name, error=first_line)
         ) from error
 
 

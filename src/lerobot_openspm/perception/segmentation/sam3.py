@@ -3,27 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from lerobot_openspm.errors import PerceptionError
 from lerobot_openspm.perception.segmentation.instances import check_query, distinct_instances
-from lerobot_openspm.perception.segmentation.pretrained import fetch, load_model, load_processor
+from lerobot_openspm.perception.segmentation.pretrained import load
 from lerobot_openspm.types import Segmentation, View
 
 WEIGHTS = "facebook/sam3"
 # What the model's authors take.
 MIN_CONFIDENCE = 0.5
-
-
-@dataclass(frozen=True)
-class _Prompt:
-    """A phrase as the model takes it: features ``(1, tokens, width)`` and which tokens are text."""
-
-    text_embeds: Any
-    attention_mask: Any
 
 
 class Sam3Segmenter:
@@ -48,9 +39,7 @@ class Sam3Segmenter:
             PerceptionError: transformers, the device, the weights or the permission to use them are missing,
                 or the checkpoint lacks some of the weights.
         """
-        checkpoint = fetch(name, "Sam3Model", device)
-        model = load_model("Sam3Model", checkpoint, device)
-        return cls(model, load_processor("Sam3Processor", checkpoint))
+        return cls(*load(name, "Sam3Model", "Sam3Processor", device))
 
     def segment(
         self, views: Mapping[str, View], phrases: Sequence[str]
@@ -70,12 +59,15 @@ class Sam3Segmenter:
         with torch.inference_mode():
             prompts = {phrase: self._encode_text(phrase) for phrase in wanted}
             for camera, view in views.items():
-                encoded = self._encode_image(view)
+                pixels = self._processor(images=view.image, return_tensors="pt").pixel_values
+                pixels = pixels.to(self._model.device, self._model.dtype)
+                encoded = self._model.get_vision_features(pixels)
                 for phrase, prompt in prompts.items():
                     found[phrase][camera] = self._instances(encoded, prompt, view)
         return found
 
-    def _encode_text(self, phrase: str) -> _Prompt:
+    def _encode_text(self, phrase: str) -> dict[str, Any]:
+        """A phrase as the model takes it: features ``(1, tokens, width)`` and which tokens are text."""
         tokens = self._processor(text=phrase, return_tensors="pt").to(self._model.device)
         longest = self._model.config.text_config.max_position_embeddings
         if tokens.input_ids.shape[1] > longest:
@@ -84,16 +76,10 @@ class Sam3Segmenter:
                 "shorten it"
             )
         features = self._model.get_text_features(tokens.input_ids, tokens.attention_mask).pooler_output
-        return _Prompt(features, tokens.attention_mask)
+        return {"text_embeds": features, "attention_mask": tokens.attention_mask}
 
-    def _encode_image(self, view: View) -> Any:
-        pixels = self._processor(images=view.image, return_tensors="pt").pixel_values
-        return self._model.get_vision_features(pixels.to(self._model.device, self._model.dtype))
-
-    def _instances(self, encoded: Any, prompt: _Prompt, view: View) -> tuple[Segmentation, ...]:
-        output = self._model(
-            vision_embeds=encoded, text_embeds=prompt.text_embeds, attention_mask=prompt.attention_mask
-        )
+    def _instances(self, encoded: Any, prompt: dict[str, Any], view: View) -> tuple[Segmentation, ...]:
+        output = self._model(vision_embeds=encoded, **prompt)
         (result,) = self._processor.post_process_instance_segmentation(
             output, threshold=self._min_confidence, target_sizes=[view.image.shape[:2]]
         )
