@@ -21,6 +21,7 @@ class Reply:
         status: HTTP's.
         wait_s: Before anything is sent.
         drip_s: Between any two bytes of the body.
+        head_drip_s: Between any two bytes of the headers.
         has_length: Whether the length is told; else the body ends where the connection does.
         location: Where a redirect leads.
         promised: Content-Length, where it is not the body's: the connection is closed too early then.
@@ -31,6 +32,7 @@ class Reply:
     wait_s: float = 0.0
     drip_s: float = 0.0
     promised: int | None = None
+    head_drip_s: float = 0.0
     has_length: bool = True
     location: str = ""
 
@@ -94,14 +96,16 @@ class _Handler(BaseHTTPRequestHandler):
                 self.send_header("Content-Length", str(reply.promised or len(reply.body)))
             if reply.location:
                 self.send_header("Location", reply.location)
-            self.end_headers()
-            pieces = [reply.body[i : i + 1] for i in range(len(reply.body))] if reply.drip_s else [reply.body]
-            for piece in pieces:
-                self.wfile.write(piece)
-                time.sleep(reply.drip_s)
+            self._send(b"".join([*self._headers_buffer, b"\r\n"]), reply.head_drip_s)
+            self._send(reply.body, reply.drip_s)
         except ConnectionError:  # the client has had enough
             pass
         self.close_connection = True
+
+    def _send(self, blob: bytes, drip_s: float) -> None:
+        for piece in [blob[i : i + 1] for i in range(len(blob))] if drip_s else [blob]:
+            self.wfile.write(piece)
+            time.sleep(drip_s)
 
     def log_message(self, format: str, *args: Any) -> None:
         """Say nothing."""

@@ -13,7 +13,12 @@ from tests.mining.phase_labels.questions import PHASES, pick_and_place
 
 from lerobot_openspm.errors import PhaseLabelError
 from lerobot_openspm.mining.phase_labels.base import PhaseJudge
-from lerobot_openspm.mining.phase_labels.endpoint import API_KEY_VARIABLE, ChatEndpoint, endpoint_judge
+from lerobot_openspm.mining.phase_labels.endpoint import (
+    API_KEY_VARIABLE,
+    MAX_ANSWER_BYTES,
+    ChatEndpoint,
+    endpoint_judge,
+)
 
 KEY = "sk-very-secret"
 N = len(PHASES)
@@ -131,6 +136,7 @@ def test_the_key_comes_from_the_environment_and_is_never_told(monkeypatch, caplo
         (Reply(completion('{"phases": "lift"}')), "'phases' is 'lift', expected a list", 1),
         (Reply(say(["levitate"] * N)), "none of the 8 items in the answer makes sense", 1),
         (Reply(say(["lift"] * N, 7.0)), "none of the 8 items", 1),
+        (Reply(completion("x" * (MAX_ANSWER_BYTES + 1))), "more than 1000000 bytes", 1),
         (Reply(say(["lift"] * N), promised=100_000), "could not be asked", 3),
     ],
 )
@@ -147,6 +153,7 @@ def test_what_is_no_answer_is_one_error(reply: Reply, words: str, requests: int)
         Reply(say(["lift"] * N), wait_s=3),
         Reply(say(["lift"] * N), drip_s=0.05),
         Reply(say(["lift"] * N), drip_s=0.05, has_length=False),
+        Reply(say(["lift"] * N), head_drip_s=0.05),
     ],
 )
 def test_a_slow_server_is_waited_for_once_and_no_longer_than_asked(reply: Reply):

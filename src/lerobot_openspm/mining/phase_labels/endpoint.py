@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import asyncio
 import base64
 import json
 import os
-import time
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import cv2
@@ -20,6 +21,7 @@ API_BASE = "http://localhost:8000/v1"
 API_KEY_VARIABLE = "OPENSPM_JUDGE_API_KEY"
 TIMEOUT_S, MAX_CONNECT_S = 60.0, 5.0
 ATTEMPTS = 3
+MAX_ANSWER_BYTES = 1_000_000
 MAX_ANSWER_TOKENS = 4096
 JPEG_QUALITY = 90
 # Status codes of servers that do not know JSON schemas.
@@ -61,22 +63,43 @@ class ChatEndpoint:
         Raises:
             PhaseLabelError: The server is gone, too slow, refuses, or gives no completion.
         """
-        deadline = time.monotonic() + self._timeout_s
+        # In a thread of its own, because in a notebook this one already runs an event loop.
+        with ThreadPoolExecutor(1) as thread:
+            return thread.submit(asyncio.run, self._complete(prompt)).result()
+
+    async def _complete(self, prompt: Prompt) -> str:
+        # Answers are not compressed: unpacked they would have no bound.
+        headers = {"Accept-Encoding": "identity"}
+        if self._key:
+            headers["Authorization"] = f"Bearer {self._key}"
+        # httpx's timeouts start again with every byte; asyncio's ends a request whatever it is doing.
+        timeout = httpx.Timeout(None, connect=MAX_CONNECT_S)
+        try:
+            async with (
+                asyncio.timeout(self._timeout_s) as limit,
+                httpx.AsyncClient(headers=headers, timeout=timeout, verify=self._tls) as http,
+            ):
+                return await self._attempts(http, prompt, limit.when() or 0.0)
+        except TimeoutError as error:
+            raise PhaseLabelError(f"{self._url} took longer than {self._timeout_s:g} s") from error
+
+    async def _attempts(self, http: httpx.AsyncClient, prompt: Prompt, deadline: float) -> str:
+        """Ask until there is an answer, no attempt is left, or no time for another one."""
         attempt, wait_s = 1, self._backoff_s
         while True:
             try:
-                return self._ask(prompt, deadline)
+                return await self._ask(http, prompt)
             except _TryAgainError as error:
-                if attempt == ATTEMPTS or time.monotonic() + wait_s >= deadline:
+                if attempt == ATTEMPTS or asyncio.get_running_loop().time() + wait_s >= deadline:
                     raise PhaseLabelError(f"{error}, {attempt} times") from error
-            time.sleep(wait_s)
+            await asyncio.sleep(wait_s)
             attempt, wait_s = attempt + 1, 2 * wait_s
 
-    def _ask(self, prompt: Prompt, deadline: float) -> str:
-        status, body = self._post(prompt, deadline)
+    async def _ask(self, http: httpx.AsyncClient, prompt: Prompt) -> str:
+        status, body = await self._post(http, prompt)
         if self._with_schema and status in NO_SCHEMA:
             self._with_schema = False
-            status, body = self._post(prompt, deadline)
+            status, body = await self._post(http, prompt)
         if status != 200:
             kind = _TryAgainError if status in BUSY else PhaseLabelError
             raise kind(f"{self._url} answered with code {status}: {self._shown(body)}")
@@ -88,24 +111,16 @@ class ChatEndpoint:
             raise PhaseLabelError(f"{self._url} gave a completion without text: {self._shown(body)}")
         return content
 
-    def _post(self, prompt: Prompt, deadline: float) -> tuple[int, bytes]:
-        """Status and body of one request."""
-        headers = {"Authorization": f"Bearer {self._key}"} if self._key else {}
-        left_s = max(0.0, deadline - time.monotonic())
-        timeout = httpx.Timeout(left_s, connect=min(left_s, MAX_CONNECT_S))
+    async def _post(self, http: httpx.AsyncClient, prompt: Prompt) -> tuple[int, bytes]:
+        """Status and body of one request. A body over the limit is not read to its end."""
         body = bytearray()
         try:
-            with (
-                httpx.Client(headers=headers, timeout=timeout, verify=self._tls) as http,
-                http.stream("POST", self._url, json=self._request(prompt)) as response,
-            ):
-                for piece in response.iter_bytes():
+            async with http.stream("POST", self._url, json=self._request(prompt)) as response:
+                async for piece in response.aiter_raw():
                     body += piece
-                    if time.monotonic() > deadline:  # httpx's own limit begins again with every piece
-                        raise httpx.ReadTimeout("the answer comes too slowly")
+                    if len(body) > MAX_ANSWER_BYTES:
+                        raise PhaseLabelError(f"{self._url} answered with more than {MAX_ANSWER_BYTES} bytes")
                 return response.status_code, bytes(body)
-        except (httpx.ReadTimeout, httpx.WriteTimeout) as error:
-            raise PhaseLabelError(f"{self._url} took longer than {self._timeout_s:g} s") from error
         except (httpx.TransportError, httpx.InvalidURL) as error:
             kind = PhaseLabelError if isinstance(error, httpx.ConnectTimeout) else _TryAgainError
             raise kind(f"{self._url} could not be asked ({type(error).__name__}: {error})") from error
