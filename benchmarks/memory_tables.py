@@ -1,4 +1,4 @@
-"""The part of ``docs/results.md`` on memory and language: instructions, key poses, teaching, large banks."""
+"""The part of ``docs/results.md`` on memory and language: language, key poses, teaching, large memories."""
 
 from __future__ import annotations
 

@@ -6,7 +6,6 @@ They lie where `make demo` and `make libero` leave theirs, and are made by which
 from __future__ import annotations
 
 import json
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -154,8 +153,7 @@ def policy(
     if episodes is not None:
         chosen = json.dumps(list(episodes))
         options = (f"--dataset.episodes={chosen}", f"--policy.memory_episodes={chosen}", *options)
-    checkpoint, seconds = train(root, root.with_name(variant), options, TRAIN_CONFIGS[simulator])
-    return checkpoint, None if math.isnan(seconds) else seconds
+    return train(root, root.with_name(variant), options, TRAIN_CONFIGS[simulator])
 
 
 def first_episodes(root: Path, demos: int, without: str | None = None) -> list[int]:

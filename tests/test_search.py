@@ -39,7 +39,7 @@ def test_then_comes_the_best_entry_of_each_other_task_the_nearest_first():
 def test_where_nothing_is_considered_the_reason_and_the_nearest_are_named():
     found = search_memory("put the mug on the plate", MEMORY)
     assert found.parts == ()
-    assert "the memory holds no memory for the instruction 'put the mug on the plate'" in found.refusal
+    assert "the memory holds no entry for the instruction 'put the mug on the plate'" in found.refusal
     assert sources(found.others) == ["good", "rack", "stove"]
     assert all(hit.semantic == 0 for hit in found.others)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping
 from functools import partial
 from pathlib import Path
@@ -12,11 +13,15 @@ from huggingface_hub.constants import CONFIG_NAME, SAFETENSORS_SINGLE_FILE
 from huggingface_hub.errors import HFValidationError
 
 from lerobot_openspm.configuration_openspm import OpenSPMConfig
-from lerobot_openspm.errors import MemoryFormatError
+from lerobot_openspm.errors import MemoryFormatError, OpenSPMError
 from lerobot_openspm.geometry.camera import check_sizes
 from lerobot_openspm.memory.io import MEMORY_JSON, arrays_file, read_memory
 from lerobot_openspm.memory.memory import Memory, check_layouts
 from lerobot_openspm.memory.stored_entries import anchored_objects
+
+MAX_CONFIG_BYTES = 1_000_000
+# Options that name programs and addresses on the user's machine.
+USERS_OWN = (("judge", "api_base"), ("segmenter", "sam3d_python"), ("segmenter", "sam3d_checkout"))
 
 
 def checkpoint_folder(name: str | Path, revision: str | None = None, **options: Any) -> Path:
@@ -30,10 +35,12 @@ def checkpoint_folder(name: str | Path, revision: str | None = None, **options: 
     Raises:
         FileNotFoundError: There is no such folder, and it is no name on the Hub.
         MemoryFormatError: It has no memory, or one of another version.
+        OpenSPMError: Its configuration says where pictures are sent or what program is run.
     """
     directory = Path(name)
     if directory.is_dir():
         arrays_file(directory)  # a checkpoint of before has options that its configuration fails on
+        _check_config(directory / CONFIG_NAME)
         return directory
     download = partial(snapshot_download, str(name), **options)
     files = [CONFIG_NAME, SAFETENSORS_SINGLE_FILE, MEMORY_JSON]
@@ -43,9 +50,38 @@ def checkpoint_folder(name: str | Path, revision: str | None = None, **options: 
         raise FileNotFoundError(
             f"no checkpoint folder at {name}, and no name on the Hub (user/name)"
         ) from error
+    _check_config(directory / CONFIG_NAME)
     # The file of arrays is named there. Pushes before may have left others of this kind.
     download(allow_patterns=[arrays_file(directory)], revision=directory.name)
     return directory
+
+
+def _check_config(path: Path) -> None:
+    """Refuse a configuration that names what only the user may: none of ours is saved with it.
+
+    A checkpoint may come from anybody. The judge is sent the user's pictures and key, and SAM 3D's Python is
+    started.
+    """
+    if not path.is_file():
+        return
+    with path.open("rb") as file:
+        blob = file.read(MAX_CONFIG_BYTES + 1)
+    try:
+        config = json.loads(blob) if len(blob) <= MAX_CONFIG_BYTES else None
+    except (ValueError, RecursionError):
+        config = None
+    if not isinstance(config, dict):
+        raise OpenSPMError(
+            f"{path} is no JSON object of up to {MAX_CONFIG_BYTES} bytes; load the checkpoint again"
+        )
+    for group, name in USERS_OWN:
+        own = config.get(group)
+        if isinstance(own, dict) and own.get(name) is not None:
+            raise OpenSPMError(
+                f"{path} sets {group}.{name} to {str(own[name])[:200]!r}, expected null: a checkpoint must "
+                f"not say what your machine runs or sends pictures to; set it to null there, and pass "
+                f"--policy.{group}.{name} if you want it"
+            )
 
 
 def load_memory(directory: Path, config: OpenSPMConfig, is_kept: bool) -> Memory:

@@ -27,7 +27,7 @@ class RunningEpisode:
     Attributes:
         controller: Decides what to do.
         perception: Finds the objects.
-        is_reported: Whether its outcome was reported.
+        is_reported: Whether its success or failure was reported.
     """
 
     controller: EpisodeController

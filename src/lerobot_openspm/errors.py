@@ -22,7 +22,7 @@ class MemoryFormatError(OpenSPMError):
 
 
 class InstructionError(OpenSPMError):
-    """An instruction that the memory holds no memory for."""
+    """An instruction that the memory holds no entry for."""
 
 
 class LexiconError(OpenSPMError):

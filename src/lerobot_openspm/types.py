@@ -104,12 +104,12 @@ class DemonstrationScene:
 
     Attributes:
         views: First frame by camera name, the hand away from the objects.
-        hints: Places that were touched, for any number of objects.
+        cues: Where the hand touched something, for any number of objects.
         later_views: A frame after the grasped object was carried off, by camera name; None if there is none.
     """
 
     views: dict[str, View]
-    hints: tuple[ContactCue, ...]
+    cues: tuple[ContactCue, ...]
     later_views: dict[str, View] | None = None
 
 

@@ -56,7 +56,7 @@ def test_what_the_policy_refuses_says_why_and_what_is_nearest(
     for scene in ([], [f"--dataset.root={tiny_dataset}"]):
         text, found = search(openspm, "put the bowl on the rack", f"--path={checkpoint}", *scene)
         assert found["considered"] == 0
-        assert "holds no memory for the instruction 'put the bowl on the rack'" in found["refusal"]
+        assert "holds no entry for the instruction 'put the bowl on the rack'" in found["refusal"]
         assert f"refused: {found['refusal']}" in text
         assert found["entries"][0]["language"] == BOWL
         assert [hit["geometric"] for hit in found["entries"]] == [None, None]

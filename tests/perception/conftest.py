@@ -27,7 +27,7 @@ def learn(folder: Path) -> None:
 
 @pytest.fixture(scope="session")
 def drawn_objects(make_once: Callable[..., Path]) -> dict[str, ShapeModel]:
-    """Models of the drawn world's block and cup, learned from hints alone."""
+    """Models of the drawn world's block and cup, learned from cues alone."""
     folder = make_once("drawn_objects", learn)
     read = {
         file.stem: store.from_parts(

@@ -73,7 +73,7 @@ def views_of(poses: dict[str, np.ndarray], T_moved: np.ndarray | None = None) ->
 
 
 def demonstration(rng: np.random.Generator, wrong: bool = False) -> DemonstrationScene:
-    """The cup is grasped at its rim and put on the block; one in a few hints may be plainly wrong."""
+    """The cup is grasped at its rim and put on the block; one in a few cues may be plainly wrong."""
     poses = draw_poses(rng)
     grasp = se3.apply(poses["cup"], np.array([[0.03, 0.0, 0.05]]))[0] + rng.normal(0, 0.004, 3)
     release = poses["block"][:3, 3] + [0, 0, 0.12] + rng.normal(0, 0.01, 3)
@@ -81,15 +81,15 @@ def demonstration(rng: np.random.Generator, wrong: bool = False) -> Demonstratio
         aside = np.array([0.2, 0.0, 0.0])
         grasp, release = release + aside, grasp - aside
     later = poses | {"cup": se3.from_yaw(poses["block"][:3, 3] + [0, 0, 0.05], 0.0)}
-    hints = (ContactCue("cup", grasp, "grasp"), ContactCue("block", release, "release"))
-    return DemonstrationScene(views_of(poses), hints, views_of(later))
+    cues = (ContactCue("cup", grasp, "grasp"), ContactCue("block", release, "release"))
+    return DemonstrationScene(views_of(poses), cues, views_of(later))
 
 
 def partly_hidden(scene: DemonstrationScene, name: str, camera: str, share: float) -> DemonstrationScene:
     """The same scene with a grey bar over the right-hand `share` of an object's place in one view."""
     view = scene.views[camera]
-    (hint,) = (hint for hint in scene.hints if hint.name == name)
-    (half, height, *_), foot = SHAPES[name], hint.point_world * [1, 1, 0]
+    (cue,) = (cue for cue in scene.cues if cue.name == name)
+    (half, height, *_), foot = SHAPES[name], cue.point_world * [1, 1, 0]
     corners = foot + np.array([[x, y, z] for x in half for y in half for z in (0, height)]) * [-1, -1, 1]
     uv, _ = project(view.camera, view.T_world_cam, np.vstack([corners, 2 * foot - corners * [1, 1, -1]]))
     low, high = uv.min(axis=0), uv.max(axis=0)

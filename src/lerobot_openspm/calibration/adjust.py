@@ -177,10 +177,7 @@ def adjust(camera: Camera, points: Array, problem: Problem) -> tuple[Camera, Arr
     camera_unit = scale * np.linalg.inv(np.linalg.cholesky(positive(about_camera))).T
     point_unit = scale * np.swapaxes(np.linalg.inv(np.linalg.cholesky(start.features)), 1, 2)
     k, m = len(camera_unit), len(feature)
-    of_camera = np.broadcast_to(np.arange(k), (m, 2, k))
-    of_point = np.broadcast_to((k + 3 * feature[:, None] + np.arange(3))[:, None], (m, 2, 3))
-    columns = np.concatenate([of_camera, of_point], axis=2).ravel()
-    ends = (k + 3) * np.arange(2 * m + 1)
+    columns, ends = _sparsity(k, feature)
 
     def at(x: Array) -> tuple[Camera, Array]:
         return moved(camera, camera_unit @ x[:k]), points + (point_unit @ x[k:].reshape(-1, 3, 1))[..., 0]
@@ -212,3 +209,14 @@ def adjust(camera: Camera, points: Array, problem: Problem) -> tuple[Camera, Arr
         tr_options={"atol": 1e-9, "btol": 1e-9},
     )
     return at(found.x)
+
+
+def _sparsity(k: int, feature: NDArray[np.intp]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Where a Jacobian's entries stand: their columns row by row, and where each row ends.
+
+    Each of a place's two rows has `k` entries for the camera, and three for the place's feature.
+    """
+    m = len(feature)
+    of_camera = np.broadcast_to(np.arange(k), (m, 2, k))
+    of_point = np.broadcast_to((k + 3 * feature[:, None] + np.arange(3))[:, None], (m, 2, 3))
+    return np.concatenate([of_camera, of_point], axis=2).ravel(), (k + 3) * np.arange(2 * m + 1)

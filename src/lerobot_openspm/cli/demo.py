@@ -11,7 +11,6 @@ from pathlib import Path
 from typing import Any
 
 import draccus
-import numpy as np
 
 from lerobot_openspm.cli.pipeline import EVALUATION_SEED, collect_dataset, evaluate, mean_steps, rate, train
 from lerobot_openspm.cli.report import write_report
@@ -69,5 +68,4 @@ def main(args: list[str]) -> None:
         "checkpoint": str(checkpoint),
         "report": str(report),
     }
-    summary = {k: None if isinstance(v, float) and np.isnan(v) else v for k, v in summary.items()}
     print(json.dumps(summary))

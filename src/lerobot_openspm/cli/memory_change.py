@@ -144,7 +144,7 @@ def merge(args: list[str]) -> None:
 
 
 def rate(args: list[str]) -> None:
-    """Count an outcome of one entry."""
+    """Count a success or failure of one entry."""
     config = draccus.parse(RateConfig, args=args)
     _required(config.source, "--source=DATASET#EPISODE")
     success = config.success

@@ -129,19 +129,19 @@ def export(args: list[str]) -> None:
 
 
 def _line(entry: MemoryEntry) -> str:
-    outcomes = f"{entry.successes} of {entry.trials}" if entry.trials else "-"
+    trials = f"{entry.successes} of {entry.trials}" if entry.trials else "-"
     return (
-        f"quality {entry.quality:.2f}  succeeded {outcomes:>9s}  version {entry.version}  "
+        f"quality {entry.quality:.2f}  succeeded {trials:>9s}  version {entry.version}  "
         f"{len(entry.key_poses):2d} key poses  {entry.source}  {entry.language!r}"
     )
 
 
 def _table(entry: MemoryEntry) -> list[str]:
     """An entry as lines: a head, a row for every key pose, and where what was moved should end."""
-    outcomes = f", succeeded {entry.successes} of {entry.trials} times" if entry.trials else ""
+    trials = f", succeeded {entry.successes} of {entry.trials} times" if entry.trials else ""
     head = (
         f"{entry.language!r} from {entry.source}, version {entry.version}, quality {entry.quality:.2f}"
-        f"{outcomes}"
+        f"{trials}"
     )
     names = f"{'phase':10s} {'place':18s} {'axes':18s}"
     columns = f"  {names} {'hand in its frame, mm':>24s} {'turn, deg':>22s} gripper conf."

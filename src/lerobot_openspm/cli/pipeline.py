@@ -75,10 +75,10 @@ def recorded_by(simulator: str) -> str:
 
 def train(
     dataset: Path, output: Path, options: Sequence[str] = (), config_file: Path = TRAIN_CONFIG
-) -> tuple[Path, float]:
+) -> tuple[Path, float | None]:
     """Run lerobot-train, unless its checkpoint is there. Returns the checkpoint and the seconds it took.
 
-    An interrupted run is resumed from its last checkpoint; the seconds are NaN then.
+    An interrupted run is resumed from its last checkpoint; the seconds are None then.
     """
     checkpoint, done = output / "checkpoints" / "last" / "pretrained_model", output / DONE
     if not config_file.is_file():
@@ -100,8 +100,7 @@ def train(
             )  # fmt: skip
         # What an interrupted run took before is not known any more.
         write_json(done, {"seconds": None if resumed else round(time.monotonic() - start_s, 1)})
-    seconds = json.loads(done.read_text())["seconds"]
-    return checkpoint, float("nan") if seconds is None else float(seconds)
+    return checkpoint, json.loads(done.read_text())["seconds"]
 
 
 def evaluate(

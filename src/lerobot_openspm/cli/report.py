@@ -89,7 +89,7 @@ def _films(episodes: Sequence[Episode], evaluation: Path, folder: Path) -> list[
         {
             "video": os.path.relpath(video, folder),
             "seed": episode.seed,
-            "outcome": "success" if episode.success else f"failed ({episode.status.replace('_', ' ')})",
+            "ended": "success" if episode.success else f"failed ({episode.status.replace('_', ' ')})",
             "steps": episode.steps,
         }
         for episode, video in successes + failures

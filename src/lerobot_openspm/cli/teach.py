@@ -85,7 +85,10 @@ def _policy(config: TeachConfig) -> OpenSPMPolicy:
 
     policy = OpenSPMPolicy.from_pretrained(config.into)
     places = {name: place for name, place in vars(config.policy.segmenter).items() if place}
-    segmenter = replace(policy.config.segmenter, **places)
+    try:
+        segmenter = replace(policy.config.segmenter, **places)
+    except ValueError as error:
+        raise OpenSPMError(f"{config.into}: {error}") from error
     cameras = config.policy.cameras or policy.config.cameras
     policy.config = replace(policy.config, cameras=cameras, segmenter=segmenter)
     return policy

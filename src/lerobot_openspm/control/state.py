@@ -126,10 +126,10 @@ class EpisodeState:
         return self.verdict if is_known else None
 
     def entry_successes(self, success: bool) -> list[tuple[MemoryEntry, bool]]:
-        """How the entries fared that were acted by, each once, given whether the episode succeeded.
+        """The entries that were acted by, each once with whether it succeeded, given whether the episode did.
 
         A failure does not count for the parts that were seen to be done, but for all others that were begun.
-        Where every part was seen to be done, one of the sightings is wrong, and the failure counts for all.
+        Where every part was seen to be done, one of these looks was wrong, and the failure counts for all.
         """
         seen = list(zip(self.used, (*self.verdicts, self.verdict), strict=False))
         is_denied = len(seen) == len(self.parts) and all(verdict is True for _, verdict in seen)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import get_args
 
 import numpy as np
 
@@ -18,7 +17,7 @@ from lerobot_openspm.types import Execution, Hand
 RESIDUAL_M, RESIDUAL_RAD = 0.004, 0.06
 # ... and one that is only passed by within these.
 PASSING_M, PASSING_RAD = 0.015, 0.15
-# A correction that leaves more than this share of the residual is blocked by something solid.
+# Where a correction leaves more than this share of the residual, something solid is in the hand's way.
 STUCK_SHARE = 0.9
 # A blocked key pose is met within this multiple of the tolerance, because what is touched is in the way.
 BLOCKED_SHARE = 3.0
@@ -156,6 +155,8 @@ class ClosedLoopTRC(ClosedLoop):
         return np.concatenate([motion / max(1.0, float(np.abs(motion).max())), action[3:]])
 
 
-STRATEGIES: dict[Execution, type[ClosedLoop]] = dict(
-    zip(get_args(Execution), (OpenLoop, ClosedLoop, ClosedLoopTRC), strict=True)
-)
+STRATEGIES: dict[Execution, type[ClosedLoop]] = {
+    "open_loop": OpenLoop,
+    "closed_loop": ClosedLoop,
+    "closed_loop_trc": ClosedLoopTRC,
+}

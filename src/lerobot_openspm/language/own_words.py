@@ -26,6 +26,9 @@ NOT_VERBATIM = 0.99
 MAX_NAME = 60
 
 _WITH = "with"
+# What one thing after another is said with: "wipe the table, and then open the drawer".
+_NEXT = re.compile(r"(?:\band )?\bthen\b|[;.!?\n]+", re.IGNORECASE)
+_AND = re.compile(r"\band\b", re.IGNORECASE)
 # Verbs whose last letter doubles before "-ing": "tapping" is of "tap", so "taping" is not.
 _DOUBLES = re.compile("[^aeiou]*[aeiou][^aeiouwxy]")
 # Where a thing ends that is put, poured or laid there.
@@ -155,6 +158,15 @@ def _base_forms(lex: Lexicon, verb: str) -> set[str]:
         elif not _DOUBLES.fullmatch(stem):
             forms.add(stem)
     return forms
+
+
+def split_steps(instruction: str, lex: Lexicon = ENGLISH) -> list[str]:
+    """What is asked one after another, joined by "then" or a full stop, else by "and"; none for one step."""
+    for joint in (_NEXT, _AND):
+        steps = [step for step in joint.split(instruction) if normal_words(step, lex)]
+        if len(steps) > 1:
+            return steps
+    return []
 
 
 @lru_cache(maxsize=4096)

@@ -6,7 +6,6 @@ demonstration shows as a whole is carried out by entries of its parts, one after
 
 from __future__ import annotations
 
-import re
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
@@ -16,7 +15,7 @@ from lerobot_openspm.errors import InstructionError
 from lerobot_openspm.language.descriptions import phrase
 from lerobot_openspm.language.meaning import semantic_score
 from lerobot_openspm.language.names import TABLE_NAMES, NameSimilarity
-from lerobot_openspm.language.own_words import normal_words
+from lerobot_openspm.language.own_words import split_steps
 from lerobot_openspm.memory.entry import CONTACT_PHASES, MemoryEntry, RetrievalKey
 from lerobot_openspm.memory.indexed_entries import near
 from lerobot_openspm.memory.retrieval import candidates_for, read_instruction, why_unread
@@ -24,9 +23,6 @@ from lerobot_openspm.types import SubTask
 
 # A sub-task takes hold of something and lets it go again.
 TRANSITIONS_PER_SUB_TASK = 2
-# What one thing after another is said with: "wipe the table, and then open the drawer".
-_NEXT = re.compile(r"(?:\band )?\bthen\b|[;.!?\n]+", re.IGNORECASE)
-_AND = re.compile(r"\band\b", re.IGNORECASE)
 
 
 @dataclass(frozen=True)
@@ -133,21 +129,18 @@ def plan_parts(
 def _plan_by_words(
     instruction: str, asked: tuple[SubTask, ...], entries: Sequence[MemoryEntry], names: NameSimilarity
 ) -> tuple[tuple[Candidate, ...], ...]:
-    """Likewise where the grammar cannot read: as a whole, else each of what "then" or "and" joins."""
+    """Likewise where the grammar cannot read: as a whole, else step by step."""
     try:
         # By their words things are not told from others of their name, so what is asked is what was shown.
         found = candidates_for(asked, instruction, entries, names)
         return (tuple(Candidate(one, score, one, one.key.sub_tasks) for one, score in found),)
     except InstructionError as error:
-        splits = (
-            [one for one in joint.split(instruction) if normal_words(one, names.lexicon)]
-            for joint in (_NEXT, _AND)
-        )
+        steps = split_steps(instruction, names.lexicon)
         with suppress(InstructionError):
-            if sentences := next((pieces for pieces in splits if len(pieces) > 1), None):
-                chain: list[tuple[Candidate, ...]] = []
-                for one in sentences:
-                    chain += plan_parts(one, read_instruction(one, entries, names), entries, names)
+            chain: list[tuple[Candidate, ...]] = []
+            for one in steps:
+                chain += plan_parts(one, read_instruction(one, entries, names), entries, names)
+            if chain:
                 return tuple(chain)
         why = why_unread(instruction, entries, names)
         raise InstructionError(f"{why}; and {error}" if why else str(error)) from error

@@ -184,7 +184,7 @@ class MemoryEntry:
         version: The paper's ``nu_i``: counts up when an entry is replaced.
         source: Dataset and episode the entry was mined from.
         object_poses: Poses ``T_world_obj`` ``(4, 4)`` of the objects at the start of the demonstration.
-        trials: How often the entry was acted by at deployment, where the outcome is known.
+        trials: How often the entry was acted by at deployment, where it is known whether that succeeded.
         successes: How many of these succeeded.
         outcomes: Where the sub-tasks leave what they move, for those of which it is known.
     """

@@ -18,7 +18,7 @@ from lerobot_openspm.memory.key_vector import key_vectors
 from lerobot_openspm.memory.stored_entries import Key, StoredEntries
 from lerobot_openspm.types import SubTask
 
-# Banks of more entries are indexed; scoring fewer takes no longer than perception.
+# Memories of more entries are indexed; scoring fewer takes no longer than perception.
 INDEX_FROM = 1000
 # Keys that the index returns for each part of an instruction.
 NEAREST_KEYS = 64

@@ -133,7 +133,7 @@ def _unknown(
     is_near = nearest is not None and scores[nearest.key.sub_tasks] > 0
     did_you_mean = f"; did you mean {nearest.language!r}?" if nearest is not None and is_near else ""
     return (
-        f"the memory holds no memory for the instruction {instruction!r}{did_you_mean or ';'} it knows: "
+        f"the memory holds no entry for the instruction {instruction!r}{did_you_mean or ';'} it knows: "
         f"{known}. Record demonstrations of it and train again, or use one of these instructions"
     )
 

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import os
 import shutil
+import stat
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from itertools import groupby
 from pathlib import Path
 from typing import Any
@@ -70,8 +71,10 @@ def write_annotated(demonstrations: Demonstrations, mined: MinedKeyPoses, folder
         shutil.rmtree(beside)
     dataset, every = demonstrations.dataset, (*mined.episodes, *mined.held_out)
     try:
-        # Hidden files are the downloader's notes.
-        shutil.copytree(dataset.root, beside, copy_function=_copy, ignore=shutil.ignore_patterns(".*"))
+        shutil.copytree(dataset.root, beside, copy_function=_copy, ignore=_left_out(Path(dataset.root)))
+        for path in (beside, *beside.rglob("*")):  # folders that were read-only stay so in a copy
+            if path.is_dir():
+                path.chmod(path.stat().st_mode | stat.S_IRWXU)
         _write_columns(demonstrations, every, beside)
         if not dataset.meta.has_language_columns:
             _write_sub_tasks(every, beside)
@@ -84,6 +87,13 @@ def write_annotated(demonstrations: Demonstrations, mined: MinedKeyPoses, folder
     except BaseException:
         shutil.rmtree(beside, ignore_errors=True)
         raise
+
+
+def _left_out(root: Path) -> Callable[[str, list[str]], set[str]]:
+    """What of a dataset is not copied: the downloader's hidden files, and pictures that became videos."""
+    return lambda folder, names: {
+        name for name in names if name.startswith(".") or (name == "images" and Path(folder) == root)
+    }
 
 
 def _copy(source: str, target: str) -> None:

@@ -78,7 +78,7 @@ def find_objects(
         shape: What is learned about an object that a segmenter finds.
         shapes: Measures objects, for shape "sam3d".
     """
-    named = sorted({cue.name for scene in scenes for cue in scene.hints} - set(known))
+    named = sorted({cue.name for scene in scenes for cue in scene.cues} - set(known))
     models = dict(known)
     if named:
         logger.info("learning what these look like: %s", ", ".join(named))
@@ -91,7 +91,7 @@ def find_objects(
         wanted = dict.fromkeys(name for sub_task in item.sub_tasks for name in sub_task.objects)
         sought = {name: models[name] for name in wanted if name in models}
         estimates = detect(scene.views, sought, segmenter)
-        places = {name: _place(name, estimate, scene.hints) for name, estimate in estimates.items()}
+        places = {name: _place(name, estimate, scene.cues) for name, estimate in estimates.items()}
         found.append({name: T for name, T in places.items() if T is not None})
         ends.append(_ends(scene, item, found[-1], models, segmenter))
     return FoundObjects(models, found, ends)

@@ -1,4 +1,4 @@
-"""Learning the boxes of drawn objects from hints and masks, and finding them again."""
+"""Learning the boxes of drawn objects from cues and masks, and finding them again."""
 
 from dataclasses import replace
 
@@ -169,8 +169,8 @@ def test_of_two_instances_the_one_of_the_right_size_is_taken(models):
 def test_the_instance_that_the_hand_touched_is_learned():
     views, poses, found = two_blocks()
     for name in NAMES:
-        hint = ContactCue("block", poses[name][:3, 3] + [0, 0, 0.04], "grasp")
-        chosen = touched(views, found, [hint], 0.0)
+        cue = ContactCue("block", poses[name][:3, 3] + [0, 0, 0.04], "grasp")
+        chosen = touched(views, found, [cue], 0.0)
         index = NAMES.index(name)
         assert all(chosen[camera] is found[camera][index] for camera in views)
         above = ContactCue("block", poses[name][:3, 3] + [0, 0, 0.2], "release")
@@ -195,9 +195,7 @@ def test_something_quite_different_is_not_found(models, unseen):
 
 def test_what_is_never_seen_near_the_hints_is_left_out(scenes, caplog):
     away = [
-        replace(
-            s, hints=tuple(replace(h, point_world=h.point_world + np.array([0, 0.5, 0])) for h in s.hints)
-        )
+        replace(s, cues=tuple(replace(h, point_world=h.point_world + np.array([0, 0.5, 0])) for h in s.cues))
         for s in scenes
     ]
     assert learn_boxes(examples(["block"], away, (), segmenter(), "box")) == {}

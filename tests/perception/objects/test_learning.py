@@ -1,4 +1,4 @@
-"""Learning objects of a drawn world from hints alone, and finding them again."""
+"""Learning objects of a drawn world from cues alone, and finding them again."""
 
 import dataclasses
 import json
@@ -74,7 +74,7 @@ def test_what_often_hides_a_part_does_not_shrink_the_shape():
     rng = np.random.default_rng(1)
     hidden = [partly_hidden(demonstration(rng), "block", "side", 0.3) for _ in range(10)]
     scenes = [
-        dataclasses.replace(scene, hints=tuple(hint for hint in scene.hints if hint.name == "block"))
+        dataclasses.replace(scene, cues=tuple(cue for cue in scene.cues if cue.name == "block"))
         for scene in hidden
     ]
     block = learn_objects(scenes, np.random.default_rng(0))["block"]

@@ -74,11 +74,11 @@ def several_tasks(n, T_moved=None):
     rng = np.random.default_rng(5)
     placed = [poses(rng) for _ in range(n)]
     moved = [None if T_moved is None or i % 2 else T_moved for i in range(n)]
-    hints = [
+    cues = [
         ContactCue("cup", placed[0]["cup"][:3, 3] + [0.03, 0.0, 0.05], "grasp", "first"),
         ContactCue("block", placed[1]["block"][:3, 3] + [0.0, 0.02, 0.04], "grasp", "second"),
     ]
-    given = [(hints[i],) if i < len(hints) else () for i in range(n)]
+    given = [(cues[i],) if i < len(cues) else () for i in range(n)]
     return [DemonstrationScene(views_of(T, m), g) for T, m, g in zip(placed, moved, given, strict=True)]
 
 
@@ -92,8 +92,8 @@ def test_one_demonstration_of_each_of_several_tasks_is_enough(unseen, shift):
 
 def test_two_objects_never_follow_the_same_motion():
     scenes = several_tasks(10)
-    hint = scenes[0].hints[0]
-    twice = [dataclasses.replace(scenes[0], hints=(hint, dataclasses.replace(hint, name="mug"))), *scenes[1:]]
+    cue = scenes[0].cues[0]
+    twice = [dataclasses.replace(scenes[0], cues=(cue, dataclasses.replace(cue, name="mug"))), *scenes[1:]]
     models = learn_patches(examples(["block", "cup", "mug"], twice))
     assert "block" in models
     assert len({"cup", "mug"} & set(models)) == 1
@@ -102,8 +102,8 @@ def test_two_objects_never_follow_the_same_motion():
 def test_what_is_known_already_is_not_learned_again_under_another_name():
     scenes = several_tasks(10)
     known = learn_patches(examples(["cup"], scenes))["cup"]
-    mug = dataclasses.replace(scenes[0].hints[0], name="mug")
-    again = [dataclasses.replace(scenes[0], hints=(mug,)), *scenes[1:]]
+    mug = dataclasses.replace(scenes[0].cues[0], name="mug")
+    again = [dataclasses.replace(scenes[0], cues=(mug,)), *scenes[1:]]
     assert "mug" in learn_patches(examples(["mug"], again))
     assert learn_patches(examples(["mug"], again, [known])) == {}
 

@@ -23,7 +23,7 @@ from lerobot_openspm.types import DemonstrationScene, Mask, PoseEstimate, Segmen
 
 # Fingers close above the plane that objects stand on; where nothing else tells it, it is taken to lie this
 # far below the lowest point that they ever went to, metres.
-BELOW_HINTS_M = 0.02
+BELOW_CUES_M = 0.02
 
 # By camera: what a segmenter found of one phrase.
 Instances = Mapping[str, Sequence[Segmentation]]
@@ -212,7 +212,7 @@ class Examples:
     @property
     def floor(self) -> float:
         """World height, metres, below which nothing that the hand touched can stand."""
-        return min(float(hint.point_world[2]) for one in self.scenes for hint in one.hints) - BELOW_HINTS_M
+        return min(float(cue.point_world[2]) for one in self.scenes for cue in one.cues) - BELOW_CUES_M
 
 
 @dataclass(frozen=True)
@@ -221,7 +221,7 @@ class Kind:
 
     Attributes:
         name: As it is called in records.
-        learn: From examples, the objects that can be known this way; leaves the others out.
+        learn: Learns from examples the objects that this kind can represent, and leaves the others out.
         from_record: The object of a record's fields and arrays, all of them checked; the last argument names
             their origin in a MemoryFormatError.
     """

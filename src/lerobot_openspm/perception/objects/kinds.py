@@ -44,7 +44,7 @@ def learn_objects(
     Raises:
         DatasetError: No scene has a contact cue.
     """
-    named = {hint.name for scene in scenes for hint in scene.hints}
+    named = {cue.name for scene in scenes for cue in scene.cues}
     if not named:
         raise DatasetError(
             "no demonstration shows a grasp, contact or release; perception has nothing to learn from"

@@ -26,10 +26,10 @@ MAX_OBJECTS = 3
 MAX_SCENES = 30
 
 
-def column(hint: ContactCue, floor: float) -> list[Array]:
+def column(cue: ContactCue, floor: float) -> list[Array]:
     """Points ``(3,)`` every 2 cm from a contact cue straight down to the world height ``floor``."""
-    heights = np.arange(hint.point_world[2], floor - 1e-9, -0.02)
-    return [np.array([*hint.point_world[:2], z], dtype=np.float64) for z in heights]
+    heights = np.arange(cue.point_world[2], floor - 1e-9, -0.02)
+    return [np.array([*cue.point_world[:2], z], dtype=np.float64) for z in heights]
 
 
 def whole_mask(mask: Mask) -> Blob | None:
@@ -47,24 +47,22 @@ def whole_mask(mask: Mask) -> Blob | None:
 
 
 def touched(
-    views: Mapping[str, View], instances: Instances, hints: Sequence[ContactCue], floor: float
+    views: Mapping[str, View], instances: Instances, cues: Sequence[ContactCue], floor: float
 ) -> ObjectMasks:
     """Per camera, the instance that is nearest to where the hand touched the object.
 
     Args:
         views: The first frame's views.
         instances: What the segmenter found in them.
-        hints: Where the object was touched; below a release, down to the world height ``floor``.
+        cues: Where the object was touched; below a release, down to the world height ``floor``.
         floor: World height below which nothing stands, metres.
 
     Returns:
         At most one instance per camera; none where the nearest is too far off.
     """
     points = [
-        np.stack(column(hint, floor) or [hint.point_world])
-        if hint.kind == "release"
-        else hint.point_world[None]
-        for hint in hints
+        np.stack(column(cue, floor) or [cue.point_world]) if cue.kind == "release" else cue.point_world[None]
+        for cue in cues
     ]
     found = {}
     for camera, ones in instances.items():
@@ -79,14 +77,14 @@ def touched(
 def segmented(
     phrases: Sequence[str], scenes: Sequence[DemonstrationScene], segmenter: Segmenter
 ) -> dict[str, list[tuple[DemonstrationScene, Instances]]]:
-    """By phrase, at most :data:`MAX_SCENES` scenes that hint at it, with what a segmenter found of it there.
+    """By phrase, at most :data:`MAX_SCENES` scenes with a cue for it, and what a segmenter found of it there.
 
     A scene is shown to the segmenter once, with all its phrases: large models encode an image once for all.
     """
     wanted: dict[int, list[str]] = {}
     for phrase in phrases:
-        hinted = [i for i, scene in enumerate(scenes) if any(hint.name == phrase for hint in scene.hints)]
-        for i in hinted[:: max(1, -(-len(hinted) // MAX_SCENES))]:
+        with_cue = [i for i, scene in enumerate(scenes) if any(cue.name == phrase for cue in scene.cues)]
+        for i in with_cue[:: max(1, -(-len(with_cue) // MAX_SCENES))]:
             wanted.setdefault(i, []).append(phrase)
     pairs: dict[str, list[tuple[DemonstrationScene, Instances]]] = {phrase: [] for phrase in phrases}
     for i, names in sorted(wanted.items()):

@@ -44,4 +44,5 @@ def make_segmenter(
         return sam3.Sam3Segmenter.from_pretrained(*names, device=device)
     if name == "grounded_sam2":
         return grounded_sam2.GroundedSam2Segmenter.from_pretrained(*names, device=device)
+    assert name == "given"
     return GivenSegmenter(labels)

@@ -92,10 +92,10 @@ BOX = Kind(BoxModel.kind, learn_boxes, from_record)
 
 
 def _see(scene: DemonstrationScene, name: str, instances: Instances, floor: float) -> Seen | None:
-    hints = [hint for hint in scene.hints if hint.name == name]
+    cues = [cue for cue in scene.cues if cue.name == name]
     masks = {
         camera: Segmentation(blob.mask, one.confidence)
-        for camera, one in touched(scene.views, instances, hints, floor).items()
+        for camera, one in touched(scene.views, instances, cues, floor).items()
         if (blob := whole_mask(one.mask)) is not None
     }
     lifted = lift(scene.views, {camera: one.mask for camera, one in masks.items()}, floor)

@@ -119,20 +119,20 @@ PATCHES = Kind(PatchModel.kind, learn_patches, from_record)
 
 def _candidate(name: str, scenes: Sequence[DemonstrationScene]) -> _Candidate:
     """Follow patches of all kinds at an object's touched places, and group those that agree."""
-    own = [scene for scene in scenes if any(hint.name == name for hint in scene.hints)]
-    others = [scene for scene in scenes if not any(hint.name == name for hint in scene.hints)]
+    own = [scene for scene in scenes if any(cue.name == name for cue in scene.cues)]
+    others = [scene for scene in scenes if not any(cue.name == name for cue in scene.cues)]
     own = _spaced(own, max(MAX_SCENES // 2, MAX_SCENES - len(others)))
     looked_at = own + _spaced(others, MAX_SCENES - len(own))
-    hints = [next(hint for hint in scene.hints if hint.name == name) for scene in own]
+    cues = [next(cue for cue in scene.cues if cue.name == name) for scene in own]
     trails = []
-    for number, place in enumerate(places_of(hints)):
-        first = next(i for i, hint in enumerate(hints) if hint is place[0])
+    for number, place in enumerate(places_of(cues)):
+        first = next(i for i, cue in enumerate(cues) if cue is place[0])
         for camera in own[first].views:
             for drop in DROPS_M:
-                points = hints[first].point_world - [0.0, 0.0, drop]
+                points = cues[first].point_world - [0.0, 0.0, drop]
                 found = (_follow(number, first, camera, points, radius, looked_at) for radius in RADII_M)
                 trails += [trail for trail in found if trail is not None]
-    return _Candidate(name, looked_at, _believable(_agreeing(trails), hints))
+    return _Candidate(name, looked_at, _believable(_agreeing(trails), cues))
 
 
 def _spaced[T](things: Sequence[T], n: int) -> list[T]:
@@ -199,14 +199,14 @@ def _difference(motion: Array, other: Array) -> float:
     return float(np.percentile(np.linalg.norm(apart - np.median(apart, axis=0), axis=1), 75))
 
 
-def _believable(groups: Sequence[list[_Trail]], hints: Sequence[ContactCue]) -> list[list[_Trail]]:
+def _believable(groups: Sequence[list[_Trail]], cues: Sequence[ContactCue]) -> list[list[_Trail]]:
     """The groups that are large enough and agree with where the hand went, or else, untold, move at all."""
     large = [group for group in groups if len(group) >= MIN_AGREEING]
-    places = [place for place in places_of(hints) if len(place) >= MIN_TOUCHES]
+    places = [place for place in places_of(cues) if len(place) >= MIN_TOUCHES]
     if not places:
         return [group for group in large if _moves(group[0])]
-    residuals = [_residual(group[0].points, hints, places) for group in large]
-    still = _residual(np.zeros((len(hints), 2)), hints, places)
+    residuals = [_residual(group[0].points, cues, places) for group in large]
+    still = _residual(np.zeros((len(cues), 2)), cues, places)
     bound = min(max(EXPLAINED_SHARE * still, STILL_M), RESIDUAL_RATIO * min(residuals, default=0.0))
     return [group for group, residual in zip(large, residuals, strict=True) if residual <= bound]
 
@@ -216,15 +216,15 @@ def _moves(trail: _Trail) -> bool:
     return trail.seen >= MIN_SCENES and size > AGREEMENT_M
 
 
-def _residual(points: Array, hints: Sequence[ContactCue], places: Sequence[Sequence[ContactCue]]) -> float:
-    """Root mean square distance of points ``(n, 2)`` from hints, less each place's own offset, metres.
+def _residual(points: Array, cues: Sequence[ContactCue], places: Sequence[Sequence[ContactCue]]) -> float:
+    """Root mean square distance of points ``(n, 2)`` from cues, less each place's own offset, metres.
 
     Offsets are estimated from the same touches, so a place of n touches tells of n - 1 distances.
     """
-    offsets = np.stack([hint.point_world[:2] for hint in hints]) - points[: len(hints)]
+    offsets = np.stack([cue.point_world[:2] for cue in cues]) - points[: len(cues)]
     squares, degrees = 0.0, 0
     for place in places:
-        own = offsets[[i for i, hint in enumerate(hints) if any(hint is one for one in place)]]
+        own = offsets[[i for i, cue in enumerate(cues) if any(cue is one for one in place)]]
         own = own[np.isfinite(own[:, 0])]
         if len(own) > 1:
             squares += float(((own - own.mean(axis=0)) ** 2).sum())

@@ -32,7 +32,7 @@ def hardly_moving(
 
     Args:
         names: The objects.
-        scenes: First frames of all demonstrations, with hints at the objects.
+        scenes: First frames of all demonstrations, with cues at the objects.
         known: Other objects, which are known by patches where they hardly moved.
     """
     told = {name: p for name in names if (p := _hardly_moves(scenes, name)) is not None}
@@ -53,8 +53,8 @@ def _hardly_moves(scenes: Sequence[DemonstrationScene], name: str) -> float | No
     nothing is known of its scale beforehand (Gelman et al., Bayesian Data Analysis, section 2.6). Kept
     strictly between 0 and 1; None where no place was touched twice.
     """
-    places = places_of(hint for scene in scenes for hint in scene.hints if hint.name == name)
-    points = [np.stack([hint.point_world[:2] for hint in place]) for place in places]
+    places = places_of(cue for scene in scenes for cue in scene.cues if cue.name == name)
+    points = [np.stack([cue.point_world[:2] for cue in place]) for place in places]
     degrees = 2 * sum(len(own) - 1 for own in points)
     if degrees == 0:
         return None
@@ -62,9 +62,9 @@ def _hardly_moves(scenes: Sequence[DemonstrationScene], name: str) -> float | No
     return float(np.clip(chi2.sf(squares / MAX_STD_M**2, degrees), 1e-6, 1 - 1e-6))
 
 
-def places_of(hints: Iterable[ContactCue]) -> list[list[ContactCue]]:
+def places_of(cues: Iterable[ContactCue]) -> list[list[ContactCue]]:
     """Hints grouped by the place on the object that they touch."""
     groups: dict[tuple[str, str], list[ContactCue]] = {}
-    for hint in hints:
-        groups.setdefault((hint.kind, hint.place), []).append(hint)
+    for cue in cues:
+        groups.setdefault((cue.kind, cue.place), []).append(cue)
     return list(groups.values())

@@ -1,4 +1,4 @@
-"""From hints to colours: which pixels of the first frames are the object's, agreed over all demonstrations.
+"""From cues to colours: which pixels of the first frames are the object's, agreed over all demonstrations.
 
 Mining says where the hand touched an object, not what the object looks like. Pixels near those places, if
 possible those that changed when the object was carried off, start a colour model; its patches, grown a
@@ -32,7 +32,7 @@ MIN_ENCLOSED = 4
 
 @dataclass(frozen=True)
 class Picture:
-    """One view of one scene's first frame, with the hints for one object.
+    """One view of one scene's first frame, with the cues for one object.
 
     Attributes:
         scene: Index of the scene.
@@ -40,7 +40,7 @@ class Picture:
         view: The view.
         bins: Its colour bins ``(H, W)``.
         changed: Pixels ``(H, W)`` that differ in the later frame; None without a later frame.
-        hints: The hints.
+        cues: The cues.
         floor: World height below which no part of a release column is sought, metres.
     """
 
@@ -49,28 +49,28 @@ class Picture:
     view: View
     bins: foreground.Bins
     changed: Mask | None
-    hints: tuple[ContactCue, ...]
+    cues: tuple[ContactCue, ...]
     floor: float
 
     def seed(self) -> Mask:
-        """Pixels ``(H, W)`` that may be the object's, judging by the hints alone."""
+        """Pixels ``(H, W)`` that may be the object's, judging by the cues alone."""
         seed = np.zeros(self.bins.shape, bool)
-        for hint in self.hints:
-            if hint.kind == "release":
-                for point in column(hint, self.floor):
+        for cue in self.cues:
+            if cue.kind == "release":
+                for point in column(cue, self.floor):
                     seed |= disc(self.view, point, RELEASE_RADIUS)
                 continue
-            near = disc(self.view, hint.point_world, SEED_RADIUS)
+            near = disc(self.view, cue.point_world, SEED_RADIUS)
             if self.changed is not None and (self.changed & near).sum() > 0.3 * max(near.sum(), 1):
-                near = disc(self.view, hint.point_world, CHANGED_RADIUS) & self.changed
+                near = disc(self.view, cue.point_world, CHANGED_RADIUS) & self.changed
             seed |= near
         return seed
 
     def neutral(self) -> Mask:
-        """Pixels ``(H, W)`` within a wide radius of the hints."""
+        """Pixels ``(H, W)`` within a wide radius of the cues."""
         mask = np.zeros(self.bins.shape, bool)
-        for hint in self.hints:
-            for point in column(hint, self.floor) if hint.kind == "release" else [hint.point_world]:
+        for cue in self.cues:
+            for point in column(cue, self.floor) if cue.kind == "release" else [cue.point_world]:
                 mask |= disc(self.view, point, NEUTRAL_RADIUS)
         return mask
 
@@ -84,7 +84,7 @@ def changed_pixels(first: View, later: View) -> Mask | None:
 
 
 def learn_colours(pictures: Sequence[Picture]) -> NDArray[np.float32]:
-    """Log-odds ``(N_BINS,)`` per colour of the object that the pictures' hints touch."""
+    """Log-odds ``(N_BINS,)`` per colour of the object that the pictures' cues touch."""
     regions = [picture.seed() for picture in pictures]
     outsides = [~(picture.neutral() | region) for picture, region in zip(pictures, regions, strict=True)]
     log_odds = _evidence(pictures, regions, outsides)
@@ -104,7 +104,7 @@ def learn_colours(pictures: Sequence[Picture]) -> NDArray[np.float32]:
 
 
 def hinted_blob(picture: Picture, log_odds: NDArray[np.float32]) -> Blob | None:
-    """The patch of the object's colours that a picture's hints point at; None if there is none."""
+    """The patch of the object's colours that a picture's cues point at; None if there is none."""
     blobs = find_blobs(foreground.probability(picture.bins, log_odds), 8, 6)
     seed = picture.seed()
     near = grow(seed, 4) if seed.any() else seed

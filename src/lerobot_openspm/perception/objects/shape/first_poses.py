@@ -1,4 +1,4 @@
-"""Where an object is in the first frames, before its shape is known: from its patches and the hints."""
+"""Where an object is in the first frames, before its shape is known: from its patches and the cues."""
 
 from __future__ import annotations
 
@@ -28,20 +28,20 @@ Patched = tuple[Evidence, Blob | None]
 
 
 def pictures_of(index: int, name: str, scene: DemonstrationScene, floor: float) -> list[Picture]:
-    """A scene's views with the hints for one object and what changed when it was carried off."""
-    hints = tuple(hint for hint in scene.hints if hint.name == name)
+    """A scene's views with the cues for one object and what changed when it was carried off."""
+    cues = tuple(cue for cue in scene.cues if cue.name == name)
     look, later = Look(scene.views), scene.later_views or {}
     return [
         Picture(
             index, key, view, look.bins(key),
-            colour_bootstrap.changed_pixels(view, later[key]) if key in later else None, hints, floor,
+            colour_bootstrap.changed_pixels(view, later[key]) if key in later else None, cues, floor,
         )
         for key, view in scene.views.items()
     ]  # fmt: skip
 
 
 def coloured(pictures: Sequence[Picture], log_odds: NDArray[np.float32]) -> dict[int, list[Patched]]:
-    """By scene, each view's foreground by colour and the patch that the hints point at."""
+    """By scene, each view's foreground by colour and the patch that the cues point at."""
     visible = colour_bootstrap.hiding_pixels(pictures, log_odds)
     groups: dict[int, list[Patched]] = {}
     for picture in pictures:
@@ -55,8 +55,8 @@ def coloured(pictures: Sequence[Picture], log_odds: NDArray[np.float32]) -> dict
 
 def masked(name: str, scene: DemonstrationScene, floor: float, instances: Instances) -> list[Patched]:
     """Each view's foreground by a segmenter: the instance that the hand touched, or nothing."""
-    hints = [hint for hint in scene.hints if hint.name == name]
-    seen = touched(scene.views, instances, hints, floor)
+    cues = [cue for cue in scene.cues if cue.name == name]
+    seen = touched(scene.views, instances, cues, floor)
     group: list[Patched] = []
     for camera, view in scene.views.items():
         blob = whole_mask(seen[camera].mask) if camera in seen else None

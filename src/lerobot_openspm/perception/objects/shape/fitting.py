@@ -97,7 +97,7 @@ def fit(
     evidence: Sequence[Evidence],
     cloud: Cloud,
     T_start: Array,
-    freedom: PosePrior,
+    pose_prior: PosePrior,
     cuts_px: Sequence[float],
     detail_px: float = FINE_PX,
 ) -> Fit:
@@ -107,11 +107,11 @@ def fit(
         evidence: The views.
         cloud: The model.
         T_start: Start pose ``(4, 4)``, upright.
-        freedom: What may move, and how far.
+        pose_prior: What may move, and how far.
         cuts_px: One Gauss-Newton step per entry; residuals beyond the entry are outliers in that step.
         detail_px: Size of the drawings, see :func:`silhouette.draw`.
     """
-    T, prior, offset = np.array(T_start, float), freedom.information, np.zeros(4)
+    T, prior, offset = np.array(T_start, float), pose_prior.information, np.zeros(4)
     hessian, scale = np.zeros((4, 4)), 1.0
     for cut in cuts_px:
         hessian, gradient, squares, weights = np.zeros((4, 4)), np.zeros(4), 0.0, 0.0

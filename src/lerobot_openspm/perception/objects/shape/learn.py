@@ -82,12 +82,12 @@ def _learn_coloured(
     name: str, scenes: Sequence[DemonstrationScene], floor: float, rng: Generator
 ) -> ShapeModel | None:
     """Colours and shape of an object from scenes with contact cues; None, with a warning, if in vain."""
-    hinted = [i for i, scene in enumerate(scenes) if any(hint.name == name for hint in scene.hints)]
-    if len(hinted) > MAX_SCENES:
-        hinted = sorted(rng.choice(hinted, MAX_SCENES, replace=False).tolist())
-    pictures = [picture for i in hinted for picture in pictures_of(i, name, scenes[i], floor)]
+    with_cue = [i for i, scene in enumerate(scenes) if any(cue.name == name for cue in scene.cues)]
+    if len(with_cue) > MAX_SCENES:
+        with_cue = sorted(rng.choice(with_cue, MAX_SCENES, replace=False).tolist())
+    pictures = [picture for i in with_cue for picture in pictures_of(i, name, scenes[i], floor)]
     log_odds = colour_bootstrap.learn_colours(pictures)
-    return _learn_shape(name, log_odds, coloured(pictures, log_odds), len(hinted))
+    return _learn_shape(name, log_odds, coloured(pictures, log_odds), len(with_cue))
 
 
 def _learn_masked(
@@ -106,7 +106,7 @@ def _learn_shape(
 ) -> ShapeModel | None:
     posed, half_size = first_poses(groups)
     if not posed:
-        log.warning("perception: %r was not found near the hints of its %d demonstrations", name, count)
+        log.warning("perception: %r was not found near the cues of its %d demonstrations", name, count)
         return None
     found = _bootstrap(posed, half_size)
     if found is None:
@@ -285,8 +285,8 @@ def _centred(
 
 
 def _refit(scene: Posed, cloud: Cloud, period: float) -> Fit:
-    freedom = PosePrior(yaw=0.0) if period == 0 else PosePrior()
-    return fit(scene.evidence, cloud, scene.T_world_obj, freedom, FINE_CUTS_PX)
+    prior = PosePrior(yaw=0.0) if period == 0 else PosePrior()
+    return fit(scene.evidence, cloud, scene.T_world_obj, prior, FINE_CUTS_PX)
 
 
 def _reliable(posed: Sequence[Posed], cloud: Cloud) -> list[Posed]:
