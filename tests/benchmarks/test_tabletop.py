@@ -27,7 +27,7 @@ def _stages(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
     for module in (tabletop, stages):
         monkeypatch.setattr(module, "collect_dataset", collect)
-    monkeypatch.setattr(stages, "train", lambda *_: (Path("checkpoint"), float("nan")))
+    monkeypatch.setattr(stages, "train", lambda *_: (Path("checkpoint"), None))
     monkeypatch.setattr(tabletop, "evaluate", lambda *_, **__: EPISODES)
 
 

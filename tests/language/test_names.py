@@ -73,7 +73,7 @@ def test_embeddings_are_not_asked_of_what_the_memory_knows(embedded: Model2VecNa
     found = semantic_candidates("put the goblet on the plate", [known], embedded)
     assert [item[0] for item in found] == [known]
     elsewhere = entry("put the goblet on the stove")
-    with pytest.raises(InstructionError, match="no memory"):
+    with pytest.raises(InstructionError, match="no entry"):
         semantic_candidates("put the goblet on the plate", [known, elsewhere], embedded)
 
 
@@ -113,5 +113,5 @@ def test_embeddings_compare_the_words_of_what_the_grammar_cannot_read(tmp_path):
     (found,) = semantic_candidates("scrub the table", entries, names)
     assert 0.75 <= found[1] < 1
     for asked, similarity in (("scrub the table", TABLE_NAMES), ("burn the table", names)):
-        with pytest.raises(InstructionError, match="no memory"):
+        with pytest.raises(InstructionError, match="no entry"):
             semantic_candidates(asked, entries, similarity)

@@ -82,7 +82,7 @@ def test_retrieval_is_that_of_all_entries(many):
 
 
 def test_what_is_unknown_is_refused_with_what_is_nearest(many):
-    with pytest.raises(InstructionError, match="holds no memory"):
+    with pytest.raises(InstructionError, match="holds no entry"):
         semantic_candidates("put the trombone on the xylophone", indexed(many))
 
 

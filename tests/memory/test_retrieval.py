@@ -93,7 +93,7 @@ def test_another_name_finds_a_thing_that_the_memory_does_not_know_by_it():
     asked = "set the cup on the tray"
     assert [item[0] for item in semantic_candidates(asked, [mug])] == [mug]
     assert [item[0] for item in semantic_candidates(asked, [mug, cup])] == [cup]
-    with pytest.raises(InstructionError, match="holds no memory"):  # it holds the two apart
+    with pytest.raises(InstructionError, match="holds no entry"):  # it holds the two apart
         semantic_candidates("put the cup on the shelf", [cup, entry("put the mug on the shelf")])
 
 

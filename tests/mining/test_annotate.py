@@ -2,6 +2,7 @@
 
 import os
 import shutil
+import stat
 from dataclasses import replace
 from pathlib import Path
 
@@ -90,6 +91,20 @@ def test_its_videos_are_the_datasets_own_files(tiny_dataset: Path, annotated_dat
     assert not os.path.samefile(tiny_dataset / cameras, annotated_dataset / cameras), (
         "what may be edited is copied"
     )
+
+
+def test_neither_hidden_files_nor_pictures_that_became_videos_are_copied(
+    tiny_dataset: Path, mined: MinedKeyPoses, tmp_path: Path
+):
+    root = Path(shutil.copytree(tiny_dataset, tmp_path / "dataset"))
+    for name in ("images", ".cache"):
+        (root / name).mkdir()
+        (root / name / "left").write_bytes(b"x")
+    (root / "meta").chmod(0o555)
+    write_annotated(processor_of(root).demonstrations, mined, tmp_path / "out")
+    taken = {path.name for path in tiny_dataset.iterdir() if not path.name.startswith(".")}
+    assert {path.name for path in (tmp_path / "out").iterdir()} == taken
+    assert stat.S_IMODE((tmp_path / "out" / "meta").stat().st_mode) & stat.S_IWUSR
 
 
 def test_where_there_are_no_links_there_are_copies(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):

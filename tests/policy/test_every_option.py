@@ -1,16 +1,16 @@
 """Every option of ours changes something that can be observed. A new one needs a case here."""
 
 import json
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass, fields, is_dataclass, replace
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
-from lerobot.configs import PreTrainedConfig
 from lerobot.datasets import LeRobotDatasetMetadata
+from scripts.house import own_options
 from tests.mining.phase_labels.loopback_chat import LoopbackChat, Reply, question_of, say
 from tests.policy.conftest import Frame, act
 from tests.policy.lerobot_commands import CALIBRATION
@@ -29,16 +29,6 @@ from lerobot_openspm.types import Segmentation, View
 Options = dict[str, Any]
 GROUPS = {"segmenter": SegmenterConfig, "judge": JudgeConfig}
 SECOND_SERVER = "the second server"
-
-
-def own_options(config: Any, prefix: str = "") -> Iterator[str]:
-    """Dotted names of the options that LeRobot's base configuration lacks."""
-    for field in fields(config):
-        value = getattr(config, field.name)
-        if is_dataclass(value):
-            yield from own_options(value, f"{prefix}{field.name}.")
-        elif prefix or field.name not in {base.name for base in fields(PreTrainedConfig)}:
-            yield f"{prefix}{field.name}"
 
 
 def grouped(options: Options) -> Options:
@@ -295,7 +285,7 @@ CASES = {
 
 
 def test_every_option_has_a_case():
-    assert sorted(CASES) == sorted(own_options(config({})))
+    assert sorted(CASES) == sorted(own_options())
 
 
 @pytest.mark.parametrize("name", CASES)

@@ -27,7 +27,7 @@ def test_a_name_that_only_embeddings_know_is_acted_on(
     batch = asked(recorded, "put the bowl on the plate", "put the zorb on the plate")
     without = load()
     without.select_action(batch)
-    assert "no memory" in without.episodes[0].controller.state.refusal
+    assert "no entry" in without.episodes[0].controller.state.refusal
     policy = load(name_embeddings=str(model))
     action = policy.select_action(batch)
     assert torch.isfinite(action).all()
