@@ -231,6 +231,7 @@ def test_what_cannot_be_taught_is_one_line_and_changes_nothing(
         ("--dataset.episodes=[]", "no episode of dataset local/openspm_tabletop is asked for"),
         ("--into=nowhere", "no checkpoint of this policy at nowhere: it has no config.json"),
         ("--policy.cameras=nowhere.json", "no calibration file at nowhere.json"),
+        ("--policy.segmenter.sam3d_python=nowhere", "are for shape 'sam3d', got 'demonstrations'"),
     ],
 )
 def test_wrong_options_are_one_line_and_change_nothing(
