@@ -18,13 +18,14 @@ from typing import Any
 import numpy as np
 from benchmarks.episodes import load, run_episode
 from benchmarks.harness import Row, checkpoint_files, measured_folder, resume
+from benchmarks.libero.variants import exchanged, variant_file, variant_states
 from benchmarks.results import run
-from benchmarks.worlds import LIBERO_IMAGE_SIZE, LiberoWorld, initial_states
+from benchmarks.worlds import LIBERO_IMAGE_SIZE, LiberoWorld
 
 from lerobot_openspm.cli.pipeline import rate
 from lerobot_openspm.control.controller import EpisodeController
 from lerobot_openspm.control.state import Status
-from lerobot_openspm.envs.libero.simulator import LiberoSimulator, tasks
+from lerobot_openspm.envs.libero.simulator import SUITE, LiberoSimulator, tasks
 from lerobot_openspm.envs.seeds import TUNING_SEED_START
 from lerobot_openspm.geometry import se3
 from lerobot_openspm.language.instruction import parse_instruction
@@ -46,8 +47,10 @@ class EvaluationConfig:
         checkpoint: Folder of the policy.
         output: Folder for episodes.jsonl.
         task: A task's name, several with commas, or "all".
+        suite: libero_goal, or one of LIBERO-PRO's variants of it.
         episodes: Initial states a task, from the first on.
-        tuning: Draw as many scenes from tuning seeds instead of taking the benchmark's initial states.
+        tuning: Draw as many scenes from tuning seeds instead of taking the benchmark's initial states; of a
+            variant, with exchanges of our own.
         tuning_seed: The first of those seeds.
         workers: Episodes at a time, each in a process of its own; a single one stays in this process.
         execution: Of the policy; the checkpoint's if not given.
@@ -56,6 +59,7 @@ class EvaluationConfig:
     checkpoint: str
     output: str
     task: str = "all"
+    suite: str = SUITE
     episodes: int = STATES
     tuning: bool = False
     tuning_seed: int = TUNING_SEED
@@ -76,7 +80,7 @@ def evaluate(config: EvaluationConfig) -> list[Row]:
     wanted = list(tasks()) if config.task == "all" else config.task.split(",")
     if unknown := [task for task in wanted if task not in tasks()]:
         raise ValueError(f"libero_goal has no tasks {unknown}, expected some of {', '.join(tasks())}")
-    settings = [f"{key}={getattr(config, key)}" for key in ("tuning", "tuning_seed", "execution")]
+    settings = [f"{key}={getattr(config, key)}" for key in ("suite", "tuning", "tuning_seed", "execution")]
     files = checkpoint_files(Path(config.checkpoint))
     folder = measured_folder(Path(config.output), files, settings, __file__)
     jobs = {f"{task} {i}": (config, task, i) for task in wanted for i in range(config.episodes)}
@@ -92,7 +96,9 @@ def evaluate_states(
 ) -> list[Row]:
     """Episodes on the first of the benchmark's initial states of all tasks or some, run if need be."""
     names = ",".join(selected) if selected else "all"
-    return evaluate(EvaluationConfig(str(checkpoint), str(output), names, states, execution=execution))
+    return evaluate(
+        EvaluationConfig(str(checkpoint), str(output), names, episodes=states, execution=execution)
+    )
 
 
 def summary(episodes: list[Row]) -> dict[str, Any]:
@@ -139,13 +145,15 @@ def evaluate_one(config: EvaluationConfig, task: str, state: int) -> Row:
         What is kept of it. ``seen`` are the poses that the policy found when it planned, ``true`` the
         simulator's poses of the objects that the instruction names.
     """
-    policy, simulator = _policy(config), _simulator(task)
     seed = (config.tuning_seed if config.tuning else SEED) + state
+    is_exchanged = config.tuning and config.suite != SUITE
+    file = exchanged(task, seed) if is_exchanged else variant_file(config.suite, task)
+    policy, simulator = _policy(config), _simulator(task, file)
     if config.tuning:
         simulator.reset(seed)
         _move_hand(simulator, np.random.default_rng(seed))
     else:
-        simulator.reset_to(seed, initial_states(task)[state])
+        simulator.reset_to(seed, variant_states(config.suite, task)[state])
     sub_tasks = parse_instruction(simulator.instruction)
     named = list(dict.fromkeys(name for sub_task in sub_tasks for name in sub_task.objects))
     places: dict[str, Any] = {}
@@ -188,11 +196,11 @@ def _policy(config: EvaluationConfig) -> OpenSPMPolicy:
     return _KEPT["policy"]
 
 
-def _simulator(task: str) -> LiberoSimulator:
-    if _KEPT.get("task") != task:
+def _simulator(task: str, file: Path | None) -> LiberoSimulator:
+    if _KEPT.get("scene") != (task, file):
         if "simulator" in _KEPT:
             _KEPT["simulator"].close()
-        _KEPT.update(task=task, simulator=LiberoSimulator(task, LIBERO_IMAGE_SIZE))
+        _KEPT.update(scene=(task, file), simulator=LiberoSimulator(task, LIBERO_IMAGE_SIZE, file))
     return _KEPT["simulator"]
 
 

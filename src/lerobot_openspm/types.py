@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Literal, Protocol
 
@@ -99,6 +99,19 @@ class ContactCue:
 
 
 @dataclass(frozen=True)
+class Moment:
+    """What some cameras showed at one moment of a demonstration.
+
+    Attributes:
+        views: By camera name.
+        moved: Objects that the hand may have moved by then.
+    """
+
+    views: Mapping[str, View]
+    moved: frozenset[str]
+
+
+@dataclass(frozen=True)
 class DemonstrationScene:
     """What learning sees of one demonstration.
 
@@ -106,11 +119,13 @@ class DemonstrationScene:
         views: First frame by camera name, the hand away from the objects.
         cues: Where the hand touched something, for any number of objects.
         later_views: A frame after the grasped object was carried off, by camera name; None if there is none.
+        film: Reads the moments of it, which show objects from all around; None where that is not wanted.
     """
 
     views: dict[str, View]
     cues: tuple[ContactCue, ...]
     later_views: dict[str, View] | None = None
+    film: Callable[[], Sequence[Moment]] | None = None
 
 
 @dataclass(frozen=True)

@@ -33,10 +33,21 @@ def cameras() -> dict[str, tuple[Camera, np.ndarray]]:
     return placed
 
 
-def render(objects: list[tuple[tuple, np.ndarray]], T_moved: np.ndarray | None = None) -> dict[str, View]:
+def hand_camera(T_world_ee: np.ndarray) -> dict[str, tuple[Camera, np.ndarray]]:
+    """The front camera, and one that the hand carries; the hand's frame is the camera's."""
+    middle = (SIZE - 1) / 2
+    hand = Camera(SIZE, SIZE, 110.0, 110.0, middle, middle, "ee", np.eye(4))
+    return {"front": cameras()["front"], "hand": (hand, T_world_ee)}
+
+
+def render(
+    objects: list[tuple[tuple, np.ndarray]],
+    T_moved: np.ndarray | None = None,
+    placed: dict[str, tuple[Camera, np.ndarray]] | None = None,
+) -> dict[str, View]:
     """Draw shapes at ``T_world_obj``, the furthest first, antialiased; ``T_moved`` moves the cameras."""
     views = {}
-    for name, (camera, T_world_usual) in cameras().items():
+    for name, (camera, T_world_usual) in (placed or cameras()).items():
         T_world_cam = T_world_usual if T_moved is None else T_moved @ T_world_usual
         image = np.full((4 * SIZE, 4 * SIZE, 3), TABLE, np.uint8)
         order = sorted(objects, key=lambda pair: -np.linalg.norm(pair[1][:3, 3] - T_world_cam[:3, 3]))

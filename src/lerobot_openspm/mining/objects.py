@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import logging
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from itertools import pairwise
 from typing import Literal
 
@@ -13,6 +15,7 @@ from tqdm import tqdm
 
 from lerobot_openspm.geometry.camera import Camera
 from lerobot_openspm.geometry.se3 import Array
+from lerobot_openspm.memory.entry import CONTACT_PHASES
 from lerobot_openspm.mining.anchors import Demonstration, sub_task_of
 from lerobot_openspm.mining.dataset import Demonstrations
 from lerobot_openspm.mining.key_poses import KeyPose
@@ -22,10 +25,22 @@ from lerobot_openspm.perception.objects.base import KnownObject, ShapeBackend
 from lerobot_openspm.perception.objects.kinds import learn_objects
 from lerobot_openspm.perception.oracle import name_simulator_poses
 from lerobot_openspm.perception.pipeline import detect
-from lerobot_openspm.types import ContactCue, DemonstrationScene, PoseEstimate, Segmenter, Shape
+from lerobot_openspm.types import (
+    ContactCue,
+    DemonstrationScene,
+    Moment,
+    PoseEstimate,
+    Segmenter,
+    Shape,
+    View,
+)
 
 logger = logging.getLogger(__name__)
 
+# So many demonstrations of a task are looked at all along, and every so-manieth frame of them.
+FILMED_PER_TASK, FILM_STEP = 3, 4
+# The hand may touch an object so many frames before the motion to a contact begins.
+FRAMES_BEFORE_CONTACT = 4
 # A pushed object's final pose counts from this confidence on.
 MIN_END_CONFIDENCE = 0.8
 
@@ -34,13 +49,48 @@ def learn_scenes(
     demonstrations: Demonstrations, mined: Sequence[MinedEpisode], cameras: Mapping[str, Camera]
 ) -> list[DemonstrationScene]:
     """What perception learns from: two frames of every episode, and where the hand touched what."""
-    scenes = []
+    scenes, filmed = [], Counter[str]()
     for item in tqdm(mined, desc="Reading images", unit="episode"):
         later = _carried_off(item.key_poses)
         views = demonstrations.views(item.episode, 0, cameras)
         later_views = None if later is None else demonstrations.views(item.episode, later, cameras)
-        scenes.append(DemonstrationScene(views, contact_cues(item), later_views))
+        filmed[item.episode.task] += 1
+        is_filmed = filmed[item.episode.task] <= FILMED_PER_TASK
+        film = partial(read_film, demonstrations, item, cameras) if is_filmed else None
+        scenes.append(DemonstrationScene(views, contact_cues(item), later_views, film))
     return scenes
+
+
+def read_film(
+    demonstrations: Demonstrations, item: MinedEpisode, cameras: Mapping[str, Camera]
+) -> tuple[Moment, ...]:
+    """A demonstration as its cameras saw it: those of the hand all the way, the fixed ones at its start."""
+    episode, moved = item.episode, moved_from(item)
+    pictures = {key: demonstrations.images(episode, key) for key in cameras}
+    moments = []
+    for frame in range(0, len(episode), FILM_STEP):
+        views = {}
+        for key, camera in cameras.items():
+            if frame > 0 and camera.mount == "world":
+                continue
+            image = pictures[key][frame].copy()  # a view of it would keep the whole film
+            scaled = camera.scaled(image.shape[1], image.shape[0])
+            views[key] = View(image, scaled, scaled.T_world_cam(episode.T_world_ee[frame]))
+        gone = frozenset(name for name, first in moved.items() if frame >= first)
+        moments.append(Moment(views, gone))
+    return tuple(moments)
+
+
+def moved_from(item: MinedEpisode) -> dict[str, int]:
+    """From which frame on an episode's objects may have been moved by the hand, by name."""
+    moved: dict[str, int] = {}
+    for pose in item.key_poses:
+        sub_task = sub_task_of(pose, item.sub_tasks)
+        if pose.phase not in CONTACT_PHASES:
+            continue
+        for name in (sub_task.target,) if pose.phase == "grasp" else sub_task.objects:
+            moved.setdefault(name, max(pose.frame - pose.n_steps - FRAMES_BEFORE_CONTACT, 1))
+    return moved
 
 
 @dataclass(frozen=True)

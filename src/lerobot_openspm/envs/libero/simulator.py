@@ -57,28 +57,36 @@ def tasks() -> dict[str, str]:
     return {task.name: task.language for task in benchmark.get_benchmark_dict()[SUITE]().tasks}
 
 
+def task_file(task: str) -> Path:
+    """LIBERO's own description of a task in :func:`tasks`."""
+    from libero.libero import get_libero_path  # pyright: ignore[reportMissingImports]
+
+    return Path(get_libero_path("bddl_files")) / SUITE / f"{task}.bddl"
+
+
 class LiberoSimulator:
     """One LIBERO task.
 
     Args:
         task: A name in :func:`tasks`.
         image_size: Height and width of the images in pixels, which are drawn when asked for; None draws none.
+        file: A variant of the task, which says what stands where and what is asked; LIBERO's own by default.
     """
 
-    def __init__(self, task: str, image_size: int | None = None) -> None:
+    def __init__(self, task: str, image_size: int | None = None, file: Path | None = None) -> None:
         if task not in tasks():
             raise ValueError(f"{SUITE} has no task {task!r}, expected one of {', '.join(tasks())}")
-        from libero.libero import get_libero_path  # pyright: ignore[reportMissingImports]
         from libero.libero.envs.env_wrapper import ControlEnv  # pyright: ignore[reportMissingImports]
 
-        self.task, self.instruction = task, tasks()[task]
         self._image_size = image_size
         self._renderer: Renderer | None = None
         self._env: Any = ControlEnv(
-            bddl_file_name=os.fspath(Path(get_libero_path("bddl_files")) / SUITE / f"{task}.bddl"),
+            bddl_file_name=os.fspath(file or task_file(task)),
             use_camera_obs=False,
             has_offscreen_renderer=False,
         )
+        self.task = task
+        self.instruction = tasks()[task] if file is None else str(self._env.language_instruction)
         self._observation: dict[str, Any] = {}
         # The scene as it was when the last observation was sampled, MuJoCo's data.
         self._sampled: Any = None

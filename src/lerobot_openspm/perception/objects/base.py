@@ -6,7 +6,7 @@ A kind is one folder with a class that is a :class:`KnownObject` and a :class:`K
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Hashable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Protocol
 
@@ -66,6 +66,7 @@ class Look:
     hidden: Mapping[str, Mask] = field(default_factory=dict[str, Mask])
     expected: Mapping[str, Array] = field(default_factory=dict[str, Array])
     _bins: dict[str, Bins] = field(default_factory=dict[str, Bins])
+    _prepared: dict[Hashable, Any] = field(default_factory=dict[Hashable, Any])
 
     def __post_init__(self) -> None:
         if not self.views:
@@ -78,6 +79,12 @@ class Look:
         if camera not in self._bins:
             self._bins[camera] = lab_bins(self.views[camera].image)
         return self._bins[camera]
+
+    def prepared[T](self, key: Hashable, make: Callable[[], T]) -> T:
+        """What objects that share ``key`` need of the views; made once for all of them."""
+        if key not in self._prepared:
+            self._prepared[key] = make()
+        return self._prepared[key]
 
     def instances_of(self, name: str) -> Instances:
         """What the segmenter found of an object. Raises PerceptionError where none was asked."""

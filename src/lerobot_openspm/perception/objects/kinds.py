@@ -12,10 +12,13 @@ from lerobot_openspm.perception.objects.base import Examples, KnownObject, Shape
 from lerobot_openspm.perception.objects.box.learn import BOX
 from lerobot_openspm.perception.objects.patches.learn import PATCHES
 from lerobot_openspm.perception.objects.shape.learn import SHAPE
+from lerobot_openspm.perception.objects.surface.learn import SURFACE
 from lerobot_openspm.types import DemonstrationScene, Segmenter, Shape
 
-# In the order in which they are asked to learn: each gets the objects that those before it left.
-KINDS = {kind.name: kind for kind in (PATCHES, SHAPE, BOX)}
+# In the order in which they are asked to learn: each gets the objects that those before it left. Where there
+# are no films, patches alone are learned of what hardly moves.
+LEARNED = (SURFACE, SHAPE, BOX)
+KINDS = {kind.name: kind for kind in (*LEARNED, PATCHES)}
 
 
 def learn_objects(
@@ -52,7 +55,7 @@ def learn_objects(
     names = sorted(named - {one.name for one in known})
     examples = Examples(names, scenes, known, rng, segmenter, source, shapes)
     learned: dict[str, KnownObject] = {}
-    for kind in KINDS.values():
+    for kind in LEARNED:
         left = [name for name in names if name not in learned]
         learned |= kind.learn(replace(examples, names=left))
     return learned

@@ -1,0 +1,216 @@
+"""Learning surfaces: from all pictures of a film in which an object stands where it stood at first."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+from scipy.spatial import KDTree
+
+from lerobot_openspm.geometry import se3
+from lerobot_openspm.geometry.se3 import Array
+from lerobot_openspm.perception.objects.base import Examples, Kind, Look
+from lerobot_openspm.perception.objects.patches.learn import learn_patches
+from lerobot_openspm.perception.objects.patches.model import PatchModel
+from lerobot_openspm.perception.objects.surface.backdrop import (
+    Backdrop,
+    Float32,
+    learn_backdrop,
+    sample,
+)
+from lerobot_openspm.perception.objects.surface.carving import Carved, Frame, Frames, carve
+from lerobot_openspm.perception.objects.surface.model import SurfaceModel, from_record
+from lerobot_openspm.perception.objects.surface.relief import (
+    WEIGHTS,
+    Relief,
+    depth_of_all,
+    fill_silhouettes,
+    find_relief,
+)
+from lerobot_openspm.perception.objects.surface.search import Surface, score_at, sight_of
+from lerobot_openspm.types import DemonstrationScene, Moment, View
+
+logger = logging.getLogger(__name__)
+
+# A point is believed where so many directions show it, with colours this much alike, CIELAB.
+MIN_DIRECTIONS, MAX_SPREAD = 2, 7.0
+# How a camera shows a point that it never saw is told by the most similar point that both cameras saw.
+SIMILAR_M, SIMILAR_COLOUR = 0.03, 10.0
+BESIDE_M = 0.02
+ROUNDS = 2
+MIN_COLOURED = 40
+
+
+def learn_surfaces(examples: Examples) -> dict[str, SurfaceModel | PatchModel]:
+    """Learn what hardly moves between demonstrations: its patches, and its surface where there are films."""
+    near = learn_patches(examples)
+    return {**near, **_learn_surfaces(near, examples)}
+
+
+def _learn_surfaces(near: Mapping[str, PatchModel], examples: Examples) -> dict[str, SurfaceModel]:
+    films = [(scene, scene.film()) for scene in examples.scenes if near and scene.film is not None]
+    backdrop = learn_backdrop(_pictures(films), examples.floor) if films else None
+    if backdrop is None:
+        return {}
+    scenes = [scene for scene, _ in films]
+    touched = {name: _touched(name, scenes, model) for name, model in near.items()}
+    heights = {name: model.height for name, model in near.items()}
+    surfaces = build_surfaces(_frames(films, near, backdrop), touched, heights, backdrop)
+    models = {}
+    for name, surface in surfaces.items():
+        typical = _typical(name, surface, scenes, near[name], backdrop)
+        models[name] = SurfaceModel(name, surface, backdrop, heights[name], typical, near[name])
+        logger.info(
+            "surface of %s: %d coloured points, typical agreement %.2f", name, len(surface.coloured), typical
+        )
+    return models
+
+
+def _pictures(films: Sequence[tuple[DemonstrationScene, Sequence[Moment]]]) -> dict[str, list[View]]:
+    """All pictures by camera."""
+    pictures: dict[str, list[View]] = {}
+    for _, moments in films:
+        for moment in moments:
+            for camera, view in moment.views.items():
+                pictures.setdefault(camera, []).append(view)
+    return pictures
+
+
+SURFACE = Kind(SurfaceModel.kind, learn_surfaces, from_record)
+
+
+def _first_poses(scene: DemonstrationScene, near: Mapping[str, PatchModel]) -> dict[str, Array]:
+    look = Look(scene.views)
+    found = {name: model.localise(look) for name, model in near.items()}
+    return {name: one.T_world_obj for name, one in found.items() if one.status == "found"}
+
+
+def _frames(
+    films: Sequence[tuple[DemonstrationScene, Sequence[Moment]]],
+    near: Mapping[str, PatchModel],
+    backdrop: Backdrop,
+) -> list[Frame]:
+    frames = []
+    for scene, moments in films:
+        poses = _first_poses(scene, near)
+        for moment in moments:
+            standing = {name: T for name, T in poses.items() if name not in moment.moved}
+            for camera, view in moment.views.items():
+                hidden = backdrop.hidden(camera, view)
+                frames.append(Frame(camera, view, backdrop.foreground(camera, view), hidden, standing))
+    return frames
+
+
+def _touched(name: str, scenes: Sequence[DemonstrationScene], model: PatchModel) -> Array:
+    """Points ``(k, 3)`` in the object's frame at which it was touched."""
+    points = []
+    for scene in scenes:
+        own = [cue.point_world for cue in scene.cues if cue.name == name]
+        found = model.localise(Look(scene.views)) if own else None
+        if found is not None and found.status == "found":
+            points += [se3.apply(se3.inverse(found.T_world_obj), point) for point in own]
+    return np.array(points).reshape(-1, 3)
+
+
+def build_surfaces(
+    frames: Sequence[Frame], touched: Mapping[str, Array], heights: Mapping[str, float], backdrop: Backdrop
+) -> dict[str, Surface]:
+    """Surfaces of objects by name.
+
+    Args:
+        frames: All pictures.
+        touched: Points ``(k, 3)`` in each object's frame at which it was touched.
+        heights: World z of each object's frame.
+        backdrop: What no object is.
+    """
+    own = {name: Frames(name, [f for f in frames if name in f.standing]) for name in touched}
+    carved: dict[str, Carved] = {}
+    reliefs: dict[str, Relief] = {}
+    for name, points in touched.items():
+        table = backdrop.table_height - heights[name]
+        space = carve(own[name], points, table) if len(points) and own[name].frames else None
+        if space is not None:
+            carved[name], reliefs[name] = space, find_relief(own[name], space, table)
+    for _ in range(ROUNDS):
+        drawn = {name: (relief.points()[0], relief.cell) for name, relief in reliefs.items()}
+        reliefs = {
+            name: fill_silhouettes(own[name], carved[name], relief, drawn) for name, relief in reliefs.items()
+        }
+    drawn = {name: (relief.points()[0], relief.cell) for name, relief in reliefs.items()}
+    surfaces = {}
+    for name, relief in reliefs.items():
+        surface = _coloured(own[name], relief, drawn)
+        if np.isfinite(surface.colours[:, 0, 0]).sum() >= MIN_COLOURED:
+            surfaces[name] = surface
+    return surfaces
+
+
+def _coloured(frames: Frames, relief: Relief, drawn: Mapping[str, tuple[Array, float]]) -> Surface:
+    """A relief's points with the colours that the pictures agree about."""
+    points, normals = relief.points()
+    seen: dict[str, list[Float32]] = {"world": [], "ee": []}
+    for frame in frames.distinct:
+        T = frame.standing[frames.name]
+        world, camera = se3.apply(T, points), frame.view.camera
+        rows, columns, depth, inside = frame.look(world)
+        nearest = depth_of_all(frame, drawn)
+        facing = ((world - frame.view.T_world_cam[:3, 3]) * (normals @ T[:3, :3].T)).sum(1) < 0
+        shown = inside & facing & (depth <= nearest[rows, columns] + 1.5 * relief.cell)
+        shown &= frame.foreground[rows, columns]
+        colours = sample(frame.colours, camera, frame.view.T_world_cam, world, frame.hidden)
+        colours[~shown] = np.nan
+        seen[camera.mount].append(colours)
+    fixed, hand = (_middle(seen[mount], len(points)) for mount in ("world", "ee"))
+    middle, spread, count = hand
+    believed = (count >= MIN_DIRECTIONS) & (spread <= MAX_SPREAD)
+    colours = np.stack([fixed[0], middle], 1)
+    colours[~believed] = np.nan
+    # What no two pictures agree about may be nothing at all, except right beside what they do agree about.
+    near = believed.copy()
+    if believed.any():
+        near |= KDTree(points[believed]).query(points)[0] < BESIDE_M
+    points, normals, colours = points[near], normals[near], colours[near]
+    return Surface(points, normals, _completed(points, normals, colours), relief.cell)
+
+
+def _middle(seen: Sequence[Float32], n: int) -> tuple[Array, Array, Array]:
+    """Median colours ``(n, 3)``, median distance from them and number of views ``(n,)``."""
+    if not seen:
+        return np.full((n, 3), np.nan), np.full(n, np.inf), np.zeros(n, int)
+    stack = np.ma.masked_invalid(np.stack(seen))
+    middle = np.ma.median(stack, axis=0)
+    away = np.ma.sqrt((((stack - middle) * WEIGHTS) ** 2).sum(-1))
+    count = (~stack.mask[..., 0]).sum(0)
+    return middle.filled(np.nan), np.ma.median(away, axis=0).filled(np.inf), count
+
+
+def _completed(points: Array, normals: Array, colours: Array) -> Float32:
+    """Colours ``(n, 2, 3)`` with those filled in that one of the cameras never saw."""
+    done = colours.astype(np.float32)
+    has = np.isfinite(colours[:, :, 0])
+    both = np.flatnonzero(has.all(1))
+    for known, missing in ((1, 0), (0, 1)):
+        lacking = np.flatnonzero(has[:, known] & ~has[:, missing])
+        if len(lacking) == 0:
+            continue
+        done[lacking, missing] = colours[lacking, known]
+        if len(both):
+            features = np.column_stack([points / SIMILAR_M, colours[:, known] / SIMILAR_COLOUR, normals])
+            _, index = KDTree(features[both]).query(features[lacking])
+            like = both[index]
+            done[lacking, missing] += colours[like, missing] - colours[like, known]
+    return done
+
+
+def _typical(
+    name: str, surface: Surface, scenes: Sequence[DemonstrationScene], near: PatchModel, backdrop: Backdrop
+) -> float:
+    """How well first pictures agree with where the object stands in them; the median of demonstrations."""
+    scores = []
+    for scene in scenes:
+        T = _first_poses(scene, {name: near}).get(name)
+        if T is not None:
+            sights = {c: sight_of(view, c, backdrop, None) for c, view in scene.views.items()}
+            scores.append(score_at(surface, sights, np.array([*T[:3, 3], 0.0])))
+    return float(np.clip(np.median(scores), 0.05, 1.0)) if scores else 0.05

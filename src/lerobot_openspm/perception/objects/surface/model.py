@@ -1,0 +1,231 @@
+"""An object known by its surface, which is found wherever it stands."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property, partial
+from typing import Any, ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lerobot_openspm.errors import MemoryFormatError
+from lerobot_openspm.geometry import se3
+from lerobot_openspm.geometry.se3 import Array
+from lerobot_openspm.perception.objects import records
+from lerobot_openspm.perception.objects.base import Look, Record
+from lerobot_openspm.perception.objects.patches import model as patches
+from lerobot_openspm.perception.objects.patches.model import PatchModel
+from lerobot_openspm.perception.objects.surface.backdrop import Backdrop, Colour
+from lerobot_openspm.perception.objects.surface.search import (
+    FINE_POINTS,
+    FINE_STEPS,
+    QUICK_POINTS,
+    QUICK_STEPS,
+    SAME_PLACE_M,
+    Place,
+    Sight,
+    Surface,
+    refine,
+    score_at,
+    search,
+    sight_of,
+)
+from lerobot_openspm.types import UNKNOWN_YAW_STD, PoseEstimate
+
+MAX_POINTS, MAX_WALLS = 60_000, 16
+# Of the agreement that is typical of the demonstrations: from here on an object is found, ...
+FOUND_SHARE = 0.6
+# ... and patches are believed that found it where it stood in them.
+BELIEVED_SHARE = 0.8
+# A second place that explains the pictures nearly as well makes the first one doubtful.
+RIVAL_SHARE = 0.93
+# A place that agrees this well holds another of the kind.
+ANOTHER_SHARE = 0.85
+# Two places nearer than this share of the radius cannot both hold one.
+OVERLAP_SHARE = 0.8
+# Patches that find an object this near to where it is expected are not checked again, metres.
+FOLLOWED_M = 0.02
+# Beyond this agreement of the followed pose there is no need to look all over the table.
+KEPT_SHARE = 0.7
+# Directions that the search begins from, for an object that does not look alike from all of them.
+YAWS = tuple(np.linspace(0, 2 * np.pi, 8, endpoint=False))
+# Turned about its middle, a round object agrees with itself this well, CIELAB and share.
+ROUND_COLOUR, ROUND_SHARE, ROUND_SPACINGS = 20.0, 0.6, 3.0
+# Where the demonstrated direction agrees this well, others are not tried.
+ENOUGH_SHARE = 0.95
+# ... and one of them is believed where the demonstrated one agrees less than this share as well.
+TURNED_SHARE = 0.93
+STD_M, STD_RAD = 0.002, 0.03
+
+
+@dataclass(frozen=True)
+class SurfaceModel:
+    """An object known by its surface; where it stood in the demonstrations, by patches too.
+
+    Attributes:
+        name: The noun phrase.
+        surface: Its points, in its own frame.
+        backdrop: What no object is.
+        height: World z of its frame when it stands on the table, metres.
+        typical_agreement: How well the demonstrations' first pictures agree with its surface.
+        near: Patches, which are more exact where it stood in the demonstrations.
+    """
+
+    kind: ClassVar[str] = "surface"
+
+    name: str
+    surface: Surface
+    backdrop: Backdrop
+    height: float
+    typical_agreement: float
+    near: PatchModel
+
+    @property
+    def yaw_period(self) -> float:
+        """A full turn: yaw is told from the demonstrated direction."""
+        return 2 * np.pi
+
+    @cached_property
+    def is_round(self) -> bool:
+        """Whether it looks alike from all sides, so that its direction cannot be seen."""
+        from scipy.spatial import KDTree
+
+        has = np.isfinite(self.surface.colours[:, 1, 0])
+        points, colours = self.surface.points[has], self.surface.colours[has, 1]
+        middle = np.append((points[:, :2].min(0) + points[:, :2].max(0)) / 2, 0.0)
+        tree, shares = KDTree(points - middle), []
+        for turn in np.deg2rad([60, 120, 180, 240, 300]):
+            R = se3.from_yaw(np.zeros(3), float(turn))[:3, :3]
+            away, index = tree.query((points - middle) @ R.T)
+            alike = np.linalg.norm(colours - colours[index], axis=1) < ROUND_COLOUR
+            shares.append(float((alike & (away < ROUND_SPACINGS * self.surface.spacing)).mean()))
+        return min(shares) > ROUND_SHARE
+
+    def localise(self, look: Look) -> PoseEstimate:
+        """Find the object: where it stood in the demonstrations, where it is expected, or anywhere."""
+        near, expected = self.near.localise(look), look.expected.get(self.name)
+        if near.status == "found" and expected is not None and _apart_m(near, expected) < FOLLOWED_M:
+            return near
+        sights = {
+            camera: look.prepared((camera, id(self.backdrop)), partial(self._sight, look, camera))
+            for camera in look.views
+        }
+        if near.status == "found":
+            score = score_at(self.surface, sights, _pose(near.T_world_obj))
+            if score >= BELIEVED_SHARE * self.typical_agreement:
+                return near
+        places = [] if expected is None else [self._refined(sights, expected)]
+        if not places or places[0].score < KEPT_SHARE * self.typical_agreement:
+            places = self._anywhere(sights)
+        return self._estimate(look, places)
+
+    def _sight(self, look: Look, camera: str) -> Sight:
+        return sight_of(look.views[camera], camera, self.backdrop, look.hidden.get(camera))
+
+    def _anywhere(self, sights: Mapping[str, Sight]) -> list[Place]:
+        """The most likely places on the table; the demonstrated direction is tried first."""
+        area, turns = self.backdrop.reach, not self.is_round
+        places = search(self.surface, sights, area, self.height, YAWS[:1], turns)
+        if turns and places[0].score < ENOUGH_SHARE * self.typical_agreement:
+            others = search(self.surface, sights, area, self.height, YAWS[1:], turns)
+            if others[0].score * TURNED_SHARE > places[0].score:
+                places = others
+        return places
+
+    def _refined(self, sights: Mapping[str, Sight], T_world_obj: Array) -> Place:
+        pose, turns = _pose(T_world_obj), not self.is_round
+        quick = refine(self.surface, sights, pose, turns, QUICK_POINTS, QUICK_STEPS[1:])
+        return refine(self.surface, sights, quick.pose, turns, FINE_POINTS, FINE_STEPS)
+
+    def _estimate(self, look: Look, places: list[Place]) -> PoseEstimate:
+        if not places:
+            unknown = np.diag([1.0, 1.0, 1.0, UNKNOWN_YAW_STD**2])
+            return PoseEstimate("not_found", np.eye(4), unknown, 0.0, visible=0.0)
+        best = places[0]
+        share = best.score / self.typical_agreement
+        apart = max(SAME_PLACE_M, OVERLAP_SHARE * self.surface.radius)
+        rivals = [one for one in places[1:] if np.linalg.norm(one.pose[:2] - best.pose[:2]) > apart]
+        is_rivalled = any(one.score > RIVAL_SHARE * best.score for one in rivals)
+        status = "not_found" if share < FOUND_SHARE else "ambiguous" if is_rivalled else "found"
+        T = se3.from_yaw(best.pose[:3], float(best.pose[3]))
+        yaw_std = UNKNOWN_YAW_STD if self.is_round else STD_RAD
+        covariance = np.diag([STD_M**2, STD_M**2, STD_M**2, yaw_std**2])
+        own = self.surface.points[np.isfinite(self.surface.colours[:, 0, 0])]
+        visible = look.seen_share(se3.apply(T, own))
+        others = tuple(
+            se3.from_yaw(one.pose[:3], float(one.pose[3]))
+            for one in rivals
+            if one.score >= ANOTHER_SHARE * max(self.typical_agreement, best.score)
+        )
+        return PoseEstimate(status, T, covariance, float(np.clip(share, 0, 1)), visible, None, others)
+
+    def to_record(self) -> Record:
+        """See :class:`lerobot_openspm.perception.objects.base.KnownObject`."""
+        near_fields, near_arrays = self.near.to_record()
+        table = self.backdrop.table
+        fields = {
+            "kind": self.kind, "name": self.name, "height": self.height,
+            "typical_agreement": self.typical_agreement, "spacing": self.surface.spacing,
+            "table_height": self.backdrop.table_height, "hand_cameras": list(self.backdrop.hand),
+            "near": near_fields,
+        }  # fmt: skip
+        arrays: dict[str, NDArray[Any]] = {
+            "points": self.surface.points.astype(np.float32),
+            "normals": self.surface.normals.astype(np.float32),
+            "colours": np.nan_to_num(self.surface.colours, nan=UNCOLOURED).astype(np.float32),
+            "table_colour": np.vstack([table.mean[None], table.precision]).astype(np.float32),
+            "table_area": self.backdrop.table_area.astype(np.float32),
+        }
+        for i, mask in enumerate(self.backdrop.hand.values()):
+            arrays[f"hand.{i}"] = mask.astype(np.uint8)
+        return fields, arrays | {f"near.{key}": value for key, value in near_arrays.items()}
+
+
+# In a record, the colour of points that have none.
+UNCOLOURED = -1000.0
+
+
+def from_record(fields: Mapping[str, Any], arrays: Mapping[str, NDArray[Any]], where: str) -> SurfaceModel:
+    """Inverse of :meth:`SurfaceModel.to_record`. Raises MemoryFormatError, which names ``where``."""
+    name, near, cameras = fields["name"], fields.get("near"), fields.get("hand_cameras")
+    if not isinstance(near, Mapping) or near.get("kind") != PatchModel.kind:
+        raise MemoryFormatError(f"{where}: 'near' of {name!r} must be an object of kind {PatchModel.kind}")
+    if not isinstance(cameras, list) or not all(isinstance(one, str) for one in cameras):
+        raise MemoryFormatError(f"{where}: 'hand_cameras' of {name!r} must be a list of camera keys")
+    points = records.array(arrays, "points", (-1, 3), where)
+    if not 8 <= len(points) <= MAX_POINTS:
+        raise MemoryFormatError(f"{where}: 'points' has {len(points)} rows, expected 8 to {MAX_POINTS}")
+    normals = records.array(arrays, "normals", (len(points), 3), where)
+    colours = records.array(arrays, "colours", (len(points), 2, 3), where).copy()
+    colours[colours <= UNCOLOURED] = np.nan
+    table = records.array(arrays, "table_colour", (4, 3), where).astype(float)
+    area = records.array(arrays, "table_area", (2, 2), where).astype(float)
+    hand = {
+        camera: records.array(arrays, f"hand.{i}", (-1, -1), where, np.uint8).astype(bool)
+        for i, camera in enumerate(cameras)
+    }
+    numbers = {key: records.number(fields, key, *BOUNDS[key], where) for key in BOUNDS}
+    backdrop = Backdrop(Colour(table[0], table[1:]), numbers["table_height"], area, {}, hand)
+    own = {key.removeprefix("near."): value for key, value in arrays.items() if key.startswith("near.")}
+    return SurfaceModel(
+        name, Surface(points, normals, colours, numbers["spacing"]), backdrop, numbers["height"],
+        numbers["typical_agreement"], patches.from_record(near, own, where),
+    )  # fmt: skip
+
+
+BOUNDS = {
+    "height": (-100.0, 100.0),
+    "typical_agreement": (0.0, 1.0),
+    "spacing": (1e-6, 1.0),
+    "table_height": (-100.0, 100.0),
+}
+
+
+def _apart_m(estimate: PoseEstimate, T_world_obj: Array) -> float:
+    return float(np.linalg.norm(estimate.T_world_obj[:3, 3] - T_world_obj[:3, 3]))
+
+
+def _pose(T_world_obj: Array) -> Array:
+    return np.array([*T_world_obj[:3, 3], se3.yaw_of(T_world_obj)])

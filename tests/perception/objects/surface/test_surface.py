@@ -1,0 +1,173 @@
+"""Surfaces are learned from films of a hand that passes over objects, which are found wherever they stand."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+from tests.perception.drawn_world import DISTRACTOR, SHAPES, hand_camera, render
+
+from lerobot_openspm.errors import MemoryFormatError
+from lerobot_openspm.geometry import se3
+from lerobot_openspm.perception.objects import store
+from lerobot_openspm.perception.objects.base import Look
+from lerobot_openspm.perception.objects.kinds import learn_objects
+from lerobot_openspm.perception.objects.surface.model import SurfaceModel
+from lerobot_openspm.types import ContactCue, DemonstrationScene, Moment
+
+HOME = (-0.05, 0.0, 0.45)
+MIDDLES = {"block": (0.02, -0.15, 0.0), "cup": (0.0, 0.15, 0.0), "distractor": (-0.02, 0.0, 0.0)}
+
+
+def looking_down(x, y, z, tilt=0.0):
+    """``T_world_ee`` of a hand whose camera looks down, leaning back by ``tilt`` radians."""
+    c, s = np.cos(tilt), np.sin(tilt)
+    axes = np.array([[0.0, -1.0, 0.0], [-c, 0.0, -s], [s, 0.0, -c]]).T
+    return se3.transform(axes, np.array([x, y, z]))
+
+
+def views_at(poses, T_world_ee):
+    return render(
+        [(SHAPES.get(name, DISTRACTOR), T) for name, T in poses.items()], None, hand_camera(T_world_ee)
+    )
+
+
+def demonstration(rng):
+    """The hand comes from one side to the cup, grasps it, and carries it over the block."""
+    poses = {
+        name: se3.from_yaw([x + dx, y + dy, 0.0], yaw)
+        for (name, (x, y, yaw)), (dx, dy) in zip(
+            MIDDLES.items(), rng.uniform(-0.012, 0.012, (3, 2)), strict=True
+        )
+    }
+    grasp = poses["cup"][:3, 3] + [0.03, 0.0, 0.05] + rng.normal(0, 0.002, 3)
+    release = poses["block"][:3, 3] + [0, 0, 0.12] + rng.normal(0, 0.002, 3)
+    cues = (ContactCue("cup", grasp, "grasp"), ContactCue("block", release, "release"))
+    places = [
+        (
+            *(rng.uniform(-0.25, 0.2), rng.uniform(-0.25, 0.25), rng.uniform(0.25, 0.45)),
+            rng.uniform(-0.5, 0.5),
+        )
+        for _ in range(16)
+    ]
+
+    def film():
+        moments = [Moment(views_at(poses, looking_down(*HOME)), frozenset())]
+        for place in places:
+            seen = views_at(poses, looking_down(*place))
+            moments.append(Moment({"hand": seen["hand"]}, frozenset()))
+        return moments
+
+    return DemonstrationScene(views_at(poses, looking_down(*HOME)), cues, None, film)
+
+
+@pytest.fixture(scope="module")
+def models():
+    rng = np.random.default_rng(1)
+    return learn_objects([demonstration(rng) for _ in range(6)], np.random.default_rng(0))
+
+
+def test_what_hardly_moves_and_was_filmed_is_known_by_its_surface(models):
+    assert {name: type(model) for name, model in models.items()} == {
+        "block": SurfaceModel, "cup": SurfaceModel,
+    }  # fmt: skip
+    # A table of one colour does not tell its height: it is taken to lie right below what was touched.
+    assert 0 <= models["cup"].backdrop.table_height < 0.03
+    assert models["cup"].is_round
+    assert not models["block"].is_round
+
+
+@pytest.mark.parametrize(("name", "height", "radius"), [("block", 0.05, 0.055), ("cup", 0.06, 0.04)])
+def test_its_points_lie_where_its_walls_and_its_top_are(models, name, height, radius):
+    model = models[name]
+    points = model.surface.coloured + np.array([0, 0, model.height])
+    assert np.percentile(points[:, 2], 95) == pytest.approx(height, abs=0.01)
+    assert model.surface.radius == pytest.approx(radius, abs=0.012)
+
+
+def moved(x, y, yaw):
+    return {"block": se3.from_yaw([x, y, 0.0], yaw), "distractor": se3.from_yaw([-0.18, 0.17, 0.0], 0.0)}
+
+
+@pytest.mark.parametrize(
+    "pose", [(0.12, 0.12, 0.0), (-0.15, -0.1, 0.5), (0.05, 0.1, np.pi / 2), (0.1, -0.2, 2.4)]
+)
+def test_it_is_found_elsewhere_and_turned(models, pose):
+    usual = {"block": se3.from_yaw((*MIDDLES["block"][:2], 0.0), 0.0)}
+    model = models["block"]
+    before = model.localise(Look(views_at(usual, looking_down(*HOME)))).T_world_obj
+    found = model.localise(Look(views_at(moved(*pose), looking_down(*HOME))))
+    assert found.status == "found"
+    # The frame that was learned lies somewhere on the block, the same place of it every time.
+    T_block_frame = se3.inverse(usual["block"]) @ before
+    choices = [moved(*pose)["block"] @ se3.from_yaw(np.zeros(3), turn) @ T_block_frame for turn in (0, np.pi)]
+    apart = [tuple(map(float, se3.distances(found.T_world_obj, T))) for T in choices]
+    assert any(metres < 0.006 and radians < np.deg2rad(4) for metres, radians in apart)
+
+
+def test_what_is_not_there_is_not_found(models):
+    scene = {"distractor": se3.from_yaw([-0.1, 0.1, 0.0], 0.0), "block": se3.from_yaw([0.1, -0.1, 0.0], 0.3)}
+    assert models["cup"].localise(Look(views_at(scene, looking_down(*HOME)))).status == "not_found"
+
+
+def test_where_it_stood_in_the_demonstrations_its_patches_are_believed(models):
+    usual = {name: se3.from_yaw((x, y, 0.0), yaw) for name, (x, y, yaw) in MIDDLES.items()}
+    look = Look(views_at(usual, looking_down(*HOME)))
+    found, near = models["cup"].localise(look), models["cup"].near.localise(look)
+    assert np.array_equal(found.T_world_obj, near.T_world_obj)
+
+
+def test_it_is_followed_from_where_it_is_expected(models):
+    model, scene = models["block"], moved(0.12, 0.12, 0.3)
+    first = model.localise(Look(views_at(scene, looking_down(*HOME))))
+    expected = {"block": se3.from_yaw([0.008, -0.006, 0.0], 0.0) @ first.T_world_obj}
+    look = Look(views_at(scene, looking_down(0.0, 0.1, 0.35)), expected=expected)
+    again = model.localise(look)
+    assert again.status == "found"
+    assert float(se3.distance(first.T_world_obj, again.T_world_obj)) < 0.006
+
+
+def test_nothing_is_learned_of_surfaces_without_a_camera_in_the_hand():
+    rng = np.random.default_rng(1)
+    scenes = [demonstration(rng) for _ in range(6)]
+    fixed = [
+        dataclasses.replace(
+            scene,
+            views={"front": scene.views["front"]},
+            film=lambda scene=scene: [Moment({"front": scene.views["front"]}, frozenset())],
+        )
+        for scene in scenes
+    ]
+    learned = learn_objects(fixed, np.random.default_rng(0))
+    assert not any(isinstance(model, SurfaceModel) for model in learned.values())
+
+
+def test_a_record_tells_all_of_it(models):
+    fields, arrays = store.to_parts(models["block"])
+    again = store.from_parts(fields, arrays, "here")
+    look = Look(views_at(moved(0.12, 0.12, 0.3), looking_down(*HOME)))
+    T, T_again = (model.localise(look).T_world_obj for model in (models["block"], again))
+    assert np.allclose(T, T_again, atol=2e-3)
+    assert isinstance(again, SurfaceModel)
+    assert again.near.name == "block"
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"near": None}, "'near' of 'block'"),
+        ({"hand_cameras": "hand"}, "list of camera keys"),
+        ({"spacing": -1.0}, "'spacing' is -1.0"),
+        ({"typical_agreement": 2.0}, "'typical_agreement' is 2.0"),
+    ],
+)
+def test_a_broken_record_is_refused(models, change, message):
+    fields, arrays = store.to_parts(models["block"])
+    with pytest.raises(MemoryFormatError, match=message):
+        store.from_parts(fields | change, arrays, "here")
+
+
+@pytest.mark.parametrize("name", ["points", "normals", "colours", "table_colour", "table_area", "hand.0"])
+def test_a_record_that_lacks_an_array_is_refused(models, name):
+    fields, arrays = store.to_parts(models["block"])
+    with pytest.raises(MemoryFormatError, match=name):
+        store.from_parts(fields, {key: value for key, value in arrays.items() if key != name}, "here")
