@@ -65,7 +65,7 @@ LIBERO = (
     *RECORDING["libero"],
     *EPISODES,
     *_package("cli/options.py", "cli/pipeline.py"),
-    *_benchmarks("stages", "libero/evaluate"),
+    *_benchmarks("stages", "libero/evaluate", "libero/variants"),
     "configs/openspm_libero_train.yaml",
     "configs/cameras/libero.json",
 )
@@ -148,6 +148,14 @@ FIGURES: dict[str, Figure] = {
     "measurement_noise_libero": _figure("measurement_noise", (*LIBERO, *NOISE), ON_LIBERO),
     "libero_goal": _libero("run", "libero/accuracy", "truth", options=LIBERO_GOAL),
     "libero_accuracy": _libero("run", "libero/accuracy", "truth", options=LIBERO_GOAL),
+    **{
+        suite: _figure(
+            "libero_pro",
+            (*LIBERO, *_benchmarks("libero_pro")),
+            f"--suite={suite} --states=50",
+        )
+        for suite in ("libero_goal_swap", "libero_goal_lan")
+    },
     "libero_few_shot_3": _libero("few_shot", options="--demos=3"),
     "libero_few_shot_1": _libero("few_shot", options="--demos=1 --states=10"),
     "libero_ablations": _with(

@@ -40,6 +40,8 @@ def libero_sections() -> list[str]:
             section("Success from pixels", "libero_goal", _main),
             section("Time of a decision", "libero_latency", _latency),
             section("Failures", "libero_goal", _failures),
+            section("Objects that changed places (LIBERO-PRO)", "libero_goal_swap", _variant),
+            section("Instructions in other words (LIBERO-PRO)", "libero_goal_lan", _variant),
             section("How key poses are followed", "libero_ablations", _execution),
             section("Where key poses come from", "libero_ablations", _memory),
             section("Error of the object poses", "libero_accuracy", _accuracy),
@@ -49,6 +51,10 @@ def libero_sections() -> list[str]:
             section("The harness against lerobot-eval", "libero_equality", _equality),
         ],
     )
+
+
+def _variant(result: Quoted) -> str:
+    return grid({"all ten tasks": result, **result["per_task"]}, STEPS)
 
 
 def _main(result: Quoted) -> str:
