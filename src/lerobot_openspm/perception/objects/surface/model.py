@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from typing import Any, ClassVar
 
@@ -47,8 +47,11 @@ ANOTHER_SHARE = 0.85
 OVERLAP_SHARE = 0.8
 # Patches that find an object this near to where it is expected are not checked again, metres.
 FOLLOWED_M = 0.02
-# Beyond this agreement of the followed pose there is no need to look all over the table.
-KEPT_SHARE = 0.7
+# An object that is expected this much above the table is in the hand, metres.
+LIFTED_M = 0.02
+# Of the typical agreement at the pose where an object is expected: from here on it is seen there, and taken
+# to be elsewhere only if that agrees so much better; below that it is gone; in between something may hide it.
+KEPT_SHARE, BETTER_SHARE, GONE_SHARE = 0.7, 0.1, 0.4
 # Directions that the search begins from, for an object that does not look alike from all of them.
 YAWS = tuple(np.linspace(0, 2 * np.pi, 8, endpoint=False))
 # Turned about its middle, a round object agrees with itself this well, CIELAB and share.
@@ -108,6 +111,8 @@ class SurfaceModel:
         near, expected = self.near.localise(look), look.expected.get(self.name)
         if near.status == "found" and expected is not None and _apart_m(near, expected) < FOLLOWED_M:
             return near
+        if expected is not None and expected[2, 3] - self.height > LIFTED_M:
+            return near  # the hand carries it and hides it
         sights = {
             camera: look.prepared((camera, id(self.backdrop)), partial(self._sight, look, camera))
             for camera in look.views
@@ -116,10 +121,15 @@ class SurfaceModel:
             score = score_at(self.surface, sights, _pose(near.T_world_obj))
             if score >= BELIEVED_SHARE * self.typical_agreement:
                 return near
-        places = [] if expected is None else [self._refined(sights, expected)]
-        if not places or places[0].score < KEPT_SHARE * self.typical_agreement:
-            places = self._anywhere(sights)
-        return self._estimate(look, places)
+        if expected is not None:
+            there = Place(_pose(expected), score_at(self.surface, sights, _pose(expected)))
+            if there.score >= KEPT_SHARE * self.typical_agreement:
+                place = self._refined(sights, expected)
+                is_better = place.score > there.score + BETTER_SHARE * self.typical_agreement
+                return self._estimate(look, [place if is_better else there])
+            if there.score >= GONE_SHARE * self.typical_agreement:
+                return replace(self._estimate(look, [there]), status="not_found", visible=0.0)
+        return self._estimate(look, self._anywhere(sights))
 
     def _sight(self, look: Look, camera: str) -> Sight:
         return sight_of(look.views[camera], camera, self.backdrop, look.hidden.get(camera))

@@ -30,6 +30,8 @@ BLOCKED_WEIGHT, BLOCKED_EVIDENCE = 0.5, 0.1
 RIM_COST = 0.6
 # A view counts if it shows this share of the visible points.
 MIN_SHOWN, MIN_SHOWN_COARSE = 0.15, 0.3
+# A camera that sees this share of the coloured points sees as much of an object as it can.
+WHOLE_SHARE = 0.15
 # Views that show less of an object than this in all, 1 being all that one of them could, tell too little.
 ENOUGH_SHOWN = 1.0
 COARSE_POINTS, QUICK_POINTS, FINE_POINTS = 50, 100, 300
@@ -126,12 +128,14 @@ class Sample:
         colours: Weighted CIELAB ``(n, 2, 3)``.
         rim: ``(m, 3)`` in the object's frame, at the depth of the silhouette's edge.
         rim_colours: Weighted CIELAB ``(m, 2, 3)`` of the edge.
+        weight: From 0 to 1; less where the camera sees only a small part of the surface.
     """
 
     points: Float32
     colours: Float32
     rim: Float32
     rim_colours: Float32
+    weight: float
 
 
 def rotations(yaws: Array) -> Array:
@@ -173,6 +177,7 @@ def take_sample(surface: Surface, sight: Sight, pose: Array, count: int) -> Samp
     return Sample(
         surface.points[chosen].astype(np.float32), colours[chosen].astype(np.float32),
         ((beside - t) @ R).astype(np.float32), colours[own[edge]].astype(np.float32),
+        min(1.0, len(own) / (WHOLE_SHARE * len(surface.coloured))),
     )  # fmt: skip
 
 
@@ -264,7 +269,7 @@ def agreement(
     least = MIN_SHOWN_COARSE if is_coarse else MIN_SHOWN
     for camera, sample in samples.items():
         score, told = compare(sample, sights[camera], poses, is_coarse)
-        told = np.where(told > least, told, 0.0)
+        told = np.where(told > least, sample.weight * told, 0.0)
         total += score * told
         weight += told
     return total / np.maximum(weight, ENOUGH_SHOWN)
