@@ -56,7 +56,7 @@ def test_a_shape_remembers_that_a_segmenter_finds_its_pixels():
         ({"height": float("inf")}, "'height'"),
         ({"typical_overlap": 1.5}, "'typical_overlap'"),
         ({"yaw_centre": "north"}, "'yaw_centre'"),
-        ({"kind": "sphere"}, "'sphere', expected one of patches, shape, box"),
+        ({"kind": "sphere"}, "'sphere', expected one of surface, patches, shape, box"),
         ({"name": ""}, "'name'"),
         ({"version": 2}, "version 2"),
     ],

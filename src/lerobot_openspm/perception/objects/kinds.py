@@ -15,10 +15,8 @@ from lerobot_openspm.perception.objects.shape.learn import SHAPE
 from lerobot_openspm.perception.objects.surface.learn import SURFACE
 from lerobot_openspm.types import DemonstrationScene, Segmenter, Shape
 
-# In the order in which they are asked to learn: each gets the objects that those before it left. Where there
-# are no films, patches alone are learned of what hardly moves.
-LEARNED = (SURFACE, SHAPE, BOX)
-KINDS = {kind.name: kind for kind in (*LEARNED, PATCHES)}
+# In the order in which they are asked to learn: each gets the objects that those before it left.
+KINDS = {kind.name: kind for kind in (SURFACE, PATCHES, SHAPE, BOX)}
 
 
 def learn_objects(
@@ -55,7 +53,7 @@ def learn_objects(
     names = sorted(named - {one.name for one in known})
     examples = Examples(names, scenes, known, rng, segmenter, source, shapes)
     learned: dict[str, KnownObject] = {}
-    for kind in LEARNED:
+    for kind in KINDS.values():
         left = [name for name in names if name not in learned]
         learned |= kind.learn(replace(examples, names=left))
     return learned

@@ -129,7 +129,11 @@ class SurfaceModel:
                 return self._estimate(look, [place if is_better else there])
             if there.score >= GONE_SHARE * self.typical_agreement:
                 return replace(self._estimate(look, [there]), status="not_found", visible=0.0)
-        return self._estimate(look, self._anywhere(sights))
+        found = self._estimate(look, self._anywhere(sights))
+        if expected is None or found.status == "found":
+            return found
+        # Where its patches cannot tell that it is gone, it may be hidden.
+        return replace(found, visible=min(found.visible, near.visible))
 
     def _sight(self, look: Look, camera: str) -> Sight:
         return sight_of(look.views[camera], camera, self.backdrop, look.hidden.get(camera))
