@@ -20,6 +20,7 @@ from lerobot_openspm.perception.objects.surface.backdrop import (
     sample,
 )
 from lerobot_openspm.perception.objects.surface.carving import Carved, Frame, Frames, carve
+from lerobot_openspm.perception.objects.surface.compare import Surface, score_at, sight_of
 from lerobot_openspm.perception.objects.surface.model import SurfaceModel, from_record
 from lerobot_openspm.perception.objects.surface.relief import (
     WEIGHTS,
@@ -28,7 +29,6 @@ from lerobot_openspm.perception.objects.surface.relief import (
     fill_silhouettes,
     find_relief,
 )
-from lerobot_openspm.perception.objects.surface.search import Surface, score_at, sight_of
 from lerobot_openspm.types import DemonstrationScene, Moment, View
 
 logger = logging.getLogger(__name__)

@@ -18,19 +18,15 @@ from lerobot_openspm.perception.objects.base import Look, Record
 from lerobot_openspm.perception.objects.patches import model as patches
 from lerobot_openspm.perception.objects.patches.model import PatchModel
 from lerobot_openspm.perception.objects.surface.backdrop import Backdrop, Colour
+from lerobot_openspm.perception.objects.surface.compare import FINE_POINTS, Sight, Surface, score_at, sight_of
 from lerobot_openspm.perception.objects.surface.search import (
-    FINE_POINTS,
     FINE_STEPS,
     QUICK_POINTS,
     QUICK_STEPS,
     SAME_PLACE_M,
     Place,
-    Sight,
-    Surface,
     refine,
-    score_at,
     search,
-    sight_of,
 )
 from lerobot_openspm.types import UNKNOWN_YAW_STD, PoseEstimate
 

@@ -1,41 +1,24 @@
-"""Where a surface explains the pictures best: candidates all over the table, refined in all views at once.
-
-At a pose, the points of the surface that a camera can see are compared with the picture. A point counts for
-the pose where the picture has its colour, against it where the picture shows the table, and hardly at all
-where something else may be in front of it. Around the silhouette the picture must not go on in its colours.
-"""
+"""Where a surface explains the pictures best: candidates all over the table, refined in all views at once."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property
 
-import cv2
 import numpy as np
-from numpy.typing import NDArray
-from scipy.spatial import KDTree
 
 from lerobot_openspm.geometry.se3 import Array
-from lerobot_openspm.perception.objects.surface.backdrop import Backdrop, Float32, lab, pixels_of
-from lerobot_openspm.perception.objects.surface.carving import spread
-from lerobot_openspm.perception.objects.surface.relief import WEIGHTS
-from lerobot_openspm.types import Mask, View
+from lerobot_openspm.perception.objects.surface.compare import (
+    FINE_POINTS,
+    Sight,
+    Surface,
+    agreement,
+    rotations,
+    samples_at,
+    take_sample,
+)
 
-# Colours this far apart, CIELAB, are alike; in the search over the table, that much.
-LIKE, LIKE_COARSE = 8.0, 12.0
-# What neither shows the object nor the table counts as this much of a point, and as evidence for the pose.
-BLOCKED_WEIGHT, BLOCKED_EVIDENCE = 0.5, 0.1
-# What the colours going on around the silhouette cost.
-RIM_COST = 0.6
-# A view counts if it shows this share of the visible points.
-MIN_SHOWN, MIN_SHOWN_COARSE = 0.15, 0.3
-# A camera that sees this share of the coloured points sees as much of an object as it can.
-WHOLE_SHARE = 0.15
-# Views that show less of an object than this in all, 1 being all that one of them could, tell too little.
-ENOUGH_SHOWN = 1.0
-COARSE_POINTS, QUICK_POINTS, FINE_POINTS = 50, 100, 300
-MIN_POINTS = 8
+COARSE_POINTS, QUICK_POINTS = 50, 100
 CANDIDATES, FINALISTS = 12, 3
 # Two candidates nearer than this are one, metres.
 SAME_PLACE_M = 0.035
@@ -46,245 +29,11 @@ MOVES_PER_STEP = 5
 
 
 @dataclass(frozen=True)
-class Surface:
-    """Coloured points of an object, all in its own frame.
-
-    Attributes:
-        points: ``(n, 3)``, metres.
-        normals: Outward directions ``(n, 3)``.
-        colours: CIELAB ``(n, 2, 3)`` as the fixed and as the hand's camera show it; the colours in between
-            are expected too. Not a number for points that only hide what is behind them.
-        spacing: Distance between points, metres.
-    """
-
-    points: Array
-    normals: Array
-    colours: Float32
-    spacing: float
-
-    @cached_property
-    def coloured(self) -> Array:
-        """The points ``(n, 3)`` that have colours."""
-        return self.points[np.isfinite(self.colours[:, 0, 0])]
-
-    @cached_property
-    def middle(self) -> Array:
-        """Horizontal middle ``(2,)`` of the coloured points."""
-        return (
-            np.percentile(self.coloured[:, :2], 5, axis=0) + np.percentile(self.coloured[:, :2], 95, axis=0)
-        ) / 2
-
-    @cached_property
-    def radius(self) -> float:
-        """Horizontal distance from the middle within which most coloured points are, metres."""
-        return float(np.percentile(np.linalg.norm(self.coloured[:, :2] - self.middle, axis=1), 90))
-
-
-@dataclass(frozen=True)
-class Sight:
-    """One view, prepared for comparing.
-
-    Attributes:
-        view: The view.
-        P: Projection ``(3, 4)`` of world points to homogeneous pixels.
-        fine: Weighted CIELAB ``(H, W, 3)``, and where the table is ``(H, W)``, lightly smoothed.
-        coarse: The same, smoothed over the steps of the search.
-        hidden: Pixels ``(H, W)`` that are no evidence.
-    """
-
-    view: View
-    P: Float32
-    fine: tuple[Float32, Float32]
-    coarse: tuple[Float32, Float32]
-    hidden: Mask
-
-
-def sight_of(view: View, camera: str, backdrop: Backdrop, hidden: Mask | None) -> Sight:
-    """Prepare a view."""
-    colours = lab(view.image)
-    table = cv2.morphologyEx(
-        backdrop.table.matches(colours).astype(np.uint8), cv2.MORPH_OPEN, np.ones((3, 3), np.uint8)
-    ).astype(np.float32)
-    weighted = colours * WEIGHTS
-    scale = view.camera.width / 256
-    fine = (cv2.GaussianBlur(weighted, (0, 0), 0.6 * scale), cv2.GaussianBlur(table, (0, 0), 0.8 * scale))
-    coarse = (cv2.GaussianBlur(weighted, (0, 0), 2 * scale), cv2.GaussianBlur(table, (0, 0), 2 * scale))
-    covered = np.zeros(table.shape, bool) if hidden is None else hidden.copy()
-    own = backdrop.hidden(camera, view)
-    if own is not None:
-        covered |= own
-    T_cam_world = np.linalg.inv(view.T_world_cam)[:3]
-    c = view.camera
-    K = np.array([[c.fx, 0, c.cx], [0, c.fy, c.cy], [0, 0, 1]])
-    return Sight(view, (K @ T_cam_world).astype(np.float32), fine, coarse, covered)  # pyright: ignore[reportArgumentType]
-
-
-@dataclass(frozen=True)
-class Sample:
-    """Points of a surface that a camera sees at some pose, and points just outside its silhouette.
-
-    Attributes:
-        points: ``(n, 3)`` in the object's frame.
-        colours: Weighted CIELAB ``(n, 2, 3)``.
-        rim: ``(m, 3)`` in the object's frame, at the depth of the silhouette's edge.
-        rim_colours: Weighted CIELAB ``(m, 2, 3)`` of the edge.
-        weight: From 0 to 1; less where the camera sees only a small part of the surface.
-    """
-
-    points: Float32
-    colours: Float32
-    rim: Float32
-    rim_colours: Float32
-    weight: float
-
-
-def rotations(yaws: Array) -> Array:
-    """Rotations ``(n, 3, 3)`` about the vertical."""
-    c, s, o = np.cos(yaws), np.sin(yaws), np.zeros_like(yaws)
-    return np.stack([c, -s, o, s, c, o, o, o, o + 1], -1).reshape(-1, 3, 3)
-
-
-def take_sample(surface: Surface, sight: Sight, pose: Array, count: int) -> Sample | None:
-    """What a camera sees of a surface at a pose (x, y, z, yaw); None if hardly anything."""
-    R, t = rotations(pose[3:4])[0], pose[:3]
-    world = surface.points @ R.T + t
-    camera, T = sight.view.camera, sight.view.T_world_cam
-    u, v, depth, inside = pixels_of(camera, T, world)
-    if inside.sum() < MIN_POINTS:
-        return None
-    rows, columns = np.rint(v[inside]).astype(int), np.rint(u[inside]).astype(int)
-    pad = 8
-    top, left = rows.min() - pad, columns.min() - pad
-    shape = (int(rows.max() - top + pad + 1), int(columns.max() - left + pad + 1))
-    nearest = np.full(shape, np.inf, np.float32)
-    np.minimum.at(nearest, (rows - top, columns - left), depth[inside])
-    radius = int(np.clip(np.ceil(0.5 * surface.spacing * camera.focal_px / np.median(depth[inside])), 0, 6))
-    drawn = spread(nearest, radius)
-    facing = ((world - T[:3, 3]) * (surface.normals @ R.T)).sum(1) < 0
-    visible = np.zeros(len(world), bool)
-    visible[inside] = depth[inside] <= drawn[rows - top, columns - left] + 1.5 * surface.spacing
-    visible &= facing & np.isfinite(surface.colours[:, 0, 0])
-    own = np.flatnonzero(visible)
-    if len(own) < MIN_POINTS:
-        return None
-    colours = surface.colours * WEIGHTS
-    rim, edge = _rim(np.isfinite(drawn), radius, np.array([left, top]), count // 2, u[own], v[own])
-    rays = np.stack(
-        [(rim[:, 0] - camera.cx) / camera.fx, (rim[:, 1] - camera.cy) / camera.fy, np.ones(len(rim))], -1
-    )
-    beside = (rays * depth[own[edge], None]) @ T[:3, :3].T + T[:3, 3]
-    chosen = spaced(own, count)
-    return Sample(
-        surface.points[chosen].astype(np.float32), colours[chosen].astype(np.float32),
-        ((beside - t) @ R).astype(np.float32), colours[own[edge]].astype(np.float32),
-        min(1.0, len(own) / (WHOLE_SHARE * len(surface.coloured))),
-    )  # fmt: skip
-
-
-def _rim(
-    mask: Mask, radius: int, corner: Array, count: int, u: Float32, v: Float32
-) -> tuple[Array, NDArray[np.int64]]:
-    """Pixels ``(m, 2)`` just outside a drawn silhouette, and the nearest of its points at ``(u, v)``."""
-    closed = cv2.morphologyEx(mask.astype(np.uint8), cv2.MORPH_CLOSE, np.ones((3, 3), np.uint8))
-    if radius > 1:  # points were drawn as squares that reach beyond the surface
-        closed = cv2.erode(closed, np.ones((2 * (radius // 2) + 1,) * 2, np.uint8))
-    wide = cv2.dilate(closed, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (7, 7)))
-    rows, columns = np.nonzero(wide - cv2.dilate(closed, np.ones((3, 3), np.uint8)))
-    some = spaced(np.arange(len(rows)), count)
-    rim = np.stack([columns[some], rows[some]], -1) + corner
-    _, nearest = KDTree(np.stack([u, v], -1)).query(rim)
-    return rim.astype(float), np.asarray(nearest, np.int64)
-
-
-def spaced(indices: NDArray[np.int64], count: int) -> NDArray[np.int64]:
-    """At most so many of some indices, evenly from all."""
-    if len(indices) <= count:
-        return indices
-    return indices[np.linspace(0, len(indices) - 1, count).astype(int)]
-
-
-def compare(sample: Sample, sight: Sight, poses: Array, is_coarse: bool = False) -> tuple[Array, Array]:
-    """How well poses ``(q, 4)`` agree with a view, and how much of the object it tells of, each ``(q,)``.
-
-    Agreement is 1 where every point has its colour and nothing goes on around it.
-    """
-    colours, table = sight.coarse if is_coarse else sight.fine
-    like = LIKE_COARSE if is_coarse else LIKE
-    match, on_table, inside = _matches(sample.points, sample.colours, sight, poses, colours, table, like)
-    good = (match * inside).sum(1)
-    bad = (on_table * (1 - match) * inside).sum(1)
-    blocked = inside.sum(1) - good - bad
-    told = good + bad + BLOCKED_WEIGHT * blocked
-    n = len(sample.points)
-    score = (good - bad + BLOCKED_EVIDENCE * blocked) / np.maximum(told, 0.05 * n)
-    if len(sample.rim):
-        match, on_table, inside = _matches(sample.rim, sample.rim_colours, sight, poses, colours, table, like)
-        goes_on = (match * (1 - on_table) * inside).sum(1)
-        score = score - RIM_COST * goes_on / np.maximum(inside.sum(1), 1)
-    return score, told / n
-
-
-def _matches(
-    points: Float32,
-    expected: Float32,
-    sight: Sight,
-    poses: Array,
-    colours: Float32,
-    table: Float32,
-    like: float,
-) -> tuple[Float32, Float32, Mask]:
-    """For points at poses ``(q, n)``: colour match, share of table, and whether the picture tells of them."""
-    P = sight.P
-    turned = P[:, :3] @ rotations(poses[:, 3]).astype(np.float32)
-    at = (turned @ points.T) + (poses[:, :3].astype(np.float32) @ P[:, :3].T + P[:, 3])[..., None]
-    ahead = np.maximum(at[:, 2], 0.03)
-    columns, rows = np.rint(at[:, 0] / ahead).astype(np.int32), np.rint(at[:, 1] / ahead).astype(np.int32)
-    height, width = table.shape
-    inside = (at[:, 2] > 0.03) & (columns >= 0) & (rows >= 0) & (columns < width) & (rows < height)
-    index = np.where(inside, rows * width + columns, 0)
-    inside &= ~sight.hidden.ravel()[index]
-    shown = colours.reshape(-1, 3).take(index, axis=0)
-    first, along = expected[:, 0], expected[:, 1] - expected[:, 0]
-    off = shown - first
-    length = np.maximum(np.einsum("nc,nc->n", along, along), 1e-6)
-    share = np.clip(np.einsum("qnc,nc->qn", off, along) / length, 0, 1)
-    off -= share[..., None] * along
-    away = np.einsum("qnc,qnc->qn", off, off)
-    return np.exp(away / (-2 * like**2)), table.ravel()[index], inside
-
-
-@dataclass(frozen=True)
 class Place:
     """A pose (x, y, z, yaw) ``(4,)`` and how well all views agree with it; 1 is perfect."""
 
     pose: Array
     score: float
-
-
-def agreement(
-    samples: Mapping[str, Sample], sights: Mapping[str, Sight], poses: Array, is_coarse: bool = False
-) -> Array:
-    """How well poses ``(q, 4)`` agree with all views."""
-    total, weight = np.zeros(len(poses)), np.zeros(len(poses))
-    least = MIN_SHOWN_COARSE if is_coarse else MIN_SHOWN
-    for camera, sample in samples.items():
-        score, told = compare(sample, sights[camera], poses, is_coarse)
-        told = np.where(told > least, sample.weight * told, 0.0)
-        total += score * told
-        weight += told
-    return total / np.maximum(weight, ENOUGH_SHOWN)
-
-
-def samples_at(surface: Surface, sights: Mapping[str, Sight], pose: Array, count: int) -> dict[str, Sample]:
-    """What each camera sees of a surface at a pose; cameras that see hardly anything are left out."""
-    taken = {camera: take_sample(surface, sight, pose, count) for camera, sight in sights.items()}
-    return {camera: sample for camera, sample in taken.items() if sample is not None}
-
-
-def score_at(surface: Surface, sights: Mapping[str, Sight], pose: Array) -> float:
-    """How well a pose agrees with all views; 0 where none shows it."""
-    samples = samples_at(surface, sights, pose, FINE_POINTS)
-    return float(agreement(samples, sights, pose[None])[0]) if samples else 0.0
 
 
 def search(
