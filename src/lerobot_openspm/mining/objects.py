@@ -37,7 +37,7 @@ from lerobot_openspm.types import (
 
 logger = logging.getLogger(__name__)
 
-# So many demonstrations of a task are looked at all along, and every so-manieth frame of them.
+# How many demonstrations of a task are filmed, and from one picture to the next how many frames.
 FILMED_PER_TASK, FILM_STEP = 3, 4
 # The hand may touch an object so many frames before the motion to a contact begins.
 FRAMES_BEFORE_CONTACT = 4

@@ -157,13 +157,35 @@ def test_a_record_tells_all_of_it(models):
         ({"near": None}, "'near' of 'block'"),
         ({"hand_cameras": "hand"}, "list of camera keys"),
         ({"spacing": -1.0}, "'spacing' is -1.0"),
-        ({"typical_agreement": 2.0}, "'typical_agreement' is 2.0"),
+        ({"typical_agreement": 0.0}, "'typical_agreement' is 0.0"),
     ],
 )
 def test_a_broken_record_is_refused(models, change, message):
     fields, arrays = store.to_parts(models["block"])
     with pytest.raises(MemoryFormatError, match=message):
         store.from_parts(fields | change, arrays, "here")
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "message"),
+    [
+        ("table_area", np.array([[-1e6, -1e6], [1e6, 1e6]]), "'table_area' is"),
+        ("table_area", np.array([[1.0, 1.0], [-1.0, -1.0]]), "'table_area' is"),
+        ("hand.0", np.zeros((0, 4), np.uint8), "has no pixels"),
+    ],
+)
+def test_a_record_that_would_hang_or_crash_a_search_is_refused(models, name, value, message):
+    fields, arrays = store.to_parts(models["block"])
+    value = value if value.dtype == np.uint8 else value.astype(np.float32)
+    with pytest.raises(MemoryFormatError, match=message):
+        store.from_parts(fields, arrays | {name: value}, "here")
+
+
+def test_a_record_without_colours_is_refused(models):
+    fields, arrays = store.to_parts(models["block"])
+    blank = np.full_like(arrays["colours"], -1000.0)
+    with pytest.raises(MemoryFormatError, match="0 points of 'block' have colours"):
+        store.from_parts(fields, arrays | {"colours": blank}, "here")
 
 
 @pytest.mark.parametrize("name", ["points", "normals", "colours", "table_colour", "table_area", "hand.0"])

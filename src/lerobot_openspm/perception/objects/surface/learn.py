@@ -37,8 +37,11 @@ logger = logging.getLogger(__name__)
 MIN_DIRECTIONS, MAX_SPREAD = 2, 7.0
 # How a camera shows a point that it never saw is told by the most similar point that both cameras saw.
 SIMILAR_M, SIMILAR_COLOUR = 0.03, 10.0
+# Points without believed colours are kept this near to such as have them, metres: they hide what is behind.
 BESIDE_M = 0.02
+# Silhouettes are filled in so many rounds, since one object's surface explains what is seen beside another.
 ROUNDS = 2
+# An object with fewer coloured points gets no surface.
 MIN_COLOURED = 40
 
 

@@ -9,6 +9,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import KDTree
 
 from lerobot_openspm.errors import MemoryFormatError
 from lerobot_openspm.geometry import se3
@@ -17,7 +18,7 @@ from lerobot_openspm.perception.objects import records
 from lerobot_openspm.perception.objects.base import Look, Record
 from lerobot_openspm.perception.objects.patches import model as patches
 from lerobot_openspm.perception.objects.patches.model import PatchModel
-from lerobot_openspm.perception.objects.surface.backdrop import Backdrop, Colour
+from lerobot_openspm.perception.objects.surface.backdrop import TABLE_MARGIN_M, Backdrop, Colour
 from lerobot_openspm.perception.objects.surface.compare import FINE_POINTS, Sight, Surface, score_at, sight_of
 from lerobot_openspm.perception.objects.surface.search import (
     FINE_STEPS,
@@ -30,7 +31,8 @@ from lerobot_openspm.perception.objects.surface.search import (
 )
 from lerobot_openspm.types import UNKNOWN_YAW_STD, PoseEstimate
 
-MAX_POINTS, MAX_WALLS = 60_000, 16
+# What a record may hold: points, coloured ones at least, and the table's length and width in metres, rounded.
+MAX_POINTS, MIN_COLOURED, MAX_TABLE_M, ROUNDING_M = 60_000, 8, 10.0, 1e-3
 # Of the agreement that is typical of the demonstrations: from here on an object is found, ...
 FOUND_SHARE = 0.6
 # ... and patches are believed that found it where it stood in them.
@@ -89,8 +91,6 @@ class SurfaceModel:
     @cached_property
     def is_round(self) -> bool:
         """Whether it looks alike from all sides, so that its direction cannot be seen."""
-        from scipy.spatial import KDTree
-
         has = np.isfinite(self.surface.colours[:, 1, 0])
         points, colours = self.surface.points[has], self.surface.colours[has, 1]
         middle = np.append((points[:, :2].min(0) + points[:, :2].max(0)) / 2, 0.0)
@@ -150,9 +150,6 @@ class SurfaceModel:
         return refine(self.surface, sights, quick.pose, turns, FINE_POINTS, FINE_STEPS)
 
     def _estimate(self, look: Look, places: list[Place]) -> PoseEstimate:
-        if not places:
-            unknown = np.diag([1.0, 1.0, 1.0, UNKNOWN_YAW_STD**2])
-            return PoseEstimate("not_found", np.eye(4), unknown, 0.0, visible=0.0)
         best = places[0]
         share = best.score / self.typical_agreement
         apart = max(SAME_PLACE_M, OVERLAP_SHARE * self.surface.radius)
@@ -162,8 +159,7 @@ class SurfaceModel:
         T = se3.from_yaw(best.pose[:3], float(best.pose[3]))
         yaw_std = UNKNOWN_YAW_STD if self.is_round else STD_RAD
         covariance = np.diag([STD_M**2, STD_M**2, STD_M**2, yaw_std**2])
-        own = self.surface.points[np.isfinite(self.surface.colours[:, 0, 0])]
-        visible = look.seen_share(se3.apply(T, own))
+        visible = look.seen_share(se3.apply(T, self.surface.coloured))
         others = tuple(
             se3.from_yaw(one.pose[:3], float(one.pose[3]))
             for one in rivals
@@ -209,13 +205,26 @@ def from_record(fields: Mapping[str, Any], arrays: Mapping[str, NDArray[Any]], w
         raise MemoryFormatError(f"{where}: 'points' has {len(points)} rows, expected 8 to {MAX_POINTS}")
     normals = records.array(arrays, "normals", (len(points), 3), where)
     colours = records.array(arrays, "colours", (len(points), 2, 3), where).copy()
-    colours[colours <= UNCOLOURED] = np.nan
+    colours[(colours <= UNCOLOURED).any((1, 2))] = np.nan
+    if (coloured := int(np.isfinite(colours[:, 0, 0]).sum())) < MIN_COLOURED:
+        raise MemoryFormatError(
+            f"{where}: {coloured} points of {name!r} have colours, expected {MIN_COLOURED} or more; "
+            "learn the objects again"
+        )
     table = records.array(arrays, "table_colour", (4, 3), where).astype(float)
     area = records.array(arrays, "table_area", (2, 2), where).astype(float)
+    sides = area[1] - area[0]
+    if sides.min() < 2 * TABLE_MARGIN_M - ROUNDING_M or sides.max() > MAX_TABLE_M:
+        raise MemoryFormatError(
+            f"{where}: 'table_area' is {area.tolist()}, expected least and largest x and y, "
+            f"{2 * TABLE_MARGIN_M} to {MAX_TABLE_M} m apart"
+        )
     hand = {
         camera: records.array(arrays, f"hand.{i}", (-1, -1), where, np.uint8).astype(bool)
         for i, camera in enumerate(cameras)
     }
+    if any(mask.size == 0 for mask in hand.values()):
+        raise MemoryFormatError(f"{where}: a picture of the hand has no pixels; learn the objects again")
     numbers = {key: records.number(fields, key, *BOUNDS[key], where) for key in BOUNDS}
     backdrop = Backdrop(Colour(table[0], table[1:]), numbers["table_height"], area, {}, hand)
     own = {key.removeprefix("near."): value for key, value in arrays.items() if key.startswith("near.")}
@@ -227,7 +236,7 @@ def from_record(fields: Mapping[str, Any], arrays: Mapping[str, NDArray[Any]], w
 
 BOUNDS = {
     "height": (-100.0, 100.0),
-    "typical_agreement": (0.0, 1.0),
+    "typical_agreement": (0.05, 1.0),
     "spacing": (1e-6, 1.0),
     "table_height": (-100.0, 100.0),
 }

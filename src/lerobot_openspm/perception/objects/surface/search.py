@@ -108,7 +108,6 @@ def refine(
     turns: bool,
     count: int,
     steps: Sequence[tuple[float, float]],
-    lifts: bool = False,
 ) -> Place:
     """Move a pose (x, y, z, yaw) in ever smaller steps to where all views agree best.
 
@@ -119,7 +118,6 @@ def refine(
         turns: Whether the yaw may change.
         count: Points to compare in a view.
         steps: Metres and radians of each round.
-        lifts: Whether the height may change.
     """
     pose, score = np.array(pose, float), 0.0
     beside = [(a, b) for a in (-1, 0, 1) for b in (-1, 0, 1) if a or b]
@@ -130,8 +128,6 @@ def refine(
         moves = [np.zeros(4), *(np.array([a * metres, b * metres, 0.0, 0.0]) for a, b in beside)]
         if turns:
             moves += [np.array([0.0, 0.0, 0.0, sign * radians]) for sign in (-1, 1)]
-        if lifts:
-            moves += [np.array([0.0, 0.0, sign * metres, 0.0]) for sign in (-1, 1)]
         for _ in range(MOVES_PER_STEP):
             scores = agreement(samples, sights, pose + np.stack(moves))
             best = int(scores.argmax())
