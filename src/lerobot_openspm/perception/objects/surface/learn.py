@@ -13,21 +13,18 @@ from lerobot_openspm.geometry.se3 import Array
 from lerobot_openspm.perception.objects.base import Examples, Kind, Look
 from lerobot_openspm.perception.objects.patches.learn import learn_patches
 from lerobot_openspm.perception.objects.patches.model import PatchModel
-from lerobot_openspm.perception.objects.surface.backdrop import (
-    Backdrop,
-    Float32,
-    learn_backdrop,
-    sample,
-)
+from lerobot_openspm.perception.objects.surface.backdrop import Backdrop, Float32, learn_backdrop
 from lerobot_openspm.perception.objects.surface.carving import Carved, Frame, Frames, carve
 from lerobot_openspm.perception.objects.surface.compare import Surface, score_at, sight_of
 from lerobot_openspm.perception.objects.surface.model import SurfaceModel, from_record
-from lerobot_openspm.perception.objects.surface.relief import (
-    WEIGHTS,
-    Relief,
-    depth_of_all,
+from lerobot_openspm.perception.objects.surface.relief import WEIGHTS, find_relief
+from lerobot_openspm.perception.objects.surface.solid import (
+    Drawn,
+    Solid,
+    carve_by_colour,
+    colours_of,
     fill_silhouettes,
-    find_relief,
+    solid_under,
 )
 from lerobot_openspm.types import DemonstrationScene, Moment, View
 
@@ -129,41 +126,30 @@ def build_surfaces(
     """
     own = {name: Frames(name, [f for f in frames if name in f.standing]) for name in touched}
     carved: dict[str, Carved] = {}
-    reliefs: dict[str, Relief] = {}
+    solids: dict[str, Solid] = {}
     for name, points in touched.items():
         table = backdrop.table_height - heights[name]
         space = carve(own[name], points, table) if len(points) and own[name].frames else None
         if space is not None:
-            carved[name], reliefs[name] = space, find_relief(own[name], space, table)
+            carved[name], solids[name] = space, solid_under(find_relief(own[name], space), space)
     for _ in range(ROUNDS):
-        drawn = {name: (relief.points()[0], relief.cell) for name, relief in reliefs.items()}
-        reliefs = {
-            name: fill_silhouettes(own[name], carved[name], relief, drawn) for name, relief in reliefs.items()
+        drawn = {name: solid.drawn for name, solid in solids.items()}
+        solids = {
+            name: fill_silhouettes(own[name], carved[name], solid, drawn) for name, solid in solids.items()
         }
-    drawn = {name: (relief.points()[0], relief.cell) for name, relief in reliefs.items()}
-    surfaces = {}
-    for name, relief in reliefs.items():
-        surface = _coloured(own[name], relief, drawn)
-        if np.isfinite(surface.colours[:, 0, 0]).sum() >= MIN_COLOURED:
-            surfaces[name] = surface
-    return surfaces
+    drawn = {name: solid.drawn for name, solid in solids.items()}
+    solids = {name: carve_by_colour(own[name], solid, drawn) for name, solid in solids.items()}
+    drawn = {name: solid.drawn for name, solid in solids.items()}
+    surfaces = {name: _coloured(own[name], solid, drawn) for name, solid in solids.items()}
+    return {name: one for name, one in surfaces.items() if len(one.coloured) >= MIN_COLOURED}
 
 
-def _coloured(frames: Frames, relief: Relief, drawn: Mapping[str, tuple[Array, float]]) -> Surface:
-    """A relief's points with the colours that the pictures agree about."""
-    points, normals = relief.points()
+def _coloured(frames: Frames, solid: Solid, drawn: Drawn) -> Surface:
+    """A solid's points with the colours that the pictures agree about."""
+    points, normals = solid.points, solid.normals
     seen: dict[str, list[Float32]] = {"world": [], "ee": []}
-    for frame in frames.distinct:
-        T = frame.standing[frames.name]
-        world, camera = se3.apply(T, points), frame.view.camera
-        rows, columns, depth, inside = frame.look(world)
-        nearest = depth_of_all(frame, drawn)
-        facing = ((world - frame.view.T_world_cam[:3, 3]) * (normals @ T[:3, :3].T)).sum(1) < 0
-        shown = inside & facing & (depth <= nearest[rows, columns] + 1.5 * relief.cell)
-        shown &= frame.foreground[rows, columns]
-        colours = sample(frame.colours, camera, frame.view.T_world_cam, world, frame.hidden)
-        colours[~shown] = np.nan
-        seen[camera.mount].append(colours)
+    for frame, colours in colours_of(frames, solid, drawn):
+        seen[frame.view.camera.mount].append(colours)
     fixed, hand = (_middle(seen[mount], len(points)) for mount in ("world", "ee"))
     middle, spread, count = hand
     believed = (count >= MIN_DIRECTIONS) & (spread <= MAX_SPREAD)
@@ -174,7 +160,7 @@ def _coloured(frames: Frames, relief: Relief, drawn: Mapping[str, tuple[Array, f
     if believed.any():
         near |= KDTree(points[believed]).query(points)[0] < BESIDE_M
     points, normals, colours = points[near], normals[near], colours[near]
-    return Surface(points, normals, _completed(points, normals, colours), relief.cell)
+    return Surface(points, normals, _completed(points, normals, colours), solid.cell)
 
 
 def _middle(seen: Sequence[Float32], n: int) -> tuple[Array, Array, Array]:

@@ -26,10 +26,11 @@ from lerobot_openspm.perception.objects.surface.search import (
     QUICK_STEPS,
     SAME_PLACE_M,
     Place,
+    covariance_at,
     refine,
     search,
 )
-from lerobot_openspm.types import UNKNOWN_YAW_STD, PoseEstimate
+from lerobot_openspm.types import PoseEstimate
 
 # What a record may hold: points, coloured ones at least, and the table's length and width in metres, rounded.
 MAX_POINTS, MIN_COLOURED, MAX_TABLE_M, ROUNDING_M = 60_000, 8, 10.0, 1e-3
@@ -47,18 +48,15 @@ OVERLAP_SHARE = 0.8
 FOLLOWED_M = 0.02
 # An object that is expected this much above the table is in the hand, metres.
 LIFTED_M = 0.02
-# Of the typical agreement at the pose where an object is expected: from here on it is seen there, and taken
-# to be elsewhere only if that agrees so much better; below that it is gone; in between something may hide it.
-KEPT_SHARE, BETTER_SHARE, GONE_SHARE = 0.7, 0.1, 0.4
+# Of the typical agreement at the pose where an object is expected: from here on it is seen there; below that
+# it is gone; in between something may hide it.
+KEPT_SHARE, GONE_SHARE = 0.7, 0.4
 # Directions that the search begins from, for an object that does not look alike from all of them.
 YAWS = tuple(np.linspace(0, 2 * np.pi, 8, endpoint=False))
 # Turned about its middle, a round object agrees with itself this well, CIELAB and share.
 ROUND_COLOUR, ROUND_SHARE, ROUND_SPACINGS = 20.0, 0.6, 3.0
-# Where the demonstrated direction agrees this well, others are not tried.
-ENOUGH_SHARE = 0.95
-# ... and one of them is believed where the demonstrated one agrees less than this share as well.
+# Another direction is believed where the demonstrated one agrees less than this share as well.
 TURNED_SHARE = 0.93
-STD_M, STD_RAD = 0.002, 0.03
 
 
 @dataclass(frozen=True)
@@ -120,12 +118,10 @@ class SurfaceModel:
         if expected is not None:
             there = Place(_pose(expected), score_at(self.surface, sights, _pose(expected)))
             if there.score >= KEPT_SHARE * self.typical_agreement:
-                place = self._refined(sights, expected)
-                is_better = place.score > there.score + BETTER_SHARE * self.typical_agreement
-                return self._estimate(look, [place if is_better else there])
+                return self._estimate(look, sights, [self._refined(sights, expected)])
             if there.score >= GONE_SHARE * self.typical_agreement:
-                return replace(self._estimate(look, [there]), status="not_found", visible=0.0)
-        found = self._estimate(look, self._anywhere(sights))
+                return replace(self._estimate(look, sights, [there]), status="not_found", visible=0.0)
+        found = self._estimate(look, sights, self._anywhere(sights))
         if expected is None or found.status == "found":
             return found
         # Where its patches cannot tell that it is gone, it may be hidden.
@@ -138,7 +134,7 @@ class SurfaceModel:
         """The most likely places on the table; the demonstrated direction is tried first."""
         area, turns = self.backdrop.reach, not self.is_round
         places = search(self.surface, sights, area, self.height, YAWS[:1], turns)
-        if turns and places[0].score < ENOUGH_SHARE * self.typical_agreement:
+        if turns:
             others = search(self.surface, sights, area, self.height, YAWS[1:], turns)
             if others[0].score * TURNED_SHARE > places[0].score:
                 places = others
@@ -149,7 +145,7 @@ class SurfaceModel:
         quick = refine(self.surface, sights, pose, turns, QUICK_POINTS, QUICK_STEPS[1:])
         return refine(self.surface, sights, quick.pose, turns, FINE_POINTS, FINE_STEPS)
 
-    def _estimate(self, look: Look, places: list[Place]) -> PoseEstimate:
+    def _estimate(self, look: Look, sights: Mapping[str, Sight], places: list[Place]) -> PoseEstimate:
         best = places[0]
         share = best.score / self.typical_agreement
         apart = max(SAME_PLACE_M, OVERLAP_SHARE * self.surface.radius)
@@ -157,8 +153,7 @@ class SurfaceModel:
         is_rivalled = any(one.score > RIVAL_SHARE * best.score for one in rivals)
         status = "not_found" if share < FOUND_SHARE else "ambiguous" if is_rivalled else "found"
         T = se3.from_yaw(best.pose[:3], float(best.pose[3]))
-        yaw_std = UNKNOWN_YAW_STD if self.is_round else STD_RAD
-        covariance = np.diag([STD_M**2, STD_M**2, STD_M**2, yaw_std**2])
+        covariance = covariance_at(self.surface, sights, best.pose, not self.is_round)
         visible = look.seen_share(se3.apply(T, self.surface.coloured))
         others = tuple(
             se3.from_yaw(one.pose[:3], float(one.pose[3]))

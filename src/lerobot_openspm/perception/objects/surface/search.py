@@ -17,6 +17,7 @@ from lerobot_openspm.perception.objects.surface.compare import (
     samples_at,
     take_sample,
 )
+from lerobot_openspm.types import UNKNOWN_YAW_STD
 
 COARSE_POINTS, QUICK_POINTS = 50, 100
 CANDIDATES, FINALISTS = 12, 3
@@ -26,6 +27,9 @@ SAME_PLACE_M = 0.035
 QUICK_STEPS = ((0.008, 0.10), (0.004, 0.05))
 FINE_STEPS = ((0.002, 0.025), (0.001, 0.0125))
 MOVES_PER_STEP = 5
+# How much agreement varies without any meaning, and how far from a pose it is probed how steeply it falls.
+AGREEMENT_NOISE, PROBE_M, PROBE_RAD = 0.02, 0.008, 0.1
+SMALLEST_STD_M, LARGEST_STD_M, HEIGHT_STD_M, SMALLEST_STD_RAD = 0.001, 0.05, 0.002, 0.01
 
 
 @dataclass(frozen=True)
@@ -136,3 +140,23 @@ def refine(
                 break
             pose = pose + moves[best]
     return Place(pose, score)
+
+
+def covariance_at(surface: Surface, sights: Mapping[str, Sight], pose: Array, turns: bool) -> Array:
+    """How well the pictures tell a pose: covariance ``(4, 4)`` over x, y, z and yaw, m and rad.
+
+    It is small where agreement falls steeply around the pose. The height is not sought and taken for known.
+    """
+    variances = np.array([LARGEST_STD_M**2, LARGEST_STD_M**2, HEIGHT_STD_M**2, UNKNOWN_YAW_STD**2])
+    samples = samples_at(surface, sights, pose, FINE_POINTS)
+    if not samples:
+        return np.diag(variances)
+    steps = np.diag([PROBE_M, PROBE_M, 0.0, PROBE_RAD])[[0, 1, 3]]
+    scores = agreement(samples, sights, pose + np.concatenate([np.zeros((1, 4)), steps, -steps]))
+    falls = np.maximum(scores[0] - (scores[1:4] + scores[4:]) / 2, 1e-6)
+    told = AGREEMENT_NOISE * np.array([PROBE_M, PROBE_M, PROBE_RAD]) ** 2 / (2 * falls)
+    smallest = np.array([SMALLEST_STD_M, SMALLEST_STD_M, SMALLEST_STD_RAD]) ** 2
+    variances[[0, 1, 3]] = np.clip(told, smallest, variances[[0, 1, 3]])
+    if not turns:
+        variances[3] = UNKNOWN_YAW_STD**2
+    return np.diag(variances)
