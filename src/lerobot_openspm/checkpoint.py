@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -14,6 +15,7 @@ from huggingface_hub.errors import HFValidationError
 
 from lerobot_openspm.configuration_openspm import OpenSPMConfig
 from lerobot_openspm.errors import MemoryFormatError, OpenSPMError
+from lerobot_openspm.geometry.arm import load_arm
 from lerobot_openspm.geometry.camera import check_sizes
 from lerobot_openspm.memory.io import MEMORY_JSON, arrays_file, read_memory
 from lerobot_openspm.memory.memory import Memory, check_layouts
@@ -95,9 +97,11 @@ def load_memory(directory: Path, config: OpenSPMConfig, is_kept: bool) -> Memory
 
     Raises:
         MemoryFormatError: It is damaged or empty, or made for another configuration.
-        CalibrationError: Its cameras are not those of the configuration.
+        CalibrationError: Its cameras are not those of the configuration, or the arm's URDF cannot be read.
     """
     memory = read_memory(directory, None if config.cameras is None else Path(config.cameras))
+    if config.arm is not None:
+        memory = replace(memory, robot=replace(memory.robot, arm=load_arm(Path(config.arm))))
     if not memory.entries:
         raise MemoryFormatError(
             f"the memory in {directory} holds no entries, so nothing can be done with it; train again"

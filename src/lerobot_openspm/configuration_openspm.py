@@ -138,6 +138,9 @@ class OpenSPMConfig(PreTrainedConfig):
             "quat" or "euler"; "none" ignores the rotation. Where the two differ, name them in the layouts.
         control_hz: Actions per second; the dataset's frame rate if not given. It only matters for how long
             an object or a camera may be out of sight.
+        arm: URDF of the robot's arm, from a link that is the world to the link ``ee``, the hand (see
+            ``configs/arms``). With it, key poses that the joints cannot reach are refused, and grasps of
+            round objects are turned to where they can be reached. A checkpoint carries it.
         hand_radius_m: Radius of the hand, in metres, which hides from the cameras what is behind it.
         perception: What finds objects. "demonstrations": the colours and patches that the demonstrations
             showed. "sam3" and "grounded_sam2": pretrained segmenters that take any phrase. "given": the
@@ -180,6 +183,7 @@ class OpenSPMConfig(PreTrainedConfig):
     action_layout: list[str] | None = None
     rotation: RotationKind | None = None
     control_hz: float | None = None
+    arm: str | None = None
     hand_radius_m: float = 0.08
 
     # Perception.
@@ -248,6 +252,7 @@ class OpenSPMConfig(PreTrainedConfig):
         return replace(
             self,
             cameras=None,
+            arm=None,
             segmenter=replace(self.segmenter, sam3d_python=None, sam3d_checkout=None),
             judge=replace(self.judge, api_base=None),
             name_embeddings=None if names and Path(names).is_dir() else names,

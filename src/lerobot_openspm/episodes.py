@@ -62,6 +62,7 @@ def new_episode(
         tracking=config.tracking,
         step_s=step_s(config),
         names=names,
+        middles=memory.middles,
     )
     fingerprint = observation.fingerprint()
     controller = EpisodeController(context, observation.instruction, fingerprint, config.noise_seed)

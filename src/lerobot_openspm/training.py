@@ -6,6 +6,7 @@ learn(...): dataset -> dataset_processor(...).mine() -> MinedDataset -> memory_o
 from __future__ import annotations
 
 import logging
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -17,6 +18,7 @@ from lerobot_openspm.configuration_openspm import OpenSPMConfig
 from lerobot_openspm.errors import PerceptionError
 from lerobot_openspm.flow.samples import perturbed, segment_frames
 from lerobot_openspm.flow.training_set import TrainingSet
+from lerobot_openspm.geometry.arm import load_arm
 from lerobot_openspm.geometry.camera import Camera, load_cameras
 from lerobot_openspm.language.lexicon import read_lexicon
 from lerobot_openspm.memory.indexed_entries import known_names
@@ -117,6 +119,7 @@ def memory_of(mined: MinedDataset, config: OpenSPMConfig) -> Memory:
 
     Raises:
         DatasetError: No demonstration's objects were found.
+        CalibrationError: The arm's URDF cannot be read.
     """
     entries = build_entries(mined)
     logger.info(
@@ -126,8 +129,9 @@ def memory_of(mined: MinedDataset, config: OpenSPMConfig) -> Memory:
     perception, segmentation = "demonstrations", config.perception
     if config.perception == "oracle":
         perception, segmentation = "oracle", "demonstrations"
+    robot = mined.robot if config.arm is None else replace(mined.robot, arm=load_arm(Path(config.arm)))
     return Memory(
-        entries, dict(mined.objects), mined.robot, dict(mined.cameras), perception,
+        entries, dict(mined.objects), robot, dict(mined.cameras), perception,
         mined.simulator_objects, segmentation, config.segmenter.shape, config.layouts(),
     )  # fmt: skip
 

@@ -13,7 +13,7 @@ from lerobot_openspm.control.feasibility import (
     geometric_score,
     shape_deviation,
 )
-from lerobot_openspm.control.transfer import RETREAT_M, transfer, transfer_pose
+from lerobot_openspm.control.transfer import RETREAT_M, Turn, transfer, transfer_pose
 from lerobot_openspm.geometry import se3
 from lerobot_openspm.memory.entry import WORLD
 
@@ -59,6 +59,26 @@ def test_moving_one_object_moves_its_own_targets_alone():
     for old, new in zip(before, after, strict=True):
         moved = G if new.key_pose.anchor.place == "plate" else np.eye(4)
         assert_allclose(new.T_world_ee, moved @ old.T_world_ee, atol=1e-9)
+
+
+@given(st.floats(-3, 3), st.floats(-0.02, 0.02), st.floats(-1, 1))
+def test_a_turned_grasp_takes_a_round_object_from_another_side_and_puts_it_to_the_same_place(turn, x, y):
+    memory, middle = entry(), np.array([x, 0.01])
+    poses = memory.object_poses | {"bowl": se3.from_yaw([0.1, y, 0.0], 0.4)}
+    turned = {0: Turn(poses["bowl"], middle, turn)}
+    before, after = (transfer(memory, poses, {}, HOME, turns=turns) for turns in (None, turned))
+    axis = se3.apply(poses["bowl"], np.array([[*middle, 0.0]]))[0]
+    grasp = next(i for i, one in enumerate(before) if one.key_pose.phase == "grasp")
+    about = se3.from_yaw(axis, turn) @ se3.from_yaw(-axis, 0.0)
+    assert_allclose(after[grasp].T_world_ee, about @ before[grasp].T_world_ee, atol=1e-9)
+    # The hand carries the axis with it, so it stands where it would have stood.
+    for old, new in list(zip(before, after, strict=True))[grasp:-1]:
+        carried = [
+            one.T_world_ee @ se3.inverse(poses_at[grasp].T_world_ee) @ poses["bowl"]
+            for one, poses_at in ((old, before), (new, after))
+        ]
+        at = [se3.apply(T, np.array([[*middle, 0.0]]))[0] for T in carried]
+        assert_allclose(at[1], at[0], atol=1e-9)
 
 
 def test_an_anchor_with_the_worlds_axes_follows_the_place_and_not_the_turn():

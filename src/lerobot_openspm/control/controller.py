@@ -14,10 +14,10 @@ from dataclasses import replace
 import numpy as np
 
 from lerobot_openspm.control.executor import Executor
-from lerobot_openspm.control.planning import Plan, PlanningContext, until
+from lerobot_openspm.control.planning import PlanningContext
 from lerobot_openspm.control.scene import GIVE_UP_S, LOOK_AGAIN_S, SECOND_LOOK_S, LookRequest, SceneState
 from lerobot_openspm.control.state import LOOKS_AT_OUTCOME, EpisodeState, Status
-from lerobot_openspm.control.transfer import Target, pushed_by_landmark, rise, transfer
+from lerobot_openspm.control.transfer import Target, pushed_by_landmark, rise
 from lerobot_openspm.errors import InstructionError
 from lerobot_openspm.geometry.se3 import Array
 from lerobot_openspm.memory.compose import plan_parts
@@ -139,11 +139,11 @@ class EpisodeController:
         state, candidates = self.state, self.state.parts[self.state.part]
         poses = self.scene.tracker.poses(hand.T_world_ee)
         state.ranked = self._context.rank(candidates, poses, hand.T_world_ee)
-        plan = Plan(state.ranked[0].entry, poses, hand.T_world_ee)
+        plan = self._context.choose(state.ranked, poses, hand.T_world_ee)
         if missing := [name for name in plan.entry.objects if name not in poses]:
             logger.info("%r: cannot find %s", self.instruction, missing)
             state.go(Status.OBJECT_NOT_FOUND)
-        elif problems := plan.problems(self._context):
+        elif problems := plan.problems(self._context, with_arm=True):
             logger.warning("%r: %s", self.instruction, "; ".join(problems))
             state.go(Status.INFEASIBLE)
         else:
@@ -162,9 +162,8 @@ class EpisodeController:
 
     def _targets(self) -> tuple[Target, ...]:
         """The key poses of the plan in the scene."""
-        state, plan = self.state, self.state.plan
-        entry = plan.entry if state.repeated is None else until(plan.entry, state.repeated)
-        targets = transfer(entry, plan.object_poses, self._context.yaw_periods, plan.T_world_ee, state.gone)
+        state = self.state
+        targets = state.plan.targets(self._context, state.gone, state.repeated)
         return targets if state.is_last_part else (*targets, *rise(targets[-1], state.start_height))
 
     # Following the plan.

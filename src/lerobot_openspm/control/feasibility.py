@@ -16,6 +16,8 @@ from lerobot_openspm.memory.robot import RobotModel
 # Longest way and largest turn between consecutive key poses: the reach of a table-top arm, and just short of
 # half a turn, whose direction is open.
 MAX_JUMP_M, MAX_JUMP_RAD = 0.8, 2.8
+# A key pose that the joints miss by more than this is out of reach.
+OUT_OF_REACH_M, OUT_OF_REACH_RAD = 0.005, 0.05
 # How much a different motion through free space counts beside one in contact.
 FREE_SPACE_SHARE = 0.2
 # An entry whose motions differ by this much scores 1/e.
@@ -65,6 +67,21 @@ def check_transfer(
             problems.append(f"{where} is {metres:.2f} m and {radians:.2f} rad from the one before")
         before = target.T_world_ee
     return problems
+
+
+def check_reach(targets: Sequence[Target], T_world_ee: Array, robot: RobotModel) -> list[str]:
+    """The first key pose that the arm's joints cannot reach on their way through all of them, in words.
+
+    Nothing is wrong where the arm's kinematics are not known.
+    """
+    if robot.arm is None:
+        return []
+    misses = robot.arm.misses((target.T_world_ee for target in targets), T_world_ee)
+    for i, (target, (metres, radians)) in enumerate(zip(targets, misses, strict=True)):
+        if metres > OUT_OF_REACH_M or radians > OUT_OF_REACH_RAD:
+            where = f"key pose {i} ({target.key_pose.phase} at {target.key_pose.anchor.place})"
+            return [f"{where} is {metres:.3f} m and {radians:.2f} rad beyond what the arm's joints reach"]
+    return []
 
 
 def geometric_score(

@@ -7,8 +7,13 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from lerobot_openspm.control.feasibility import TransferLimits, check_transfer, geometric_score
-from lerobot_openspm.control.transfer import Target, pushed_by_landmark, transfer
+from lerobot_openspm.control.feasibility import (
+    TransferLimits,
+    check_reach,
+    check_transfer,
+    geometric_score,
+)
+from lerobot_openspm.control.transfer import Target, Turn, pushed_by_landmark, transfer
 from lerobot_openspm.geometry import se3
 from lerobot_openspm.geometry.se3 import Array
 from lerobot_openspm.language.names import TABLE_NAMES, NameSimilarity
@@ -20,6 +25,11 @@ from lerobot_openspm.types import Execution, SubTask
 
 # An object this far from where the key poses took it to be takes them along; less is noise.
 MOVED_M, MOVED_RAD = 0.002, 0.05
+# Of the entries so many are tried, and grasps of round objects are turned by so much, radians.
+MAX_TRIED = 3
+TURNS = tuple(
+    np.deg2rad([0, *(sign * turn for turn in range(30, 180, 30) for sign in (1, -1)), 180]).tolist()
+)
 # Where an object is that was never seen.
 NOWHERE = se3.transform(np.eye(3), np.full(3, np.inf))
 
@@ -37,6 +47,8 @@ class PlanningContext:
         tracking: Whether objects are looked for again once a plan is made.
         step_s: Seconds that a control step takes.
         names: Tells which names in an instruction mean the same thing.
+        middles: Where the axis of each object is that looks alike from all sides: x and y ``(2,)`` in its
+            frame.
     """
 
     entries: Sequence[MemoryEntry]
@@ -47,6 +59,7 @@ class PlanningContext:
     tracking: bool = True
     step_s: float = 0.05
     names: NameSimilarity = TABLE_NAMES
+    middles: Mapping[str, Array] = field(default_factory=dict[str, Array])
 
     def __deepcopy__(self, memo: dict[int, object]) -> PlanningContext:
         """Itself: nothing here ever changes, and the memory may be large."""
@@ -77,6 +90,22 @@ class PlanningContext:
         semantic = [(one.entry, one.semantic) for one in candidates]
         return tuple(retrieve(semantic, lambda entry: geometric[id(entry)], self.names))
 
+    def choose(self, ranked: Sequence[Scored], object_poses: Mapping[str, Array], T_world_ee: Array) -> Plan:
+        """The best entry that the arm can follow, grasps of round objects turned as little as needed.
+
+        Where none of the first can be followed, the best one as it is.
+        """
+        first = Plan(ranked[0].entry, object_poses, T_world_ee)
+        if any(name not in object_poses for name in first.entry.objects):
+            return first
+        for entry in (one.entry for one in ranked[:MAX_TRIED] if one.geometric > 0):
+            plan = replace(first, entry=entry)
+            for radians in TURNS if plan.round_grasps(self) else TURNS[:1]:
+                turned = replace(plan, turned=radians)
+                if not turned.problems(self, with_arm=True):
+                    return turned
+        return first
+
 
 @dataclass(frozen=True)
 class Plan:
@@ -87,16 +116,41 @@ class Plan:
         object_poses: Poses ``T_world_obj`` ``(4, 4)`` that the key poses are carried over by. For what the
             hand has touched they are those from before.
         T_world_ee: The hand's pose ``(4, 4)`` where the plan begins.
+        turned: How far the hand is turned about the axis of round objects that it grasps, radians.
     """
 
     entry: MemoryEntry
     object_poses: Mapping[str, Array]
     T_world_ee: Array
+    turned: float = 0.0
 
-    def problems(self, context: PlanningContext) -> list[str]:
-        """What keeps the hand from following the plan, in words."""
-        targets = transfer(self.entry, self.object_poses, context.yaw_periods, self.T_world_ee)
-        return check_transfer(targets, self.T_world_ee, context.robot, context.limits)
+    def targets(
+        self,
+        context: PlanningContext,
+        gone: Mapping[int, float] | None = None,
+        last: int | None = None,
+    ) -> tuple[Target, ...]:
+        """The key poses in the scene; see :func:`transfer`. Those after sub-task `last` are left out."""
+        entry = self.entry if last is None else until(self.entry, last)
+        turns = {
+            sub_task: Turn(self.object_poses[name], context.middles[name], self.turned)
+            for sub_task, name in self.round_grasps(context).items()
+            if self.turned and name in self.object_poses
+        }
+        return transfer(entry, self.object_poses, context.yaw_periods, self.T_world_ee, gone, turns)
+
+    def round_grasps(self, context: PlanningContext) -> dict[int, str]:
+        """Round objects that are grasped, by sub-task."""
+        grasps = (pose for pose in self.entry.key_poses if pose.phase == "grasp")
+        return {p.sub_task: p.anchor.place for p in grasps if p.anchor.place in context.middles}
+
+    def problems(self, context: PlanningContext, with_arm: bool = False) -> list[str]:
+        """What keeps the hand from following the plan, in words; with what the arm's joints say, if asked."""
+        targets = self.targets(context)
+        problems = check_transfer(targets, self.T_world_ee, context.robot, context.limits)
+        if problems or not with_arm:
+            return problems
+        return check_reach(targets, self.T_world_ee, context.robot)
 
     def moved(self, names: Sequence[str], object_poses: Mapping[str, Array]) -> dict[str, Array]:
         """The poses of those objects that are elsewhere now than where the plan takes them to be."""

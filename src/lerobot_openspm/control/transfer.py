@@ -69,6 +69,21 @@ class PushPath:
 
 
 @dataclass(frozen=True)
+class Turn:
+    """A round object is grasped from another side than it was shown.
+
+    Attributes:
+        T_world_obj: Where it stands ``(4, 4)``.
+        middle: Where its axis is, x and y ``(2,)`` in its frame, metres.
+        radians: How far the hand is turned about the axis.
+    """
+
+    T_world_obj: Array
+    middle: Array
+    radians: float
+
+
+@dataclass(frozen=True)
 class Target:
     """A key pose in the present scene.
 
@@ -99,6 +114,7 @@ def transfer(
     yaw_periods: Mapping[str, float],
     T_world_ee: Array,
     gone: Mapping[int, float] | None = None,
+    turns: Mapping[int, Turn] | None = None,
 ) -> tuple[Target, ...]:
     """Carry an entry's key poses over to the scene.
 
@@ -111,6 +127,7 @@ def transfer(
         yaw_periods: Angle by object that turns it into itself, radians; 0 for a body of revolution.
         T_world_ee: Present hand pose ``(4, 4)``.
         gone: How far a drawer or a knob has moved already, by sub-task, metres or radians.
+        turns: By how much the grasp of a round object is turned about its axis, by sub-task.
     """
     chosen: dict[str, Array] = {}
     targets: list[Target] = []
@@ -134,11 +151,35 @@ def transfer(
         is_straight = sum(p.phase == "push" and p.sub_task == pose.sub_task for p in entry.key_poses) == 1
         push = path if pose.phase == "push" and is_straight else None
         targets.append(Target(before, pose, _is_precise(entry, i), axis, push))
+    for sub_task, turn in (turns or {}).items():
+        targets = _turned(targets, sub_task, turn)
     for sub_task, amount in (gone or {}).items():
         targets = _gone_on(targets, sub_task, amount)
     if targets and entry.key.sub_tasks[-1].operation == "put":
         targets += _release(targets)
     return tuple(targets) + _retreat(targets)
+
+
+def _turned(targets: Sequence[Target], sub_task: int, turn: Turn) -> list[Target]:
+    """Key poses that grasp a round object turned about its axis, and put it where they would have put it.
+
+    The hand turns about the axis where it stands, and from the grasp on where the hand has carried it to.
+    """
+    turned = list(targets)
+    T_ee_obj: Array | None = None
+    axis = turn.T_world_obj
+    for i, target in enumerate(targets):
+        pose = target.key_pose
+        if pose.sub_task != sub_task:
+            continue
+        if T_ee_obj is not None and pose.phase != "retreat":
+            axis = target.T_world_ee @ T_ee_obj
+        if pose.phase == "grasp" and T_ee_obj is None:
+            T_ee_obj = se3.inverse(target.T_world_ee) @ turn.T_world_obj
+        point = se3.apply(axis, np.array([[*turn.middle, 0.0]]))[0]
+        about = se3.from_yaw(point, turn.radians) @ se3.from_yaw(-point, 0.0)
+        turned[i] = replace(target, T_world_ee=about @ target.T_world_ee)
+    return turned
 
 
 def push_paths(entry: MemoryEntry, object_poses: Mapping[str, Array]) -> dict[int, PushPath]:

@@ -11,6 +11,7 @@ import numpy as np
 
 from lerobot_openspm.errors import MemoryFormatError
 from lerobot_openspm.geometry.camera import Camera
+from lerobot_openspm.geometry.se3 import Array
 from lerobot_openspm.geometry.vector_layout import VectorLayout
 from lerobot_openspm.memory.entry import MemoryEntry
 from lerobot_openspm.memory.quality import with_success
@@ -52,6 +53,12 @@ class Memory:
     def yaw_periods(self) -> dict[str, float]:
         """Angle by object that turns it into itself, radians; 0 for a body of revolution."""
         return {name: model.yaw_period for name, model in self.objects.items()}
+
+    @property
+    def middles(self) -> dict[str, Array]:
+        """Where the axis of each object is that looks alike from all sides: x and y ``(2,)`` in its frame."""
+        middles = {name: model.middle for name, model in self.objects.items()}
+        return {name: middle for name, middle in middles.items() if middle is not None}
 
     def appended(self, newer: Memory) -> Memory:
         """This memory with the entries of another one added.

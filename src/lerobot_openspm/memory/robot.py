@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lerobot_openspm.errors import MemoryFormatError
+from lerobot_openspm.geometry.arm import Arm
 from lerobot_openspm.geometry.se3 import Array
 
 
@@ -23,6 +24,7 @@ class RobotModel:
         radians_per_action: Rotation per unit of commanded rotation increment and step.
         metres_per_step: Usual speed of the moving hand, rotation included as in :func:`se3.distance`.
         workspace: Lowest and highest hand position ``(2, 3)`` in the world.
+        arm: Its kinematics; None where they are not known.
     """
 
     close_command: float
@@ -32,9 +34,10 @@ class RobotModel:
     radians_per_action: float
     metres_per_step: float
     workspace: Array
+    arm: Arm | None = None
 
     def covering(self, other: RobotModel) -> RobotModel:
-        """This robot with the workspace of both.
+        """This robot with the workspace of both, and the newer one's arm if it has one.
 
         Raises:
             MemoryFormatError: The other one's gripper takes other commands, so it is another robot.
@@ -49,7 +52,7 @@ class RobotModel:
                 )
         low = np.minimum(self.workspace[0], other.workspace[0])
         high = np.maximum(self.workspace[1], other.workspace[1])
-        return replace(self, workspace=np.stack([low, high]))
+        return replace(self, workspace=np.stack([low, high]), arm=other.arm or self.arm)
 
     def closed(self, gripper_commands: Array) -> NDArray[np.bool_]:
         """Which of the commands ``(...)`` close the gripper."""

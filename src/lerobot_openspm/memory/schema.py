@@ -14,6 +14,7 @@ from msgspec import Meta, Struct
 
 from lerobot_openspm.errors import LayoutError, MemoryFormatError
 from lerobot_openspm.geometry import se3
+from lerobot_openspm.geometry.arm import MAX_JOINTS, Arm
 from lerobot_openspm.geometry.se3 import Array
 from lerobot_openspm.geometry.vector_layout import RotationKind, parse_layout
 from lerobot_openspm.memory.entry import AxisKind, MemoryEntry, Phase
@@ -122,6 +123,17 @@ class _Entry(Record, kw_only=True):
     outcomes: list[_Outcome] = []
 
 
+class _Joint(Record):
+    T_before_joint: Transform
+    axis: Vector
+    limits: Annotated[list[Number], Meta(min_length=2, max_length=2)]
+
+
+class _Arm(Record):
+    joints: Annotated[list[_Joint], Meta(min_length=1, max_length=MAX_JOINTS)]
+    T_last_ee: Transform
+
+
 class _Robot(Record):
     close_command: Number
     open_command: Number
@@ -130,6 +142,7 @@ class _Robot(Record):
     radians_per_action: Gain
     metres_per_step: Speed
     workspace: Corners
+    arm: _Arm | None = None
 
 
 class _Vector(Record):
@@ -286,6 +299,18 @@ def _wrong_covariance(covariance: Array) -> str:
     return ""
 
 
+def _wrong_arm(arm: Arm) -> str:
+    if not se3.is_rigid(np.stack([*(joint.T_before_joint for joint in arm.joints), arm.T_last_ee])):
+        return "the 'arm' of the 'robot' has transforms that are not rigid"
+    for joint in arm.joints:
+        if not joint.limits[0] < joint.limits[1] or abs(np.linalg.norm(joint.axis) - 1) > 1e-6:
+            return (
+                f"a joint of the 'arm' has 'limits' {joint.limits.tolist()} and 'axis' "
+                f"{joint.axis.tolist()}, expected the lower limit first and a unit vector"
+            )
+    return ""
+
+
 def origin_of(memory: Memory, file_format: str) -> dict[str, Any]:
     """The fields of a memory's :class:`Origin`."""
     layouts = None
@@ -306,6 +331,8 @@ def memory_from(origin: Origin, where: str, **others: Any) -> Memory:
             f"{where}: 'workspace' of the 'robot' is {robot.workspace.tolist()}, expected the lowest, then "
             f"the highest corner; {AGAIN}"
         )
+    if robot.arm is not None and (wrong := _wrong_arm(robot.arm)):
+        raise MemoryFormatError(f"{where}: {wrong}; {AGAIN}")
     layouts = None
     try:
         if (both := origin.layouts) is not None:

@@ -139,6 +139,14 @@ class KnownObject(Protocol):
         """Turning by this angle (radians) leaves it unchanged; 0 for a body of revolution."""
         ...
 
+    @property
+    def middle(self) -> Array | None:
+        """Where the axis of an object is that looks alike from all sides: x and y ``(2,)`` in its frame.
+
+        None for an object that has a direction, or of which it is not known.
+        """
+        ...
+
     def localise(self, look: Look) -> PoseEstimate:
         """Find the object.
 

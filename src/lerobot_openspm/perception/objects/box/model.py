@@ -72,6 +72,11 @@ class BoxModel:
         """Angle in radians that turns the box, if not the object, into itself: all it shows of the yaw."""
         return 0.0 if self.is_round else box_period(self.size)
 
+    @property
+    def middle(self) -> Array | None:
+        """See :class:`lerobot_openspm.perception.objects.base.KnownObject`."""
+        return np.zeros(2) if self.yaw_period == 0 else None
+
     def localise(self, look: Look) -> PoseEstimate:
         """Find the object in a segmenter's masks; an expected pose only tells its visibility.
 

@@ -51,6 +51,11 @@ class PatchModel:
         """A full turn: the object is not known to look alike from any two sides."""
         return 2 * np.pi
 
+    @property
+    def middle(self) -> None:
+        """It is not known whether the object looks alike from all sides."""
+        return None
+
     def localise(self, look: Look) -> PoseEstimate:
         """Find the object near its demonstrated places; out of the patches' reach nothing can be said of it.
 

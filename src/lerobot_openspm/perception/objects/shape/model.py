@@ -104,6 +104,11 @@ class ShapeModel:
         steps = (np.arange(count) + 0.5) / count * 2 - 1
         return self.yaw_centre + steps * self.yaw_halfwidth
 
+    @property
+    def middle(self) -> Array | None:
+        """See :class:`lerobot_openspm.perception.objects.base.KnownObject`."""
+        return np.zeros(2) if self.yaw_period == 0 else None
+
     def localise(self, look: Look) -> PoseEstimate:
         """Find the object: where it is expected, else on its support plane, at any place and learned yaw."""
         T_expected = look.expected.get(self.name)

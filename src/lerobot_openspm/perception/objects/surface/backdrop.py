@@ -34,6 +34,8 @@ STILL_LEVELS = 6.0
 TABLE_MARGIN_M = 0.25
 # ... and objects stand with their middle this near to where it went.
 REACH_M = 0.10
+# The table's height is sought in such steps, metres, in so many pictures, where so many of them show a place.
+HEIGHT_STEP_M, MAX_TABLE_VIEWS, MIN_TABLE_VIEWS = 0.005, 80, 5
 
 
 def lab(image: NDArray[np.uint8]) -> Float32:
@@ -151,7 +153,7 @@ def learn_backdrop(films: Mapping[str, Sequence[View]], floor: float) -> Backdro
     table, _ = frequent_colour(np.concatenate(pixels))
     spots = np.concatenate([np.stack([_hand_place(view) for view in views]) for views in carried.values()])
     area = np.stack([spots.min(0) - TABLE_MARGIN_M, spots.max(0) + TABLE_MARGIN_M])
-    height = _table_height(carried, hand, area, floor)
+    height = _table_height(carried, hand, table, area, floor)
     known = Backdrop(table, height, area)
     walls = {
         key: _walls(known, views)
@@ -193,27 +195,46 @@ def _walls(known: Backdrop, views: Sequence[View]) -> tuple[Colour, ...]:
 
 
 def _table_height(
-    carried: Mapping[str, Sequence[View]], hand: Mapping[str, Mask], area: Array, floor: float
+    carried: Mapping[str, Sequence[View]],
+    hand: Mapping[str, Mask],
+    table: Colour,
+    area: Array,
+    floor: float,
 ) -> float:
-    """The height at which pictures from many places agree best about the colours of a plane."""
+    """The height at which pictures from many places agree best about the grain of a plane.
+
+    Only what has the table's colour counts: what stands on it agrees at other heights.
+    """
     grid = np.stack(
         np.meshgrid(*(np.arange(low, high, 0.008) for low, high in area.T), indexing="ij"), -1
     ).reshape(-1, 2)
-    views = [(key, view) for key, group in carried.items() for view in distinct(group)[:40]]
+    views = [(key, view) for key, group in carried.items() for view in distinct(group)[:MAX_TABLE_VIEWS]]
     pictures = [lab(view.image) for _, view in views]
-    heights = np.arange(floor - 0.01, floor + BELOW_CUES_M, 0.005)
+    others = [hand[key] | ~table.matches(picture) for (key, _), picture in zip(views, pictures, strict=True)]
+    steps = round(BELOW_CUES_M / HEIGHT_STEP_M)
+    heights = floor + HEIGHT_STEP_M * np.arange(-steps, steps + 1).astype(float)
     spreads = []
     for height in heights:
         plane = np.asarray(np.column_stack([grid, np.full(len(grid), height)]), float)
         seen = [
-            sample(picture, view.camera, view.T_world_cam, plane, hand[key])
-            for (key, view), picture in zip(views, pictures, strict=True)
+            sample(picture, view.camera, view.T_world_cam, plane, other)
+            for (_, view), picture, other in zip(views, pictures, others, strict=True)
         ]
         stack = np.ma.masked_invalid(np.stack(seen))
         spread = np.ma.median(np.ma.abs(stack - np.ma.median(stack, axis=0)).sum(-1), axis=0)
-        enough = (~stack.mask[..., 0]).sum(0) >= max(3, 0.3 * len(views))
+        enough = (~stack.mask[..., 0]).sum(0) >= MIN_TABLE_VIEWS
         spreads.append(float(np.ma.median(spread[enough])) if enough.any() else np.inf)
-    return float(heights[int(np.argmin(spreads))])
+    return _least(heights, np.array(spreads))
+
+
+def _least(heights: Array, spreads: Array) -> float:
+    """Where a parabola through the least spread and its neighbours has its vertex."""
+    i = int(np.argmin(spreads))
+    if not 0 < i < len(heights) - 1 or not np.isfinite(spreads[i - 1 : i + 2]).all():
+        return float(heights[i])
+    before, least, after = spreads[i - 1 : i + 2]
+    bend = before - 2 * least + after
+    return float(heights[i] + HEIGHT_STEP_M * (0.5 * (before - after) / bend if bend > 0 else 0.0))
 
 
 def distinct(views: Sequence[View], metres: float = 0.05, radians: float = 0.25) -> list[View]:

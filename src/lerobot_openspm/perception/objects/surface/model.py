@@ -48,8 +48,8 @@ OVERLAP_SHARE = 0.8
 FOLLOWED_M = 0.02
 # An object that is expected this much above the table is in the hand, metres.
 LIFTED_M = 0.02
-# Of the typical agreement at the pose where an object is expected: from here on it is seen there; below that
-# it is gone; in between something may hide it.
+# Of the typical agreement around where an object is expected: from here on it is seen there; below that it
+# is gone; in between something may hide it.
 KEPT_SHARE, GONE_SHARE = 0.7, 0.4
 # Directions that the search begins from, for an object that does not look alike from all of them.
 YAWS = tuple(np.linspace(0, 2 * np.pi, 8, endpoint=False))
@@ -86,6 +86,11 @@ class SurfaceModel:
         """A full turn: yaw is told from the demonstrated direction."""
         return 2 * np.pi
 
+    @property
+    def middle(self) -> Array | None:
+        """See :class:`lerobot_openspm.perception.objects.base.KnownObject`."""
+        return self.surface.middle if self.is_round else None
+
     @cached_property
     def is_round(self) -> bool:
         """Whether it looks alike from all sides, so that its direction cannot be seen."""
@@ -116,9 +121,9 @@ class SurfaceModel:
             if score >= BELIEVED_SHARE * self.typical_agreement:
                 return near
         if expected is not None:
-            there = Place(_pose(expected), score_at(self.surface, sights, _pose(expected)))
+            there = self._refined(sights, expected)
             if there.score >= KEPT_SHARE * self.typical_agreement:
-                return self._estimate(look, sights, [self._refined(sights, expected)])
+                return self._estimate(look, sights, [there])
             if there.score >= GONE_SHARE * self.typical_agreement:
                 return replace(self._estimate(look, sights, [there]), status="not_found", visible=0.0)
         found = self._estimate(look, sights, self._anywhere(sights))
@@ -142,7 +147,7 @@ class SurfaceModel:
 
     def _refined(self, sights: Mapping[str, Sight], T_world_obj: Array) -> Place:
         pose, turns = _pose(T_world_obj), not self.is_round
-        quick = refine(self.surface, sights, pose, turns, QUICK_POINTS, QUICK_STEPS[1:])
+        quick = refine(self.surface, sights, pose, turns, QUICK_POINTS, QUICK_STEPS)
         return refine(self.surface, sights, quick.pose, turns, FINE_POINTS, FINE_STEPS)
 
     def _estimate(self, look: Look, sights: Mapping[str, Sight], places: list[Place]) -> PoseEstimate:

@@ -20,7 +20,7 @@ from lerobot_openspm.perception.objects.surface.compare import (
 from lerobot_openspm.types import UNKNOWN_YAW_STD
 
 COARSE_POINTS, QUICK_POINTS = 50, 100
-CANDIDATES, FINALISTS = 12, 3
+CANDIDATES, CANDIDATES_PER_YAW, FINALISTS = 10, 2, 3
 # Two candidates nearer than this are one, metres.
 SAME_PLACE_M = 0.035
 # Steps of the refinement: metres and radians.
@@ -71,7 +71,7 @@ def search(
         if all(_apart(pose, place, apart) for place in begun):
             begun.append(pose)
             places.append(refine(surface, sights, pose, turns, QUICK_POINTS, QUICK_STEPS))
-        if len(places) >= CANDIDATES:
+        if len(places) >= CANDIDATES + CANDIDATES_PER_YAW * len(yaws):
             break
     places.sort(key=lambda place: -place.score)
     finest = [

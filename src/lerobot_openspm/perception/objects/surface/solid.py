@@ -10,11 +10,12 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Any, cast
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import binary_erosion, gaussian_filter
+from scipy.ndimage import binary_erosion, gaussian_filter, label
 
 from lerobot_openspm.geometry import se3
 from lerobot_openspm.geometry.se3 import Array
@@ -116,7 +117,15 @@ def carve_by_colour(frames: Frames, solid: Solid, drawn: Drawn, sweeps: int = SW
         filled = solid.filled.copy()
         filled[solid.surface] &= ~gone
         solid = replace(solid, filled=filled)
-    return solid
+    return replace(solid, filled=_largest_piece(solid.filled))
+
+
+def _largest_piece(filled: Mask) -> Mask:
+    """The largest connected piece of some cells ``(n, n, m)``."""
+    pieces, count = cast(Any, label)(filled)
+    if count < 2:
+        return filled
+    return np.asarray(pieces == 1 + int(np.bincount(pieces.ravel())[1:].argmax()))
 
 
 def colours_of(frames: Frames, solid: Solid, drawn: Drawn) -> list[tuple[Frame, Float32]]:
