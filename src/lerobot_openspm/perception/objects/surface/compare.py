@@ -8,7 +8,7 @@ where something else may be in front of it. Around the silhouette the picture mu
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 
 import cv2
@@ -24,10 +24,20 @@ from lerobot_openspm.types import Mask, View
 
 # Colours this far apart, CIELAB, are alike; in the search over the table, that much.
 LIKE, LIKE_COARSE = 8.0, 12.0
+# Pictures are smoothed by a Gaussian of so many pixels, if they are 256 wide, and by octaves more where a
+# surface's points are further apart than that. The search begins with more.
+FINEST, MAX_OCTAVE, COARSE_OCTAVE = 0.6, 4, 2
+# Smoothed over this share of the points' distance a picture shows as much detail as they have.
+DETAIL_SHARE = 0.5
 # What neither shows the object nor the table counts as this much of a point, and as evidence for the pose.
 BLOCKED_WEIGHT, BLOCKED_EVIDENCE = 0.5, 0.1
 # What the colours going on around the silhouette cost.
 RIM_COST = 0.6
+# A surface may end this share of its points' distance before the object does; the rim lies so many pixels,
+# from and to, beyond that.
+BEYOND, RIM_PX = 1.0, (0, 2)
+# Points are drawn this large at most, in pixels.
+MAX_PX = 16
 # A view counts if it shows this share of the visible points.
 MIN_SHOWN, MIN_SHOWN_COARSE = 0.15, 0.3
 # A camera that sees this share of the coloured points sees as much of an object as it can.
@@ -79,16 +89,27 @@ class Sight:
     Attributes:
         view: The view.
         P: Projection ``(3, 4)`` of world points to homogeneous pixels.
-        fine: Weighted CIELAB ``(H, W, 3)``, and where the table is ``(H, W)``, lightly smoothed.
-        coarse: The same, smoothed over the steps of the search.
+        colours: Weighted CIELAB ``(H, W, 3)``.
+        table: Where the table is ``(H, W)``, 1 or 0.
         hidden: Pixels ``(H, W)`` that are no evidence.
     """
 
     view: View
     P: Float32
-    fine: tuple[Float32, Float32]
-    coarse: tuple[Float32, Float32]
+    colours: Float32
+    table: Float32
     hidden: Mask
+    _smoothed: dict[int, tuple[Float32, Float32]] = field(default_factory=dict[int, tuple[Float32, Float32]])
+
+    def smoothed(self, octave: int) -> tuple[Float32, Float32]:
+        """Colours and table, smoothed over about ``2 ** octave`` pixels of a picture 256 wide; made once."""
+        if octave not in self._smoothed:
+            sigma = FINEST * 2.0**octave * self.view.camera.width / 256
+            self._smoothed[octave] = (
+                np.asarray(cv2.GaussianBlur(self.colours, (0, 0), sigma), np.float32),
+                np.asarray(cv2.GaussianBlur(self.table, (0, 0), 1.3 * sigma), np.float32),
+            )
+        return self._smoothed[octave]
 
 
 def sight_of(view: View, camera: str, backdrop: Backdrop, hidden: Mask | None) -> Sight:
@@ -97,10 +118,6 @@ def sight_of(view: View, camera: str, backdrop: Backdrop, hidden: Mask | None) -
     table = cv2.morphologyEx(
         backdrop.table.matches(colours).astype(np.uint8), cv2.MORPH_OPEN, np.ones((3, 3), np.uint8)
     ).astype(np.float32)
-    weighted = colours * WEIGHTS
-    scale = view.camera.width / 256
-    fine = (cv2.GaussianBlur(weighted, (0, 0), 0.6 * scale), cv2.GaussianBlur(table, (0, 0), 0.8 * scale))
-    coarse = (cv2.GaussianBlur(weighted, (0, 0), 2 * scale), cv2.GaussianBlur(table, (0, 0), 2 * scale))
     covered = np.zeros(table.shape, bool) if hidden is None else hidden.copy()
     own = backdrop.hidden(camera, view)
     if own is not None:
@@ -108,7 +125,7 @@ def sight_of(view: View, camera: str, backdrop: Backdrop, hidden: Mask | None) -
     T_cam_world = np.linalg.inv(view.T_world_cam)[:3]
     c = view.camera
     K = np.array([[c.fx, 0, c.cx], [0, c.fy, c.cy], [0, 0, 1]])
-    return Sight(view, (K @ T_cam_world).astype(np.float32), fine, coarse, covered)  # pyright: ignore[reportArgumentType]
+    return Sight(view, (K @ T_cam_world).astype(np.float32), colours * WEIGHTS, table, covered)
 
 
 @dataclass(frozen=True)
@@ -121,6 +138,7 @@ class Sample:
         rim: ``(m, 3)`` in the object's frame, at the depth of the silhouette's edge.
         rim_colours: Weighted CIELAB ``(m, 2, 3)`` of the edge.
         weight: From 0 to 1; less where the camera sees only a small part of the surface.
+        octave: How far pictures are smoothed to show as much detail as the surface has.
     """
 
     points: Float32
@@ -128,6 +146,7 @@ class Sample:
     rim: Float32
     rim_colours: Float32
     weight: float
+    octave: int
 
 
 def rotations(yaws: Array) -> Array:
@@ -145,12 +164,13 @@ def take_sample(surface: Surface, sight: Sight, pose: Array, count: int) -> Samp
     if inside.sum() < MIN_POINTS:
         return None
     rows, columns = np.rint(v[inside]).astype(int), np.rint(u[inside]).astype(int)
-    pad = 8
+    across_px = surface.spacing * camera.focal_px / float(np.median(depth[inside]))
+    radius, beyond = (int(np.clip(np.ceil(share * across_px), 0, MAX_PX)) for share in (0.5, BEYOND))
+    pad = MAX_PX + RIM_PX[1] + 2
     top, left = rows.min() - pad, columns.min() - pad
     shape = (int(rows.max() - top + pad + 1), int(columns.max() - left + pad + 1))
     nearest = np.full(shape, np.inf, np.float32)
     np.minimum.at(nearest, (rows - top, columns - left), depth[inside])
-    radius = int(np.clip(np.ceil(0.5 * surface.spacing * camera.focal_px / np.median(depth[inside])), 0, 6))
     drawn = spread(nearest, radius)
     facing = ((world - T[:3, 3]) * (surface.normals @ R.T)).sum(1) < 0
     visible = np.zeros(len(world), bool)
@@ -160,7 +180,7 @@ def take_sample(surface: Surface, sight: Sight, pose: Array, count: int) -> Samp
     if len(own) < MIN_POINTS:
         return None
     colours = surface.colours * WEIGHTS
-    rim, edge = _rim(np.isfinite(drawn), radius, np.array([left, top]), count // 2, u[own], v[own])
+    rim, edge = _rim(np.isfinite(drawn), radius, beyond, np.array([left, top]), count // 2, u[own], v[own])
     rays = np.stack(
         [(rim[:, 0] - camera.cx) / camera.fx, (rim[:, 1] - camera.cy) / camera.fy, np.ones(len(rim))], -1
     )
@@ -169,19 +189,28 @@ def take_sample(surface: Surface, sight: Sight, pose: Array, count: int) -> Samp
     return Sample(
         surface.points[chosen].astype(np.float32), colours[chosen].astype(np.float32),
         ((beside - t) @ R).astype(np.float32), colours[own[edge]].astype(np.float32),
-        min(1.0, len(own) / (WHOLE_SHARE * len(surface.coloured))),
+        min(1.0, len(own) / (WHOLE_SHARE * len(surface.coloured))), _octave(surface, sight, depth[own]),
     )  # fmt: skip
 
 
+def _octave(surface: Surface, sight: Sight, depth: Float32) -> int:
+    """How far a picture is smoothed that shows points at these depths ``(n,)``; see :class:`Sight`."""
+    across_px = surface.spacing * sight.view.camera.focal_px / float(np.median(depth))
+    finest_px = FINEST * sight.view.camera.width / 256
+    return int(np.clip(np.ceil(np.log2(DETAIL_SHARE * across_px / finest_px)), 0, MAX_OCTAVE))
+
+
 def _rim(
-    mask: Mask, radius: int, corner: Array, count: int, u: Float32, v: Float32
+    mask: Mask, radius: int, beyond: int, corner: Array, count: int, u: Float32, v: Float32
 ) -> tuple[Array, NDArray[np.int64]]:
-    """Pixels ``(m, 2)`` just outside a drawn silhouette, and the nearest of its points at ``(u, v)``."""
+    """Pixels ``(m, 2)`` so far outside a drawn silhouette, and the nearest of its points at ``(u, v)``."""
     closed = cv2.morphologyEx(mask.astype(np.uint8), cv2.MORPH_CLOSE, np.ones((3, 3), np.uint8))
     if radius > 1:  # points were drawn as squares that reach beyond the surface
         closed = cv2.erode(closed, np.ones((2 * (radius // 2) + 1,) * 2, np.uint8))
-    wide = cv2.dilate(closed, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (7, 7)))
-    rows, columns = np.nonzero(wide - cv2.dilate(closed, np.ones((3, 3), np.uint8)))
+    near, far = (
+        cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * (beyond + more) + 1,) * 2) for more in RIM_PX
+    )
+    rows, columns = np.nonzero(cv2.dilate(closed, far) - cv2.dilate(closed, near))
     some = spaced(np.arange(len(rows)), count)
     rim = np.stack([columns[some], rows[some]], -1) + corner
     _, nearest = KDTree(np.stack([u, v], -1)).query(rim)
@@ -200,7 +229,7 @@ def compare(sample: Sample, sight: Sight, poses: Array, is_coarse: bool = False)
 
     Agreement is 1 where every point has its colour and nothing goes on around it.
     """
-    colours, table = sight.coarse if is_coarse else sight.fine
+    colours, table = sight.smoothed(max(sample.octave, COARSE_OCTAVE) if is_coarse else sample.octave)
     like = LIKE_COARSE if is_coarse else LIKE
     match, on_table, inside = _matches(sample.points, sample.colours, sight, poses, colours, table, like)
     good = (match * inside).sum(1)

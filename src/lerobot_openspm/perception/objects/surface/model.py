@@ -51,6 +51,8 @@ LIFTED_M = 0.02
 # Of the typical agreement around where an object is expected: from here on it is seen there; below that it
 # is gone; in between something may hide it.
 KEPT_SHARE, GONE_SHARE = 0.7, 0.4
+# That it is where it was expected needs less evidence: from this share on nothing is in doubt.
+SURE_SHARE = 0.8
 # Directions that the search begins from, for an object that does not look alike from all of them.
 YAWS = tuple(np.linspace(0, 2 * np.pi, 8, endpoint=False))
 # Turned about its middle, a round object agrees with itself this well, CIELAB and share.
@@ -123,7 +125,8 @@ class SurfaceModel:
         if expected is not None:
             there = self._refined(sights, expected)
             if there.score >= KEPT_SHARE * self.typical_agreement:
-                return self._estimate(look, sights, [there])
+                seen = self._estimate(look, sights, [there])
+                return replace(seen, confidence=min(1.0, seen.confidence / SURE_SHARE))
             if there.score >= GONE_SHARE * self.typical_agreement:
                 return replace(self._estimate(look, sights, [there]), status="not_found", visible=0.0)
         found = self._estimate(look, sights, self._anywhere(sights))
