@@ -62,6 +62,8 @@ def new_episode(
         tracking=config.tracking,
         step_s=step_s(config),
         names=names,
+        points=memory.points,
+        hand_radius_m=config.hand_radius_m,
         middles=memory.middles,
     )
     fingerprint = observation.fingerprint()

@@ -17,6 +17,7 @@ import pytest
 
 REPOSITORY = Path(__file__).parents[2]
 CALIBRATION = REPOSITORY / "configs/cameras/openspm_tabletop.json"
+ARM = REPOSITORY / "configs/arms/libero_panda.urdf"
 TRAIN_CONFIG = REPOSITORY / "configs/openspm_tabletop_train.yaml"
 # Enough for weights that differ from the first ones; the memory does not depend on it.
 STEPS = 60

@@ -13,7 +13,7 @@ from lerobot.datasets import LeRobotDatasetMetadata
 from scripts.house import own_options
 from tests.mining.phase_labels.loopback_chat import LoopbackChat, Reply, question_of, say
 from tests.policy.conftest import Frame, act
-from tests.policy.lerobot_commands import CALIBRATION
+from tests.policy.lerobot_commands import ARM, CALIBRATION
 from tests.policy.test_learning import new_config
 
 from lerobot_openspm import episodes as running
@@ -79,6 +79,7 @@ def trained(
     pose = document["cameras"]["observation.images.front"]["T_mount_cam"]
     pose[0][3] += 0.03
     Path("moved.json").write_text(json.dumps(document))
+    Path("arm.urdf").write_text(ARM.read_text())
     return Trained(load, recorded, tiny_meta, mined)
 
 
@@ -129,6 +130,12 @@ def status_far_away(trained: Trained, options: Options) -> Any:
     policy.memory = replace(memory, robot=robot)
     act(policy, trained.recorded[:1])
     return policy.episodes[0].controller.state.status
+
+
+def arm_length(trained: Trained, options: Options) -> Any:
+    """How many joints the policy's arm has; 0 where it is not known."""
+    arm = trained.with_options(options).require_memory().robot.arm
+    return len(arm.joints) if arm else 0
 
 
 def understood(trained: Trained, options: Options) -> Any:
@@ -255,6 +262,7 @@ CASES = {
     "action_layout": Case(numbers, NAMES, TURNED_NAMES),
     "rotation": Case(numbers, None, "axis_angle"),
     "control_hz": Case(step_s, 20.0, 10.0),
+    "arm": Case(arm_length, None, "arm.urdf"),
     "hand_radius_m": Case(actions, 0.08, 1.0),
     "perception": Case(refusal, "demonstrations", "oracle"),
     "tracking": Case(actions_after_a_change, True, False),

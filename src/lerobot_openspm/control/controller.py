@@ -131,7 +131,8 @@ class EpisodeController:
             scene.ground(state.parts[0])
         entries = [one.entry for part in state.parts[state.part :] for one in part]
         needed = [name for entry in entries for name in (*entry.objects, *pushed_by_landmark(entry).values())]
-        names = dict.fromkeys([*needed, *scene.grounding.landmarks])
+        # What else is known may stand in the way.
+        names = dict.fromkeys([*needed, *scene.grounding.landmarks, *context.points])
         return scene.look([name for name in names if name not in scene.altered], hand)
 
     def _plan(self, hand: Hand) -> None:
@@ -147,7 +148,7 @@ class EpisodeController:
             logger.warning("%r: %s", self.instruction, "; ".join(problems))
             state.go(Status.INFEASIBLE)
         else:
-            state.plan = plan
+            state.plan = self._context.clear(plan)
             state.used = (*state.used, next(one.source for one in candidates if one.entry is plan.entry))
             self._begin(0, hand)
             if self._is_tracking:  # else no later look could end the waiting

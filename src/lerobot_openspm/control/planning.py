@@ -7,6 +7,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from lerobot_openspm.control.clearance import lifted
 from lerobot_openspm.control.feasibility import (
     TransferLimits,
     check_reach,
@@ -47,6 +48,8 @@ class PlanningContext:
         tracking: Whether objects are looked for again once a plan is made.
         step_s: Seconds that a control step takes.
         names: Tells which names in an instruction mean the same thing.
+        points: Points ``(n, 3)`` of each object's surface in its frame, where its shape is known.
+        hand_radius_m: Radius of the hand, with which it keeps clear of other objects.
         middles: Where the axis of each object is that looks alike from all sides: x and y ``(2,)`` in its
             frame.
     """
@@ -59,6 +62,8 @@ class PlanningContext:
     tracking: bool = True
     step_s: float = 0.05
     names: NameSimilarity = TABLE_NAMES
+    points: Mapping[str, Array] = field(default_factory=dict[str, Array])
+    hand_radius_m: float = 0.0
     middles: Mapping[str, Array] = field(default_factory=dict[str, Array])
 
     def __deepcopy__(self, memo: dict[int, object]) -> PlanningContext:
@@ -105,6 +110,17 @@ class PlanningContext:
                 if not turned.problems(self, with_arm=True):
                     return turned
         return first
+
+    def clear(self, plan: Plan) -> Plan:
+        """A plan whose ways are lifted over what stands about, as far as the arm can follow them."""
+        points = {
+            name: se3.apply(plan.object_poses[name], own)
+            for name, own in self.points.items()
+            if name in plan.object_poses
+        }
+        entry = lifted(plan.entry, plan.targets(self), plan.T_world_ee, points, self.hand_radius_m)
+        higher = replace(plan, entry=entry)
+        return plan if higher.problems(self, with_arm=True) else higher
 
 
 @dataclass(frozen=True)

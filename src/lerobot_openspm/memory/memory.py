@@ -55,6 +55,12 @@ class Memory:
         return {name: model.yaw_period for name, model in self.objects.items()}
 
     @property
+    def points(self) -> dict[str, Array]:
+        """Points ``(n, 3)`` of each object's surface in its frame, where its shape is known."""
+        points = {name: np.asarray(model.points, float) for name, model in self.objects.items()}
+        return {name: own for name, own in points.items() if len(own)}
+
+    @property
     def middles(self) -> dict[str, Array]:
         """Where the axis of each object is that looks alike from all sides: x and y ``(2,)`` in its frame."""
         middles = {name: model.middle for name, model in self.objects.items()}

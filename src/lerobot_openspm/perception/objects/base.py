@@ -140,6 +140,11 @@ class KnownObject(Protocol):
         ...
 
     @property
+    def points(self) -> NDArray[np.floating[Any]]:
+        """Points ``(n, 3)`` of its surface in its frame, metres; none where its shape is not known."""
+        ...
+
+    @property
     def middle(self) -> Array | None:
         """Where the axis of an object is that looks alike from all sides: x and y ``(2,)`` in its frame.
 

@@ -73,6 +73,11 @@ class BoxModel:
         return 0.0 if self.is_round else box_period(self.size)
 
     @property
+    def points(self) -> Array:
+        """See :class:`lerobot_openspm.perception.objects.base.KnownObject`."""
+        return self.size * CORNERS
+
+    @property
     def middle(self) -> Array | None:
         """See :class:`lerobot_openspm.perception.objects.base.KnownObject`."""
         return np.zeros(2) if self.yaw_period == 0 else None

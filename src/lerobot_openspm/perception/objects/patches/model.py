@@ -52,6 +52,11 @@ class PatchModel:
         return 2 * np.pi
 
     @property
+    def points(self) -> Array:
+        """None: patches have no shape."""
+        return np.zeros((0, 3))
+
+    @property
     def middle(self) -> None:
         """It is not known whether the object looks alike from all sides."""
         return None

@@ -36,6 +36,8 @@ TABLE_MARGIN_M = 0.25
 REACH_M = 0.10
 # The table's height is sought in such steps, metres, in so many pictures, where so many of them show a place.
 HEIGHT_STEP_M, MAX_TABLE_VIEWS, MIN_TABLE_VIEWS = 0.005, 80, 5
+# ... and told if pictures differ there by less than this share of what they usually do.
+DISTINCT_SHARE = 0.95
 
 
 def lab(image: NDArray[np.uint8]) -> Float32:
@@ -228,13 +230,17 @@ def _table_height(
 
 
 def _least(heights: Array, spreads: Array) -> float:
-    """Where a parabola through the least spread and its neighbours has its vertex."""
+    """Where a parabola through the least spread and its neighbours has its vertex.
+
+    A table without any grain does not tell its height; it is taken to lie a little below the floor that
+    touches tell, which is in the middle of the heights.
+    """
     i = int(np.argmin(spreads))
-    if not 0 < i < len(heights) - 1 or not np.isfinite(spreads[i - 1 : i + 2]).all():
-        return float(heights[i])
-    before, least, after = spreads[i - 1 : i + 2]
-    bend = before - 2 * least + after
-    return float(heights[i] + HEIGHT_STEP_M * (0.5 * (before - after) / bend if bend > 0 else 0.0))
+    around = spreads[i - 1 : i + 2] if 0 < i < len(heights) - 1 else np.full(3, np.inf)
+    if not (np.isfinite(around).all() and around[1] < DISTINCT_SHARE * np.median(spreads)):
+        return float(heights[len(heights) // 2] - 2 * HEIGHT_STEP_M)
+    bend = around[0] - 2 * around[1] + around[2]
+    return float(heights[i] + HEIGHT_STEP_M * 0.5 * (around[0] - around[2]) / bend)
 
 
 def distinct(views: Sequence[View], metres: float = 0.05, radians: float = 0.25) -> list[View]:

@@ -51,12 +51,13 @@ LIFTED_M = 0.02
 # Of the typical agreement around where an object is expected: from here on it is seen there; below that it
 # is gone; in between something may hide it.
 KEPT_SHARE, GONE_SHARE = 0.7, 0.4
-# That it is where it was expected needs less evidence: from this share on nothing is in doubt.
-SURE_SHARE = 0.8
+# That it is where it was expected needs less evidence, if the pictures tell its place as sharply as this:
+# from this share on nothing is in doubt. What tells it more vaguely than that is no evidence. Metres.
+SURE_SHARE, SHARP_M, VAGUE_M = 0.8, 0.004, 0.008
 # Directions that the search begins from, for an object that does not look alike from all of them.
 YAWS = tuple(np.linspace(0, 2 * np.pi, 8, endpoint=False))
 # Turned about its middle, a round object agrees with itself this well, CIELAB and share.
-ROUND_COLOUR, ROUND_SHARE, ROUND_SPACINGS = 20.0, 0.6, 3.0
+ROUND_COLOUR, ROUND_SHARE, ROUND_SPACINGS = 20.0, 0.52, 3.0
 # Another direction is believed where the demonstrated one agrees less than this share as well.
 TURNED_SHARE = 0.93
 
@@ -87,6 +88,11 @@ class SurfaceModel:
     def yaw_period(self) -> float:
         """A full turn: yaw is told from the demonstrated direction."""
         return 2 * np.pi
+
+    @property
+    def points(self) -> Array:
+        """See :class:`lerobot_openspm.perception.objects.base.KnownObject`."""
+        return self.surface.coloured
 
     @property
     def middle(self) -> Array | None:
@@ -123,12 +129,9 @@ class SurfaceModel:
             if score >= BELIEVED_SHARE * self.typical_agreement:
                 return near
         if expected is not None:
-            there = self._refined(sights, expected)
-            if there.score >= KEPT_SHARE * self.typical_agreement:
-                seen = self._estimate(look, sights, [there])
-                return replace(seen, confidence=min(1.0, seen.confidence / SURE_SHARE))
-            if there.score >= GONE_SHARE * self.typical_agreement:
-                return replace(self._estimate(look, sights, [there]), status="not_found", visible=0.0)
+            seen = self._estimate(look, sights, [self._refined(sights, expected)])
+            if seen.confidence >= GONE_SHARE:
+                return _followed(seen)
         found = self._estimate(look, sights, self._anywhere(sights))
         if expected is None or found.status == "found":
             return found
@@ -235,6 +238,16 @@ def from_record(fields: Mapping[str, Any], arrays: Mapping[str, NDArray[Any]], w
         name, Surface(points, normals, colours, numbers["spacing"]), backdrop, numbers["height"],
         numbers["typical_agreement"], patches.from_record(near, own, where),
     )  # fmt: skip
+
+
+def _followed(seen: PoseEstimate) -> PoseEstimate:
+    """What is seen around where an object was expected, as far as the pictures can tell."""
+    std_m = float(np.sqrt(seen.covariance[:2, :2].diagonal().max()))
+    if seen.confidence < KEPT_SHARE or std_m > VAGUE_M:
+        return replace(seen, status="not_found", visible=0.0)
+    if std_m <= SHARP_M:
+        seen = replace(seen, confidence=min(1.0, seen.confidence / SURE_SHARE))
+    return replace(seen, status="found")
 
 
 BOUNDS = {

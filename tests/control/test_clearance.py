@@ -1,0 +1,130 @@
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+from tests.control.test_controller import planning_context
+from tests.geometry.test_arm import LIBERO
+from tests.memory.builders import entry, hand_pose, robot
+
+from lerobot_openspm.control.clearance import BESIDE, CLEARANCE_M, Way, lifted
+from lerobot_openspm.control.planning import Plan
+from lerobot_openspm.control.transfer import transfer
+from lerobot_openspm.geometry import se3
+from lerobot_openspm.geometry.arm import load_arm
+from lerobot_openspm.memory.compose import Candidate
+
+HOME = hand_pose(0.0, 0.0, 0.3)
+RADIUS = 0.08
+
+
+def pillar(x, y, height):
+    """Points of a post on the table."""
+    return np.column_stack([np.full(20, x), np.full(20, y), np.linspace(0, height, 20)])
+
+
+def heights(*points, start=(0.0, 0.0, 0.1), goal=(0.4, 0.0, 0.1), below=0.0):
+    return Way(np.array(start), np.array(goal), below).height_over(np.concatenate(points), RADIUS)
+
+
+def test_what_stands_beside_the_way_or_below_it_leaves_it_clear():
+    assert heights(pillar(0.2, RADIUS + 0.01, 0.5)) is None
+    assert heights(pillar(0.2, 0.0, 0.1 - CLEARANCE_M - 0.01)) is None
+    assert heights(pillar(-RADIUS - 0.01, 0.0, 0.5)) is None
+
+
+def test_what_stands_in_the_way_is_crossed_above_its_top():
+    assert_allclose(heights(pillar(0.2, 0.05, 0.25), pillar(0.3, 0.0, 0.1)), 0.25 + CLEARANCE_M)
+
+
+def test_what_hangs_from_the_hand_has_to_clear_it_too():
+    low = pillar(0.2, 0.0, 0.05)
+    assert heights(low) is None
+    assert_allclose(heights(low, below=0.04), 0.05 + 0.04 + CLEARANCE_M)
+
+
+def test_a_hand_that_passes_high_enough_where_the_object_stands_need_not_rise():
+    # It comes down from 0.4 m to 0.1 m, and is still high above a post near its start.
+    assert heights(pillar(0.02, 0.0, 0.2), start=(0, 0, 0.4), goal=(0.4, 0, 0.1)) is None
+    assert heights(pillar(0.38, 0.0, 0.2), start=(0, 0, 0.4), goal=(0.4, 0, 0.1)) is not None
+
+
+def carried_over(*posts):
+    """Key poses that carry a bowl from the left to the plate on the right, with posts about."""
+    shown = entry()
+    poses = {"bowl": se3.from_yaw([-0.2, 0.0, 0.0], 0.0), "plate": se3.from_yaw([0.2, 0.0, 0.0], 0.0)}
+    points = {f"post {i}": post for i, post in enumerate(posts)} | {"bowl": pillar(-0.2, 0.0, 0.05)}
+    plain = transfer(shown, poses, {}, HOME)
+    higher = lifted(shown, plain, HOME, points, RADIUS)
+    return plain, transfer(higher, poses, {}, HOME)
+
+
+def test_nothing_changes_where_nothing_is_in_the_way():
+    plain, targets = carried_over(pillar(0.0, 0.3, 0.4))
+    assert len(targets) == len(plain)
+
+
+def test_a_carried_object_is_lifted_over_a_post_and_then_goes_on_as_shown():
+    plain, targets = carried_over(pillar(0.1, 0.0, 0.2))
+    assert len(targets) == len(plain) + 2
+    rise, over = targets[4], targets[5]
+    assert [rise.key_pose.phase, over.key_pose.phase] == ["pre-place", "pre-place"]
+    below = 0.03  # the bowl was grasped 3 cm above the table
+    for one in (rise, over):
+        assert_allclose(one.T_world_ee[2, 3], 0.2 + below + CLEARANCE_M)
+        assert one.key_pose.closed
+        assert not one.precise
+    # Straight up from where it was lifted to, straight down to where it was to go.
+    assert_allclose(rise.T_world_ee[:2, 3], plain[3].T_world_ee[:2, 3])
+    assert_allclose(over.T_world_ee[:2, 3], plain[4].T_world_ee[:2, 3])
+    kept = (*targets[:4], *targets[6:])
+    assert_allclose([one.T_world_ee for one in kept], [one.T_world_ee for one in plain])
+
+
+def test_an_empty_hand_comes_down_beyond_a_post_on_its_first_way():
+    plain, targets = carried_over(pillar(-0.1, BESIDE * RADIUS - 0.01, 0.25))
+    assert targets[0].key_pose.phase == "approach"
+    assert_allclose(targets[0].T_world_ee[:2, 3], plain[0].T_world_ee[:2, 3])
+    assert_allclose(targets[0].T_world_ee[2, 3], 0.25 + CLEARANCE_M)
+
+
+@pytest.fixture
+def panda(request):
+    return load_arm(request.config.rootpath / LIBERO)
+
+
+def scene(panda, yaw, x=-0.1):
+    """A context with a Panda, poses of a bowl and a plate that were turned together, and the hand's."""
+    poses = {"bowl": se3.from_yaw([x, 0.1, 0.9], yaw), "plate": se3.from_yaw([-0.05, -0.1, 0.9], yaw)}
+    context = planning_context(middles={"bowl": np.zeros(2)})
+    own = robot(workspace=np.array([[-2.0, -2.0, 0.0], [2.0, 2.0, 2.0]]), arm=panda)
+    return replace(context, robot=own), poses, hand_pose(-0.2, 0.0, 1.17)
+
+
+def chosen(context, poses, home):
+    (shown,) = context.entries
+    candidate = Candidate(shown, 1.0, shown, shown.key.sub_tasks)
+    return context.choose(context.rank([candidate], poses, home), poses, home)
+
+
+def test_a_grasp_that_the_joints_cannot_reach_is_turned_about_a_round_object(panda):
+    # The last joint may turn by less, so that the hand cannot; the bowl looks alike from all sides.
+    *joints, last = panda.joints
+    stiff = replace(panda, joints=(*joints, replace(last, limits=np.array([-0.5, 1.5]))))
+    context, poses, home = scene(stiff, np.deg2rad(90))
+    plan = Plan(context.entries[0], poses, home)
+    assert not plan.problems(context)
+    (problem,) = plan.problems(context, with_arm=True)
+    assert "beyond what the arm's joints reach" in problem
+    plan = chosen(context, poses, home)
+    assert plan.turned != 0
+    assert not plan.problems(context, with_arm=True)
+
+
+def test_a_grasp_within_reach_stays_as_shown(panda):
+    assert chosen(*scene(panda, 0.0)).turned == 0
+
+
+def test_what_is_out_of_reach_from_all_sides_is_refused(panda):
+    context, poses, home = scene(panda, 0.0, x=0.9)
+    assert chosen(context, poses, home).problems(context, with_arm=True)
