@@ -136,17 +136,15 @@ class OpenSPMConfig(PreTrainedConfig):
         action_layout: Name of every number of ``action``; read from the dataset if not given.
         rotation: How state and action write rotations, where their names are wrong about it: "axis_angle",
             "quat" or "euler"; "none" ignores the rotation. Where the two differ, name them in the layouts.
-        control_hz: Actions per second; the dataset's frame rate if not given. It only matters for how long
-            an object or a camera may be out of sight.
-        arm: URDF of the robot's arm, from a link that is the world to the link ``ee``, the hand (see
-            ``configs/arms``). With it, key poses that the joints cannot reach are refused, and grasps of
-            round objects are turned to where they can be reached. A checkpoint carries it.
-        hand_radius_m: Radius of the hand, in metres, which hides from the cameras what is behind it.
+        control_hz: Actions per second; the dataset's if not given. It tells how long things are out of sight.
+        arm: URDF of the arm, from the world to the link ``ee``, the hand (see ``configs/arms``). Key poses
+            that its joints cannot reach are refused, grasps of round objects turned. A checkpoint carries it.
+        hand_radius_m: Radius of the hand, in metres. It hides what is behind it, and keeps clear of objects.
         perception: What finds objects. "demonstrations": the colours and patches that the demonstrations
             showed. "sam3" and "grounded_sam2": pretrained segmenters that take any phrase. "given": the
             masks in ``observation.masks.<camera>``. "oracle": the simulator's poses, for ablations only.
-        tracking: Whether objects are followed through the episode, and key poses with them. Otherwise they
-            are found once, at its start, as in the paper, and later pictures are neither needed nor used.
+        tracking: Whether objects are followed through the episode. Otherwise they are found once, as in the
+            paper, and later pictures are neither needed nor used.
         segmenter: What a segmenter needs, and what is learned from its masks.
         memory_episodes: Indices of the episodes that may enter the memory and the training samples; all if
             not given. Name them when some are held out: the policy is shown the whole dataset otherwise.

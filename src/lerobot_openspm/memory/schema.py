@@ -302,12 +302,10 @@ def _wrong_covariance(covariance: Array) -> str:
 def _wrong_arm(arm: Arm) -> str:
     if not se3.is_rigid(np.stack([*(joint.T_before_joint for joint in arm.joints), arm.T_last_ee])):
         return "the 'arm' of the 'robot' has transforms that are not rigid"
-    for joint in arm.joints:
-        if not joint.limits[0] < joint.limits[1] or abs(np.linalg.norm(joint.axis) - 1) > 1e-6:
-            return (
-                f"a joint of the 'arm' has 'limits' {joint.limits.tolist()} and 'axis' "
-                f"{joint.axis.tolist()}, expected the lower limit first and a unit vector"
-            )
+    for one in arm.joints:
+        if not one.limits[0] < one.limits[1] or abs(np.linalg.norm(one.axis) - 1) > 1e-6:
+            told = f"a joint of the 'arm' has 'limits' {one.limits.tolist()} and 'axis' {one.axis.tolist()}"
+            return f"{told}, expected the lower limit first and a unit vector"
     return ""
 
 
