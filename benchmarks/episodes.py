@@ -69,7 +69,7 @@ class Episode:
             "key_pose": state.index,
             "phase": targets[state.index].key_pose.phase if targets else None,
             "attempts": state.attempts,
-            "entry": state.ranked[0].entry.source if state.ranked else None,
+            "entry": state.used[-1].source if state.used else None,
         }
 
 

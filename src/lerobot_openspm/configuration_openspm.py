@@ -124,9 +124,9 @@ class OpenSPMConfig(PreTrainedConfig):
     """Configuration of OpenSPM.
 
     The defaults are those measured on the bundled tabletop. What must be given for a new robot is the
-    calibration of its cameras, and the layouts of state and action where the dataset's feature names do not
-    say what the numbers are. The optimizer and its schedule are LeRobot's options: ``--optimizer.*`` and
-    ``--scheduler.*`` with ``--use_policy_training_preset=false``.
+    calibration of its cameras, and the layouts of state and action where feature names do not tell them. The
+    optimizer and its schedule are LeRobot's options: ``--optimizer.*`` and ``--scheduler.*`` with
+    ``--use_policy_training_preset=false``.
 
     Args:
         cameras: Calibration file of the cameras to look through (see ``configs/cameras``). Needed for
@@ -326,7 +326,7 @@ class OpenSPMConfig(PreTrainedConfig):
 
     @property
     def action_delta_indices(self) -> None:
-        """None: chunks come from the mined segments, which end at key poses; the loader's run across them."""
+        """None: chunks come from the mined segments; the loader's would run across key poses."""
         return None
 
     @property

@@ -3,16 +3,19 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
-from tests.control.test_controller import planning_context
+from tests.control.test_controller import HAND, Perception, controller, observe, planning_context
 from tests.geometry.test_arm import LIBERO
 from tests.memory.builders import entry, hand_pose, robot
 
 from lerobot_openspm.control.clearance import BESIDE, CLEARANCE_M, Way, lifted
+from lerobot_openspm.control.controller import MOST_IN_A_SCENE
 from lerobot_openspm.control.planning import Plan
+from lerobot_openspm.control.state import Status
 from lerobot_openspm.control.transfer import transfer
 from lerobot_openspm.geometry import se3
 from lerobot_openspm.geometry.arm import load_arm
 from lerobot_openspm.memory.compose import Candidate
+from lerobot_openspm.perception.objects.box.model import BoxModel
 
 HOME = hand_pose(0.0, 0.0, 0.3)
 RADIUS = 0.08
@@ -86,6 +89,33 @@ def test_an_empty_hand_comes_down_beyond_a_post_on_its_first_way():
     assert targets[0].key_pose.phase == "approach"
     assert_allclose(targets[0].T_world_ee[:2, 3], plain[0].T_world_ee[:2, 3])
     assert_allclose(targets[0].T_world_ee[2, 3], 0.25 + CLEARANCE_M)
+
+
+def test_a_box_is_in_the_way_of_what_runs_through_the_middle_of_its_side():
+    box = BoxModel("crate", np.array([0.4, 0.3, 0.2]), 0.0, np.pi, 0.0, 0.9)
+    assert_allclose(heights(se3.apply(se3.from_yaw([0.2, 0.0, 0.0], 0.3), box.points)), 0.2 + CLEARANCE_M)
+
+
+@pytest.mark.parametrize(("known", "asked"), [(MOST_IN_A_SCENE, MOST_IN_A_SCENE), (MOST_IN_A_SCENE + 1, 2)])
+def test_what_may_stand_in_the_way_is_looked_for_unless_too_much_is_known(known, asked):
+    names = ["bowl", "plate", *(f"thing {i}" for i in range(known - 2))]
+    look = controller(points={name: pillar(0, 0, 0.1) for name in names}).advance(HAND)
+    assert look is not None
+    assert set(look.names) == set(names[:asked])
+
+
+def test_the_hand_of_an_episode_rises_over_what_it_was_not_asked_about():
+    # Between the hand and the bowl.
+    shown = entry()
+    bowl = shown.object_poses["bowl"][:3, 3]
+    post = se3.from_yaw([*((HAND.T_world_ee[:3, 3] + bowl) / 2)[:2], 0.0], 0.0)
+    sees, points = Perception({**shown.object_poses, "post": post}), {"post": pillar(0, 0, 0.28)}
+    for radius, more in ((0.0, 0), (RADIUS, 1)):
+        one = controller(shown, points=points, hand_radius_m=radius / BESIDE)
+        observe(one, HAND, sees)
+        assert one.state.status is Status.RUNNING
+        assert one.state.used == (shown,)
+        assert (len(one.state.plan.entry.key_poses) > len(shown.key_poses)) == bool(more)
 
 
 @pytest.fixture

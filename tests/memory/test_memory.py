@@ -4,13 +4,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from numpy.testing import assert_array_equal
 from tests.memory.builders import entry, robot
 from tests.memory.memories import LAYOUTS, a_memory, merged_entry, same
 from tests.memory.memory_files import edit_arrays, edit_entries, edit_header, names, vouch_for, write_texts
 
 from lerobot_openspm.errors import MemoryFormatError, OpenSPMError
-from lerobot_openspm.geometry.arm import load_arm
 from lerobot_openspm.geometry.camera import cameras_to_dict
 from lerobot_openspm.memory.io import read_memory, write_memory
 from lerobot_openspm.memory.schema import VERSION
@@ -68,42 +66,18 @@ def test_yaw_periods_are_those_of_the_objects():
     }
 
 
+def test_the_shapes_of_objects_are_not_used_in_the_simulators_frames():
+    known = a_memory()
+    assert set(known.points) == {"bowl", "cream cheese box", "rack", "mug"}  # the stove is known by patches
+    oracle = a_memory(perception="oracle")
+    assert oracle.points == {}
+    assert oracle.middles == {}
+
+
 def test_what_found_the_objects_is_remembered(tmp_path):
     made = a_memory(segmentation="given", shape="box")
     write_memory(made, tmp_path)
     assert same(read_memory(tmp_path), made)
-
-
-@pytest.fixture
-def with_arm(request, tmp_path):
-    """A saved memory of a robot whose arm is known."""
-    arm = load_arm(request.config.rootpath / "configs/arms/libero_panda.urdf")
-    write_memory(a_memory(robot=robot(arm=arm)), tmp_path)
-    return tmp_path, arm
-
-
-def test_an_arm_is_remembered(with_arm):
-    folder, arm = with_arm
-    read = read_memory(folder).robot.arm
-    assert read is not None
-    angles = np.linspace(-1.0, 1.0, 7) - 0.5
-    assert_array_equal(read.ee_pose(angles), arm.ee_pose(angles))
-
-
-@pytest.mark.parametrize(
-    ("field", "value", "told"),
-    [
-        ("limits", [1.0, -1.0], "the lower limit first"),
-        ("axis", [0.0, 0.0, 0.0], "a unit vector"),
-        ("T_before_joint", np.full((4, 4), 0.5).tolist(), "not rigid"),
-        ("limits", [1.0], r"length >= 2 - at `\$\.robot\.arm\.joints\[0\]\.limits"),
-    ],
-)
-def test_an_arm_that_is_none_is_refused(with_arm, field, value, told):
-    folder, _ = with_arm
-    edit_header(folder, lambda header: header["robot"]["arm"]["joints"][0].update({field: value}))
-    with pytest.raises(MemoryFormatError, match=told):
-        read_memory(folder)
 
 
 @pytest.mark.parametrize("index", range(2))

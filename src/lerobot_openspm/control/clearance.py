@@ -20,7 +20,7 @@ from lerobot_openspm.memory.entry import MemoryEntry, MemoryKeyPose
 
 # Phases that cross free space.
 CROSSING = ("approach", "pre-place")
-# It comes down where the hand points down, by the cosine of its lean; from the front it goes as shown.
+# The hand comes down where it points down, by the cosine of its lean; otherwise it goes as it was shown.
 UPRIGHT = 0.9
 # A way shorter than this, horizontally, crosses nothing, metres.
 SHORTEST_M = 0.03

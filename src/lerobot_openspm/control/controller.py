@@ -28,6 +28,9 @@ from lerobot_openspm.types import Detections, Hand
 
 logger = logging.getLogger(__name__)
 
+# A memory that knows more objects than this knows several scenes, and not all objects are looked for.
+MOST_IN_A_SCENE = 20
+
 
 class EpisodeController:
     """Carries out one instruction in one environment; other environments never see any of this.
@@ -131,8 +134,9 @@ class EpisodeController:
             scene.ground(state.parts[0])
         entries = [one.entry for part in state.parts[state.part :] for one in part]
         needed = [name for entry in entries for name in (*entry.objects, *pushed_by_landmark(entry).values())]
-        # What else is known may stand in the way.
-        names = dict.fromkeys([*needed, *scene.grounding.landmarks, *context.points])
+        # What else is known may stand in the way; what is known of many scenes is mostly elsewhere.
+        others = context.points if len(context.points) <= MOST_IN_A_SCENE else ()
+        names = dict.fromkeys([*needed, *scene.grounding.landmarks, *others])
         return scene.look([name for name in names if name not in scene.altered], hand)
 
     def _plan(self, hand: Hand) -> None:

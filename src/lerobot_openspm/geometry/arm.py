@@ -113,8 +113,7 @@ class Arm:
             kept = np.eye(len(angles)) / SCALE_REST_RAD
             return np.asarray(np.concatenate([weights[:, None] * moves, kept]), float)
 
-        margin = 1e-6
-        begin = np.clip(start, low + margin, high - margin)
+        begin = np.clip(start, low, high)
         solve = cast(Any, optimize).least_squares  # it has no stubs
         found = solve(errors, begin, slopes, bounds=(low, high), max_nfev=MAX_EVALUATIONS)
         return np.asarray(found.x, float)

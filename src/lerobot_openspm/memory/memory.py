@@ -56,13 +56,23 @@ class Memory:
 
     @property
     def points(self) -> dict[str, Array]:
-        """Points ``(n, 3)`` of each object's surface in its frame, where its shape is known."""
+        """Points ``(n, 3)`` of each object's surface in its frame, where its shape is known.
+
+        None with the oracle: its objects' frames are the simulator's, not those that shapes were learned in.
+        """
+        if self.perception == "oracle":
+            return {}
         points = {name: np.asarray(model.points, float) for name, model in self.objects.items()}
         return {name: own for name, own in points.items() if len(own)}
 
     @property
     def middles(self) -> dict[str, Array]:
-        """Where the axis of each object is that looks alike from all sides: x and y ``(2,)`` in its frame."""
+        """Where the axis of each object is that looks alike from all sides: x and y ``(2,)`` in its frame.
+
+        None with the oracle, as with :attr:`points`.
+        """
+        if self.perception == "oracle":
+            return {}
         middles = {name: model.middle for name, model in self.objects.items()}
         return {name: middle for name, middle in middles.items() if middle is not None}
 

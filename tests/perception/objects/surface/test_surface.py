@@ -8,6 +8,7 @@ from tests.perception.drawn_world import DISTRACTOR, SHAPES, hand_camera, render
 
 from lerobot_openspm.errors import MemoryFormatError
 from lerobot_openspm.geometry import se3
+from lerobot_openspm.geometry.camera import project
 from lerobot_openspm.perception.objects import store
 from lerobot_openspm.perception.objects.base import Look
 from lerobot_openspm.perception.objects.kinds import learn_objects
@@ -124,6 +125,25 @@ def test_it_is_followed_from_where_it_is_expected(models):
     again = model.localise(look)
     assert again.status == "found"
     assert float(se3.distance(first.T_world_obj, again.T_world_obj)) < 0.006
+
+
+def test_pictures_that_tell_a_place_vaguely_are_no_evidence(models):
+    model, scene = models["block"], moved(0.12, 0.12, 0.3)
+    views = views_at(scene, looking_down(0.12, 0.1, 0.35))
+    T = model.localise(Look(views)).T_world_obj
+    # All is hidden but the middle of its top, which has one colour.
+    hidden = {}
+    for name, view in views.items():
+        uv, _ = project(view.camera, view.T_world_cam, scene["block"][:3, 3] + [0.0, 0.0, 0.05])
+        rows, columns = np.mgrid[: view.camera.height, : view.camera.width]
+        hidden[name] = np.hypot(columns - uv[0], rows - uv[1]) > 5
+    expected = {"block": se3.from_yaw([0.004, 0.004, 0.0], 0.0) @ T}
+    seen = model.localise(Look(views, hidden=hidden, expected=expected))
+    assert seen.status == "not_found"
+    assert seen.visible == 0
+    clear = model.localise(Look(views, expected=expected))
+    assert clear.status == "found"
+    assert np.sqrt(clear.covariance[:2, :2].diagonal()).max() < 0.004
 
 
 def test_nothing_is_learned_of_surfaces_without_a_camera_in_the_hand():

@@ -20,6 +20,10 @@ from lerobot_openspm.perception.objects.shape import hull
 # Corners of a box of unit size that stands on its origin, and points on the rims of the cylinder in it.
 _SIGNS = np.array([-0.5, 0.5])
 CORNERS = np.stack(np.meshgrid(_SIGNS, _SIGNS, [0.0, 1.0], indexing="ij"), axis=-1).reshape(-1, 3)
+# Points all over it, and corners: a way that runs through the middle of a side meets some.
+GRID = np.stack(
+    np.meshgrid(np.linspace(-0.5, 0.5, 7), np.linspace(-0.5, 0.5, 7), [0.0, 0.5, 1.0], indexing="ij"), axis=-1
+).reshape(-1, 3)
 _ANGLES = np.arange(32) * 2 * np.pi / 32
 _RIMS = np.concatenate([
     np.stack([np.cos(_ANGLES) / 2, np.sin(_ANGLES) / 2, np.full(len(_ANGLES), z)], axis=1) for z in (0.0, 1.0)

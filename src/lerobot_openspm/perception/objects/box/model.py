@@ -15,7 +15,7 @@ from lerobot_openspm.geometry.camera import intersect_plane
 from lerobot_openspm.geometry.se3 import Array
 from lerobot_openspm.perception.objects import records
 from lerobot_openspm.perception.objects.base import Look, Record
-from lerobot_openspm.perception.objects.box.box import CORNERS, Box
+from lerobot_openspm.perception.objects.box.box import CORNERS, GRID, Box
 from lerobot_openspm.perception.objects.box.outline import SIZES_M, OutlineFit, fit_outlines, outline, overlap
 from lerobot_openspm.perception.objects.mask_association import ObjectMasks, associate, whole_mask
 from lerobot_openspm.perception.objects.shape import fitting
@@ -75,7 +75,7 @@ class BoxModel:
     @property
     def points(self) -> Array:
         """See :class:`lerobot_openspm.perception.objects.base.KnownObject`."""
-        return self.size * CORNERS
+        return self.size * GRID
 
     @property
     def middle(self) -> Array | None:

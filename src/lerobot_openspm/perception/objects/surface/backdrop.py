@@ -36,8 +36,9 @@ TABLE_MARGIN_M = 0.25
 REACH_M = 0.10
 # The table's height is sought in such steps, metres, in so many pictures, where so many of them show a place.
 HEIGHT_STEP_M, MAX_TABLE_VIEWS, MIN_TABLE_VIEWS = 0.005, 80, 5
-# ... and told if pictures differ there by less than this share of what they usually do.
-DISTINCT_SHARE = 0.95
+# ... and told if pictures differ there by less than this share of what they usually do, and by so much less,
+# CIELAB.
+DISTINCT_SHARE, DISTINCT = 0.95, 0.02
 
 
 def lab(image: NDArray[np.uint8]) -> Float32:
@@ -225,7 +226,8 @@ def _table_height(
         stack = np.ma.masked_invalid(np.stack(seen))
         spread = np.ma.median(np.ma.abs(stack - np.ma.median(stack, axis=0)).sum(-1), axis=0)
         enough = (~stack.mask[..., 0]).sum(0) >= MIN_TABLE_VIEWS
-        spreads.append(float(np.ma.median(spread[enough])) if enough.any() else np.inf)
+        # The mean, because a coarse pattern differs at its edges alone.
+        spreads.append(float(np.ma.mean(spread[enough])) if enough.any() else np.inf)
     return _least(heights, np.array(spreads))
 
 
@@ -237,7 +239,8 @@ def _least(heights: Array, spreads: Array) -> float:
     """
     i = int(np.argmin(spreads))
     around = spreads[i - 1 : i + 2] if 0 < i < len(heights) - 1 else np.full(3, np.inf)
-    if not (np.isfinite(around).all() and around[1] < DISTINCT_SHARE * np.median(spreads)):
+    usual = float(np.median(spreads))
+    if not (np.isfinite(around).all() and around[1] < min(DISTINCT_SHARE * usual, usual - DISTINCT)):
         return float(heights[len(heights) // 2] - 2 * HEIGHT_STEP_M)
     bend = around[0] - 2 * around[1] + around[2]
     return float(heights[i] + HEIGHT_STEP_M * 0.5 * (around[0] - around[2]) / bend)

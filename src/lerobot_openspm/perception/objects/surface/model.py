@@ -142,7 +142,7 @@ class SurfaceModel:
         return sight_of(look.views[camera], camera, self.backdrop, look.hidden.get(camera))
 
     def _anywhere(self, sights: Mapping[str, Sight]) -> list[Place]:
-        """The most likely places on the table; the demonstrated direction is tried first."""
+        """The most likely places on the table; turned otherwise than shown if that agrees much better."""
         area, turns = self.backdrop.reach, not self.is_round
         places = search(self.surface, sights, area, self.height, YAWS[:1], turns)
         if turns:
@@ -247,7 +247,7 @@ def _followed(seen: PoseEstimate) -> PoseEstimate:
         return replace(seen, status="not_found", visible=0.0)
     if std_m <= SHARP_M:
         seen = replace(seen, confidence=min(1.0, seen.confidence / SURE_SHARE))
-    return replace(seen, status="found")
+    return seen
 
 
 BOUNDS = {

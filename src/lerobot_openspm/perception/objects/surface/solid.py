@@ -28,10 +28,10 @@ from lerobot_openspm.types import Mask
 FILLED_SHARE, MIN_FILLED = 0.5, 2
 # A cell of the surface is taken out where pictures differ by more than this about it, CIELAB.
 INCONSISTENT = 14.0
+# So often at most; what is behind a cell that was taken out is looked at next.
 SWEEPS = 12
 # A camera sees a cell that is at most this many cells behind the nearest one.
 DEPTH_CELLS = 1.5
-
 
 # By object: points ``(n, 3)`` of its surface in its own frame, and their spacing in metres.
 Drawn = Mapping[str, tuple[Array, float]]
@@ -107,9 +107,9 @@ def fill_silhouettes(frames: Frames, carved: Carved, solid: Solid, drawn: Drawn)
     return replace(solid, filled=solid.filled | (above & (layers <= new_top[..., None])))
 
 
-def carve_by_colour(frames: Frames, solid: Solid, drawn: Drawn, sweeps: int = SWEEPS) -> Solid:
+def carve_by_colour(frames: Frames, solid: Solid, drawn: Drawn) -> Solid:
     """Take out cells of the surface that pictures disagree about, until they agree about all."""
-    for _ in range(sweeps):
+    for _ in range(SWEEPS):
         seen = colours_of(frames, solid, {**drawn, frames.name: solid.drawn})
         gone = disagreement(np.stack([colours for _, colours in seen]), 0.0) > INCONSISTENT
         if gone.sum() < 1e-3 * len(gone):
