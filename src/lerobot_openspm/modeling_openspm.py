@@ -118,7 +118,9 @@ class OpenSPMPolicy(PreTrainedPolicy):
             controller, hand = episode.controller, observation.hand
             look = controller.advance(hand)
             while look is not None:  # twice where a part of the instruction ends and the next one begins
-                detections = episode.perception.detect(observation, look.names, look.expected, look.time_s)
+                detections = episode.perception.detect(
+                    observation, look.names, look.expected, look.time_s, look.told_apart
+                )
                 look = controller.take_in(look, detections, hand)
             for i in range(n_actions):
                 action = controller.executor.next_action(hand)

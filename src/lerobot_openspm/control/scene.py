@@ -35,6 +35,7 @@ class LookRequest:
         expected: Poses ``T_world_obj`` ``(4, 4)`` at which those that were seen before are expected.
         time_s: Seconds since the episode began.
         held: Those of the objects that are taken to be in the hand.
+        told_apart: Those that the instruction tells from others of their kind.
         back_to: The key pose to go back to after the look; None unless something is tried again.
     """
 
@@ -42,6 +43,7 @@ class LookRequest:
     expected: Mapping[str, Array]
     time_s: float
     held: frozenset[str]
+    told_apart: frozenset[str]
     back_to: int | None
 
 
@@ -83,7 +85,9 @@ class SceneState:
         """A look for some objects, now."""
         expected = {k: T for k, T in self.tracker.poses(hand.T_world_ee).items() if k in names}
         held = self.tracker.held & frozenset(names)
-        return LookRequest(tuple(names), expected, self._step * self._context.step_s, held, back_to)
+        told_apart = frozenset(self.grounding.said) & frozenset(names)
+        time_s = self._step * self._context.step_s
+        return LookRequest(tuple(names), expected, time_s, held, told_apart, back_to)
 
     def take_in(self, detections: Detections, hand: Hand) -> frozenset[str]:
         """Take in what a look brought; the names of the objects that are somewhere else than before.

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Protocol
 
@@ -12,7 +12,7 @@ import numpy as np
 from lerobot_openspm.geometry import se3
 from lerobot_openspm.geometry.camera import Camera, project
 from lerobot_openspm.geometry.se3 import Array
-from lerobot_openspm.perception.objects.base import KnownObject, look_at
+from lerobot_openspm.perception.objects.base import KnownObject, localise_all, look_at
 from lerobot_openspm.perception.observation import Observation
 from lerobot_openspm.perception.oracle import name_simulator_poses
 from lerobot_openspm.perception.tracking.camera_health import CameraWatch
@@ -68,7 +68,12 @@ class Perception:
     _labelled: set[str] = field(default_factory=set[str])
 
     def detect(
-        self, observation: Observation, names: Sequence[str], expected: Mapping[str, Array], time_s: float
+        self,
+        observation: Observation,
+        names: Sequence[str],
+        expected: Mapping[str, Array],
+        time_s: float,
+        told_apart: Collection[str] = (),
     ) -> Detections:
         """Look for objects.
 
@@ -78,6 +83,7 @@ class Perception:
             expected: Poses ``T_world_obj`` ``(4, 4)`` of those that were seen before; they are looked for
                 there first.
             time_s: Seconds since the episode began.
+            told_apart: Those of the objects that words tell from others of their kind.
 
         Raises:
             ObservationError: A camera is missing or broken at the very first look.
@@ -100,8 +106,8 @@ class Perception:
             return Detections({}, faults)
         hidden = {camera: hand_mask(view, T_world_ee, self.hand_radius_m) for camera, view in sound.items()}
         known = {name: self.memory.objects[name] for name in names if name in self.memory.objects}
-        look = look_at(sound, list(known), self.segmenter, hidden, expected)
-        return Detections({name: one.localise(look) for name, one in known.items()}, faults)
+        look = look_at(sound, list(known), self.segmenter, hidden, expected, told_apart)
+        return Detections(localise_all(known, look), faults)
 
     def _simulator_poses(self, observation: Observation, names: Sequence[str]) -> dict[str, PoseEstimate]:
         poses = observation.simulator_poses(self.memory.simulator_objects)
@@ -125,7 +131,7 @@ def detect(
         PerceptionError: An object needs a segmenter and there is none, or the segmenter cannot be used.
     """
     look = look_at(views, list(objects), segmenter, {}, {})
-    return {name: known.localise(look) for name, known in objects.items()}
+    return localise_all(objects, look)
 
 
 def hand_mask(view: View, T_world_ee: Array, radius: float) -> Mask:

@@ -7,7 +7,7 @@ A kind is one folder with a class that is a :class:`KnownObject` and a :class:`K
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Hashable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, Protocol
 
 import numpy as np
@@ -27,6 +27,8 @@ BELOW_CUES_M = 0.02
 
 # By camera: what a segmenter found of one phrase.
 Instances = Mapping[str, Sequence[Segmentation]]
+# An object that was found with this confidence is not sought on top of others.
+CLEAR = 0.8
 # Fields for a JSON file, and arrays for a safetensors file.
 Record = tuple[dict[str, Any], dict[str, NDArray[Any]]]
 
@@ -56,6 +58,8 @@ class Look:
         instances: By phrase and camera: what a segmenter found.
         hidden: Pixels ``(H, W)`` by camera name that something may be in front of; no evidence.
         expected: Poses ``T_world_obj`` ``(4, 4)`` by object at which it is looked for first.
+        told_apart: Objects that words tell from others of their kind, all of which are sought therefore.
+        supports: Points ``(n, 3)`` of other things' surfaces, world, that an object may stand on or in.
 
     Raises:
         ObservationError: There is no view, or one is malformed.
@@ -65,6 +69,8 @@ class Look:
     instances: Mapping[str, Instances] = field(default_factory=dict[str, Instances])
     hidden: Mapping[str, Mask] = field(default_factory=dict[str, Mask])
     expected: Mapping[str, Array] = field(default_factory=dict[str, Array])
+    told_apart: Collection[str] = ()
+    supports: Array = field(default_factory=lambda: np.zeros((0, 3)))
     _bins: dict[str, Bins] = field(default_factory=dict[str, Bins])
     _prepared: dict[Hashable, Any] = field(default_factory=dict[Hashable, Any])
 
@@ -115,10 +121,26 @@ def look_at(
     segmenter: Segmenter | None,
     hidden: Mapping[str, Mask],
     expected: Mapping[str, Array],
+    told_apart: Collection[str] = (),
 ) -> Look:
     """A :class:`Look` for objects. A segmenter is asked once for all of their phrases."""
     found = segmenter.segment(views, phrases) if segmenter is not None and phrases else {}
-    return Look(views, found, hidden, expected)
+    return Look(views, found, hidden, expected, told_apart)
+
+
+def localise_all(objects: Mapping[str, KnownObject], look: Look) -> dict[str, PoseEstimate]:
+    """Find objects by name; those that were not found clearly are sought on top of the others too.
+
+    What is under another may not be found for it, but where it seems to be is where to look.
+    """
+    found = {name: known.localise(look) for name, known in objects.items()}
+    points = {name: se3.apply(one.T_world_obj, objects[name].points) for name, one in found.items()}
+    for name, one in found.items():
+        is_clear = one.status == "found" and one.confidence >= CLEAR and name not in look.told_apart
+        supports = [own for other, own in points.items() if other != name and len(own)]
+        if supports and not is_clear and name not in look.expected:
+            found[name] = objects[name].localise(replace(look, supports=np.concatenate(supports)))
+    return found
 
 
 class KnownObject(Protocol):

@@ -10,8 +10,9 @@ from lerobot_openspm.errors import MemoryFormatError
 from lerobot_openspm.geometry import se3
 from lerobot_openspm.geometry.camera import project
 from lerobot_openspm.perception.objects import store
-from lerobot_openspm.perception.objects.base import Look
+from lerobot_openspm.perception.objects.base import Look, localise_all
 from lerobot_openspm.perception.objects.kinds import learn_objects
+from lerobot_openspm.perception.objects.surface.compare import without_pattern
 from lerobot_openspm.perception.objects.surface.model import SurfaceModel
 from lerobot_openspm.types import ContactCue, DemonstrationScene, Moment
 
@@ -108,6 +109,53 @@ def test_it_is_found_elsewhere_and_turned(models, pose):
 def test_what_is_not_there_is_not_found(models):
     scene = {"distractor": se3.from_yaw([-0.1, 0.1, 0.0], 0.0), "block": se3.from_yaw([0.1, -0.1, 0.0], 0.3)}
     assert models["cup"].localise(Look(views_at(scene, looking_down(*HOME)))).status == "not_found"
+
+
+def test_what_stands_on_another_is_found_at_its_height(models):
+    block, cup = se3.from_yaw([0.05, 0.1, 0.0], 0.4), se3.from_yaw([0.05, 0.1, 0.05], 0.0)
+    look = Look(views_at({"block": block, "cup": cup}, looking_down(*HOME)))
+    found = localise_all(models, look)["cup"]
+    assert found.status == "found"
+    assert found.T_world_obj[2, 3] - models["cup"].height == pytest.approx(0.05, abs=0.012)
+    usual = models["cup"].localise(
+        Look(views_at({"cup": se3.from_yaw([0.05, 0.1, 0.0], 0.0)}, looking_down(*HOME)))
+    )
+    assert found.T_world_obj[:2, 3] == pytest.approx(usual.T_world_obj[:2, 3], abs=0.008)
+
+
+def test_of_what_words_tell_apart_every_one_is_found(models):
+    usual = se3.from_yaw((*MIDDLES["cup"][:2], 0.0), 0.0)
+    other = se3.from_yaw([-0.1, -0.12, 0.0], 0.0)
+    views = render([(SHAPES["cup"], usual), (SHAPES["cup"], other)], None, hand_camera(looking_down(*HOME)))
+    assert models["cup"].localise(Look(views)).others == ()
+    found = models["cup"].localise(Look(views, told_apart=("cup",)))
+    places = sorted((T[:2, 3] for T in (found.T_world_obj, *found.others)), key=lambda place: place[1])
+    away = models["cup"].localise(Look(views)).T_world_obj[:2, 3] - usual[:2, 3]
+    assert len(places) == 2
+    for place, T in zip(places, (other, usual), strict=True):
+        assert place == pytest.approx(T[:2, 3] + away, abs=0.008)
+
+
+def test_colours_without_their_pattern_agree_less():
+    rng = np.random.default_rng(0)
+    expected = np.repeat(rng.uniform(40, 60, (50, 1, 3)), 2, axis=1).astype(np.float32)
+    inside = np.ones((1, 50), np.float32)
+    as_expected, mixed = expected[None, :, 0] + 5.0, expected[None, rng.permutation(50), 0]
+    assert without_pattern(as_expected, expected, inside) == pytest.approx(0.0, abs=1e-3)
+    assert without_pattern(mixed, expected, inside) > 0.6
+    # Of what has one colour its pattern tells nothing.
+    plain = np.full((50, 2, 3), 50.0, np.float32)
+    assert without_pattern(mixed, plain, inside) == pytest.approx(0.0, abs=1e-3)
+
+
+def test_where_it_is_found_from_is_told_by_what_looks_like_it_elsewhere(models):
+    model = models["cup"]
+    shares = [
+        dataclasses.replace(model, typical_agreement=0.8, rival_agreement=rival).found_share
+        for rival in (0.1, 0.4, 0.7)
+    ]
+    assert shares[0] < shares[1] < shares[2] < 1.0
+    assert shares[2] > 0.7 / 0.8
 
 
 def test_where_it_stood_in_the_demonstrations_its_patches_are_believed(models):

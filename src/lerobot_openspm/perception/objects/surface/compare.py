@@ -8,8 +8,7 @@ where something else may be in front of it. Around the silhouette the picture mu
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
-from functools import cached_property
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -17,16 +16,16 @@ from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
 from lerobot_openspm.geometry.se3 import Array
-from lerobot_openspm.perception.objects.surface.backdrop import Backdrop, Float32, lab, pixels_of
+from lerobot_openspm.perception.objects.surface.backdrop import Float32, pixels_of
 from lerobot_openspm.perception.objects.surface.carving import spread
 from lerobot_openspm.perception.objects.surface.relief import WEIGHTS
-from lerobot_openspm.types import Mask, View
+from lerobot_openspm.perception.objects.surface.sight import FINEST, LIKE_COARSE, Sight, Surface
+from lerobot_openspm.types import Mask
 
-# Colours this far apart, CIELAB, are alike; in the search over the table, that much.
-LIKE, LIKE_COARSE = 8.0, 12.0
-# Pictures are smoothed by a Gaussian of so many pixels, if they are 256 wide, and by octaves more where a
-# surface's points are further apart than that. The search begins with more.
-FINEST, MAX_OCTAVE, COARSE_OCTAVE = 0.6, 4, 2
+# Colours this far apart, CIELAB, are alike.
+LIKE = 8.0
+# Pictures are smoothed by so many octaves more than least at most; the search begins with this many.
+MAX_OCTAVE, COARSE_OCTAVE = 4, 2
 # Smoothed over this share of the points' distance a picture shows as much detail as they have.
 DETAIL_SHARE = 0.5
 # What neither shows the object nor the table counts as this much of a point, and as evidence for the pose.
@@ -36,8 +35,12 @@ RIM_COST = 0.6
 # A surface may end this share of its points' distance before the object does; the rim lies so many pixels,
 # from and to, beyond that.
 BEYOND, RIM_PX = 1.0, (0, 2)
+# What colours that do not vary over the object as expected cost, if they are to vary by much more than this.
+PATTERN_COST, PATTERN_STD, PATTERN_BLOCKED = 0.6, 3.0, 0.3
 # Points are drawn this large at most, in pixels.
 MAX_PX = 16
+# What looks like the table and like the object is so much less likely to be the object.
+TABLE_SHARE = 0.5
 # A view counts if it shows this share of the visible points.
 MIN_SHOWN, MIN_SHOWN_COARSE = 0.15, 0.3
 # A camera that sees this share of the coloured points sees as much of an object as it can.
@@ -45,87 +48,6 @@ WHOLE_SHARE = 0.15
 # Views that show less of an object than this in all, 1 being all that one of them could, tell too little.
 ENOUGH_SHOWN = 1.0
 FINE_POINTS, MIN_POINTS = 300, 8
-
-
-@dataclass(frozen=True)
-class Surface:
-    """Coloured points of an object, all in its own frame.
-
-    Attributes:
-        points: ``(n, 3)``, metres.
-        normals: Outward directions ``(n, 3)``.
-        colours: CIELAB ``(n, 2, 3)`` as the fixed and as the hand's camera show it; the colours in between
-            are expected too. Not a number for points that only hide what is behind them.
-        spacing: Distance between points, metres.
-    """
-
-    points: Array
-    normals: Array
-    colours: Float32
-    spacing: float
-
-    @cached_property
-    def coloured(self) -> Array:
-        """The points ``(n, 3)`` that have colours."""
-        return self.points[np.isfinite(self.colours[:, 0, 0])]
-
-    @cached_property
-    def middle(self) -> Array:
-        """Horizontal middle ``(2,)`` of the coloured points."""
-        return (
-            np.percentile(self.coloured[:, :2], 5, axis=0) + np.percentile(self.coloured[:, :2], 95, axis=0)
-        ) / 2
-
-    @cached_property
-    def radius(self) -> float:
-        """Horizontal distance from the middle within which most coloured points are, metres."""
-        return float(np.percentile(np.linalg.norm(self.coloured[:, :2] - self.middle, axis=1), 90))
-
-
-@dataclass(frozen=True)
-class Sight:
-    """One view, prepared for comparing.
-
-    Attributes:
-        view: The view.
-        P: Projection ``(3, 4)`` of world points to homogeneous pixels.
-        colours: Weighted CIELAB ``(H, W, 3)``.
-        table: Where the table is ``(H, W)``, 1 or 0.
-        hidden: Pixels ``(H, W)`` that are no evidence.
-    """
-
-    view: View
-    P: Float32
-    colours: Float32
-    table: Float32
-    hidden: Mask
-    _smoothed: dict[int, tuple[Float32, Float32]] = field(default_factory=dict[int, tuple[Float32, Float32]])
-
-    def smoothed(self, octave: int) -> tuple[Float32, Float32]:
-        """Colours and table, smoothed over about ``2 ** octave`` pixels of a picture 256 wide; made once."""
-        if octave not in self._smoothed:
-            sigma = FINEST * 2.0**octave * self.view.camera.width / 256
-            self._smoothed[octave] = (
-                np.asarray(cv2.GaussianBlur(self.colours, (0, 0), sigma), np.float32),
-                np.asarray(cv2.GaussianBlur(self.table, (0, 0), 1.3 * sigma), np.float32),
-            )
-        return self._smoothed[octave]
-
-
-def sight_of(view: View, camera: str, backdrop: Backdrop, hidden: Mask | None) -> Sight:
-    """Prepare a view."""
-    colours = lab(view.image)
-    table = cv2.morphologyEx(
-        backdrop.table.matches(colours).astype(np.uint8), cv2.MORPH_OPEN, np.ones((3, 3), np.uint8)
-    ).astype(np.float32)
-    covered = np.zeros(table.shape, bool) if hidden is None else hidden.copy()
-    own = backdrop.hidden(camera, view)
-    if own is not None:
-        covered |= own
-    T_cam_world = np.linalg.inv(view.T_world_cam)[:3]
-    c = view.camera
-    K = np.array([[c.fx, 0, c.cx], [0, c.fy, c.cy], [0, 0, 1]])
-    return Sight(view, (K @ T_cam_world).astype(np.float32), colours * WEIGHTS, table, covered)
 
 
 @dataclass(frozen=True)
@@ -147,6 +69,13 @@ class Sample:
     rim_colours: Float32
     weight: float
     octave: int
+
+    def thinned(self, step: int) -> Sample:
+        """Every so many-th of the points."""
+        return replace(
+            self, points=self.points[::step], colours=self.colours[::step],
+            rim=self.rim[::step], rim_colours=self.rim_colours[::step],
+        )  # fmt: skip
 
 
 def rotations(yaws: Array) -> Array:
@@ -231,30 +160,56 @@ def compare(sample: Sample, sight: Sight, poses: Array, is_coarse: bool = False)
     """
     colours, table = sight.smoothed(max(sample.octave, COARSE_OCTAVE) if is_coarse else sample.octave)
     like = LIKE_COARSE if is_coarse else LIKE
-    match, on_table, inside = _matches(sample.points, sample.colours, sight, poses, colours, table, like)
+    shown, on_table, inside = _shown(sample.points, sight, poses, colours, table)
+    match = _match(shown, sample.colours, like)
     good = (match * inside).sum(1)
     bad = (on_table * (1 - match) * inside).sum(1)
     blocked = inside.sum(1) - good - bad
     told = good + bad + BLOCKED_WEIGHT * blocked
     n = len(sample.points)
     score = (good - bad + BLOCKED_EVIDENCE * blocked) / np.maximum(told, 0.05 * n)
+    weights = inside * (1 - (1 - PATTERN_BLOCKED) * (1 - match) * (1 - on_table))
+    score = score * (1 - PATTERN_COST * without_pattern(shown, sample.colours, weights))
     if len(sample.rim):
-        match, on_table, inside = _matches(sample.rim, sample.rim_colours, sight, poses, colours, table, like)
-        goes_on = (match * (1 - on_table) * inside).sum(1)
+        shown, on_table, inside = _shown(sample.rim, sight, poses, colours, table)
+        goes_on = (_match(shown, sample.rim_colours, like) * (1 - on_table) * inside).sum(1)
         score = score - RIM_COST * goes_on / np.maximum(inside.sum(1), 1)
     return score, told / n
 
 
-def _matches(
-    points: Float32,
-    expected: Float32,
-    sight: Sight,
-    poses: Array,
-    colours: Float32,
-    table: Float32,
-    like: float,
+def palette_likeness(surface: Surface, sight: Sight) -> Float32:
+    """How much every second pixel ``(H / 2, W / 2)`` has one of a surface's colours, from 0 to 1."""
+    colours, table = sight.smoothed(COARSE_OCTAVE)
+    colours, palette = colours[::2, ::2], surface.palette
+    away = (colours**2).sum(-1, keepdims=True) - 2 * colours @ palette.T + (palette**2).sum(1)
+    like = np.exp(away.min(-1) / (-2 * LIKE_COARSE**2))
+    return np.asarray(like * (1 - TABLE_SHARE * table[::2, ::2]), np.float32)
+
+
+def shown_at(picture: Float32, sight: Sight, points: Array, places: Array) -> tuple[Array, Array]:
+    """Mean of every second pixel over points ``(n, 3)`` at places ``(q, 3)``, and the share that is told.
+
+    Points that are hidden or not in the picture count as 0, and are not told.
+    """
+    P, hidden = sight.P, sight.hidden[::2, ::2]
+    at = (points @ P[:, :3].T)[None] + (places @ P[:, :3].T + P[:, 3])[:, None]
+    ahead = np.maximum(at[..., 2], 0.03)
+    columns, rows = (np.rint(at[..., i] / ahead / 2).astype(np.int32) for i in (0, 1))
+    height, width = picture.shape
+    inside = (at[..., 2] > 0.03) & (columns >= 0) & (rows >= 0) & (columns < width) & (rows < height)
+    index = np.where(inside, rows * width + columns, 0)
+    inside &= ~hidden.ravel()[index]
+    return np.asarray((picture.take(index) * inside).mean(1), float), np.asarray(inside.mean(1), float)
+
+
+def _shown(
+    points: Float32, sight: Sight, poses: Array, colours: Float32, table: Float32
 ) -> tuple[Float32, Float32, Mask]:
-    """For points at poses ``(q, n)``: colour match, share of table, and whether the picture tells of them."""
+    """What is at points ``(n, 3)`` at poses ``(q, 4)``.
+
+    Returns:
+        Weighted CIELAB ``(q, n, 3)``, share of table ``(q, n)``, and whether the picture tells ``(q, n)``.
+    """
     P = sight.P
     turned = P[:, :3] @ rotations(poses[:, 3]).astype(np.float32)
     at = (turned @ points.T) + (poses[:, :3].astype(np.float32) @ P[:, :3].T + P[:, 3])[..., None]
@@ -264,14 +219,36 @@ def _matches(
     inside = (at[:, 2] > 0.03) & (columns >= 0) & (rows >= 0) & (columns < width) & (rows < height)
     index = np.where(inside, rows * width + columns, 0)
     inside &= ~sight.hidden.ravel()[index]
-    shown = colours.reshape(-1, 3).take(index, axis=0)
+    return colours.reshape(-1, 3).take(index, axis=0), table.ravel()[index], inside
+
+
+def _match(shown: Float32, expected: Float32, like: float) -> Float32:
+    """How well colours ``(q, n, 3)`` match what is expected ``(n, 2, 3)``, from 0 to 1."""
     first, along = expected[:, 0], expected[:, 1] - expected[:, 0]
     off = shown - first
     length = np.maximum(np.einsum("nc,nc->n", along, along), 1e-6)
-    share = np.clip(np.einsum("qnc,nc->qn", off, along) / length, 0, 1)
-    off -= share[..., None] * along
-    away = np.einsum("qnc,qnc->qn", off, off)
-    return np.exp(away / (-2 * like**2)), table.ravel()[index], inside
+    dot = np.einsum("qnc,nc->qn", off, along)
+    share = np.clip(dot / length, 0, 1)
+    away = np.maximum(np.einsum("qnc,qnc->qn", off, off) - share * (2 * dot - share * length), 0.0)
+    return np.exp(away / (-2 * like**2))
+
+
+def without_pattern(shown: Float32, expected: Float32, weights: Float32) -> Array:
+    """How little colours ``(q, n, 3)`` vary over an object as is expected ``(n, 2, 3)``, from 0 to 1.
+
+    One minus their correlation; less for objects of one colour, of which it tells nothing.
+    """
+    middle = expected.mean(1)
+    middle = middle - middle.mean(0)
+    n = np.maximum(weights.sum(1), 1.0)
+    weighted = shown * weights[..., None]
+    sum_shown, sum_expected = weighted.sum(1), weights @ middle
+    together = weighted.reshape(len(shown), -1) @ middle.ravel() - (sum_shown * sum_expected).sum(1) / n
+    vary_shown = np.einsum("qnc,qnc->q", weighted, shown) - (sum_shown**2).sum(1) / n
+    vary_expected = weights @ (middle**2).sum(1) - (sum_expected**2).sum(1) / n
+    correlation = together / np.sqrt(np.maximum(vary_shown * vary_expected, 1e-6))
+    tells = vary_expected / (vary_expected + n * PATTERN_STD**2)
+    return np.asarray(tells * (1 - np.clip(correlation, 0, 1)), float)
 
 
 def agreement(

@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Mapping, Sequence
 
+import cv2
 import numpy as np
 from scipy.spatial import KDTree
 
@@ -14,10 +15,11 @@ from lerobot_openspm.perception.objects.base import Examples, Kind, Look
 from lerobot_openspm.perception.objects.patches.learn import learn_patches
 from lerobot_openspm.perception.objects.patches.model import PatchModel
 from lerobot_openspm.perception.objects.surface.backdrop import Backdrop, Float32, learn_backdrop
-from lerobot_openspm.perception.objects.surface.carving import Carved, Frame, Frames, carve
-from lerobot_openspm.perception.objects.surface.compare import Surface, score_at, sight_of
-from lerobot_openspm.perception.objects.surface.model import SurfaceModel, from_record
+from lerobot_openspm.perception.objects.surface.carving import Carved, Frame, Frames, carve, silhouette
+from lerobot_openspm.perception.objects.surface.compare import score_at
+from lerobot_openspm.perception.objects.surface.model import SurfaceModel, best_on_table, from_record
 from lerobot_openspm.perception.objects.surface.relief import WEIGHTS, find_relief
+from lerobot_openspm.perception.objects.surface.sight import Surface, sight_of
 from lerobot_openspm.perception.objects.surface.solid import (
     Drawn,
     Solid,
@@ -26,7 +28,7 @@ from lerobot_openspm.perception.objects.surface.solid import (
     fill_silhouettes,
     solid_under,
 )
-from lerobot_openspm.types import DemonstrationScene, Moment, View
+from lerobot_openspm.types import DemonstrationScene, Mask, Moment, View
 
 logger = logging.getLogger(__name__)
 
@@ -38,6 +40,9 @@ SIMILAR_M, SIMILAR_COLOUR = 0.03, 10.0
 BESIDE_M = 0.02
 # Silhouettes are filled in so many rounds, since one object's surface explains what is seen beside another.
 ROUNDS = 2
+# In so many of the demonstrations it is measured what looks most like the object without it; what is this
+# near to it is hidden for that, pixels of a picture 256 wide.
+RIVAL_SCENES, MARGIN_PX = 6, 6
 # An object with fewer coloured points gets no surface.
 MIN_COLOURED = 40
 
@@ -59,11 +64,10 @@ def _learn_surfaces(near: Mapping[str, PatchModel], examples: Examples) -> dict[
     surfaces = build_surfaces(_frames(films, near, backdrop), touched, heights, backdrop)
     models = {}
     for name, surface in surfaces.items():
-        typical = _typical(name, surface, scenes, near[name], backdrop)
-        models[name] = SurfaceModel(name, surface, backdrop, heights[name], typical, near[name])
-        logger.info(
-            "surface of %s: %d coloured points, typical agreement %.2f", name, len(surface.coloured), typical
-        )
+        typical, rival = _agreements(name, surface, scenes, near[name], backdrop)
+        models[name] = SurfaceModel(name, surface, backdrop, heights[name], typical, rival, near[name])
+        logger.info("surface of %s: %d coloured points, agreement %.2f, without it %.2f",
+                    name, len(surface.coloured), typical, rival)  # fmt: skip
     return models
 
 
@@ -192,14 +196,36 @@ def _completed(points: Array, normals: Array, colours: Array) -> Float32:
     return done
 
 
-def _typical(
+def _agreements(
     name: str, surface: Surface, scenes: Sequence[DemonstrationScene], near: PatchModel, backdrop: Backdrop
-) -> float:
-    """How well first pictures agree with where the object stands in them; the median of demonstrations."""
-    scores = []
-    for scene in scenes:
-        T = _first_poses(scene, {name: near}).get(name)
-        if T is not None:
-            sights = {c: sight_of(view, c, backdrop, None) for c, view in scene.views.items()}
-            scores.append(score_at(surface, sights, np.array([*T[:3, 3], 0.0])))
-    return float(np.clip(np.median(scores), 0.05, 1.0)) if scores else 0.05
+) -> tuple[float, float]:
+    """How well first pictures agree with the object where it stands, and with the best place without it.
+
+    The first is the median of demonstrations, the second the most of some of them.
+    """
+    own, rivals = [], []
+    standing = [(scene, _first_poses(scene, {name: near}).get(name)) for scene in scenes]
+    found = [(scene, T) for scene, T in standing if T is not None]
+    searched = (
+        {id(found[i][0]) for i in np.linspace(0, len(found) - 1, RIVAL_SCENES).astype(int)} if found else ()
+    )
+    for scene, T in found:
+        sights = {c: sight_of(view, c, backdrop, None) for c, view in scene.views.items()}
+        own.append(score_at(surface, sights, np.array([*T[:3, 3], 0.0])))
+        if id(scene) in searched:
+            world = se3.apply(T, surface.points)
+            without = {
+                c: sight_of(view, c, backdrop, _covered(view, world, surface.spacing))
+                for c, view in scene.views.items()
+            }
+            rivals.append(best_on_table(surface, without, backdrop, float(T[2, 3])))
+    typical = float(np.clip(np.median(own), 0.05, 1.0)) if own else 0.05
+    return typical, float(np.clip(max(rivals, default=0.0), 0.0, typical))
+
+
+def _covered(view: View, points: Array, spacing: float) -> Mask:
+    """Pixels ``(H, W)`` around points ``(n, 3)`` of an object in the world."""
+    frame = Frame("", view, np.ones(view.image.shape[:2], bool), None, {})
+    drawn = np.isfinite(silhouette(frame, points, spacing)).astype(np.uint8)
+    margin = 2 * round(MARGIN_PX * view.camera.width / 256) + 1
+    return cv2.dilate(drawn, np.ones((margin, margin), np.uint8)).astype(bool)

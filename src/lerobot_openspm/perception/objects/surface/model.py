@@ -19,24 +19,29 @@ from lerobot_openspm.perception.objects.base import Look, Record
 from lerobot_openspm.perception.objects.patches import model as patches
 from lerobot_openspm.perception.objects.patches.model import PatchModel
 from lerobot_openspm.perception.objects.surface.backdrop import TABLE_MARGIN_M, Backdrop, Colour
-from lerobot_openspm.perception.objects.surface.compare import FINE_POINTS, Sight, Surface, score_at, sight_of
+from lerobot_openspm.perception.objects.surface.compare import FINE_POINTS, score_at
 from lerobot_openspm.perception.objects.surface.search import (
     FINE_STEPS,
     QUICK_POINTS,
     QUICK_STEPS,
     SAME_PLACE_M,
+    Freedom,
     Place,
     covariance_at,
+    over_supports,
+    over_table,
     refine,
     search,
 )
+from lerobot_openspm.perception.objects.surface.sight import Sight, Surface, sight_of
 from lerobot_openspm.types import PoseEstimate
 
 # What a record may hold: points, coloured ones at least, and the table's length and width in metres, rounded.
 MAX_POINTS, MIN_COLOURED, MAX_TABLE_M, ROUNDING_M = 60_000, 8, 10.0, 1e-3
-# Of the agreement that is typical of the demonstrations: from here on an object is found, ...
-FOUND_SHARE = 0.6
-# ... and patches are believed that found it where it stood in them.
+# An object is found from here on between what agrees at most where it is not, and what is typical of it;
+# and with less than this share of the typical agreement it is never.
+FOUND_BETWEEN, LEAST_SHARE = 0.35, 0.55
+# Patches that find an object where it stood in the demonstrations are believed from this share on.
 BELIEVED_SHARE = 0.8
 # A second place that explains the pictures nearly as well makes the first one doubtful.
 RIVAL_SHARE = 0.93
@@ -56,10 +61,11 @@ KEPT_SHARE, GONE_SHARE = 0.7, 0.4
 SURE_SHARE, SHARP_M, VAGUE_M = 0.8, 0.004, 0.008
 # Directions that the search begins from, for an object that does not look alike from all of them.
 YAWS = tuple(np.linspace(0, 2 * np.pi, 8, endpoint=False))
+# An object that agrees less than this share with its best place on the table may stand on something. That is
+# believed if it agrees this share, and the place on the table less than this share as well.
+CLEAR_SHARE, RAISED_SHARE, BETTER_SHARE = 0.9, 0.85, 0.93
 # Turned about its middle, a round object agrees with itself this well, CIELAB and share.
 ROUND_COLOUR, ROUND_SHARE, ROUND_SPACINGS = 20.0, 0.52, 3.0
-# Another direction is believed where the demonstrated one agrees less than this share as well.
-TURNED_SHARE = 0.93
 
 
 @dataclass(frozen=True)
@@ -72,6 +78,7 @@ class SurfaceModel:
         backdrop: What no object is.
         height: World z of its frame when it stands on the table, metres.
         typical_agreement: How well the demonstrations' first pictures agree with its surface.
+        rival_agreement: How well they agree with it elsewhere at most, where it is not.
         near: Patches, which are more exact where it stood in the demonstrations.
     """
 
@@ -82,6 +89,7 @@ class SurfaceModel:
     backdrop: Backdrop
     height: float
     typical_agreement: float
+    rival_agreement: float
     near: PatchModel
 
     @property
@@ -113,26 +121,40 @@ class SurfaceModel:
             shares.append(float((alike & (away < ROUND_SPACINGS * self.surface.spacing)).mean()))
         return min(shares) > ROUND_SHARE
 
+    @property
+    def found_share(self) -> float:
+        """The share of the typical agreement from which on it is found."""
+        rival = self.rival_agreement / self.typical_agreement
+        return max(LEAST_SHARE, rival + FOUND_BETWEEN * (1 - rival))
+
     def localise(self, look: Look) -> PoseEstimate:
         """Find the object: where it stood in the demonstrations, where it is expected, or anywhere."""
         near, expected = self.near.localise(look), look.expected.get(self.name)
         if near.status == "found" and expected is not None and _apart_m(near, expected) < FOLLOWED_M:
             return near
-        if expected is not None and expected[2, 3] - self.height > LIFTED_M:
-            return near  # the hand carries it and hides it
         sights = {
             camera: look.prepared((camera, id(self.backdrop)), partial(self._sight, look, camera))
             for camera in look.views
         }
+        if expected is not None and expected[2, 3] - self.height > LIFTED_M:
+            # In the hand, or where that put it, it is hidden more often than gone.
+            seen = _followed(self._estimate(look, sights, [self._refined(sights, expected)]))
+            return seen if seen.status == "found" else near
+        if self.name in look.told_apart and expected is None:
+            return self._estimate(look, sights, self._all_places(look, sights))
+        near_score = 0.0
         if near.status == "found":
-            score = score_at(self.surface, sights, _pose(near.T_world_obj))
-            if score >= BELIEVED_SHARE * self.typical_agreement:
+            near_score = score_at(self.surface, sights, _pose(near.T_world_obj))
+            if near_score >= BELIEVED_SHARE * self.typical_agreement:
                 return near
         if expected is not None:
             seen = self._estimate(look, sights, [self._refined(sights, expected)])
             if seen.confidence >= GONE_SHARE:
                 return _followed(seen)
-        found = self._estimate(look, sights, self._anywhere(sights))
+        places = self._anywhere(look, sights)
+        if near_score > BETTER_SHARE * places[0].score:  # something may stand on it
+            return replace(near, confidence=min(near.confidence, near_score / self.typical_agreement))
+        found = self._estimate(look, sights, places)
         if expected is None or found.status == "found":
             return found
         # Where its patches cannot tell that it is gone, it may be hidden.
@@ -141,20 +163,48 @@ class SurfaceModel:
     def _sight(self, look: Look, camera: str) -> Sight:
         return sight_of(look.views[camera], camera, self.backdrop, look.hidden.get(camera))
 
-    def _anywhere(self, sights: Mapping[str, Sight]) -> list[Place]:
-        """The most likely places on the table; turned otherwise than shown if that agrees much better."""
-        area, turns = self.backdrop.reach, not self.is_round
-        places = search(self.surface, sights, area, self.height, YAWS[:1], turns)
-        if turns:
-            others = search(self.surface, sights, area, self.height, YAWS[1:], turns)
-            if others[0].score * TURNED_SHARE > places[0].score:
-                places = others
-        return places
+    def _anywhere(self, look: Look, sights: Mapping[str, Sight]) -> list[Place]:
+        """The most likely places: on the table, else on other things."""
+        key = (self.name, id(self))
+        table = look.prepared((*key, "table"), partial(self._on_table, sights))
+        if table[0].score >= CLEAR_SHARE * self.typical_agreement:
+            return table
+        if len(look.supports):
+            on_things = self._on_things(look.supports, sights)
+            if on_things and BETTER_SHARE * on_things[0].score > table[0].score:
+                return on_things
+        return table
+
+    def _all_places(self, look: Look, sights: Mapping[str, Sight]) -> list[Place]:
+        """Places on the table and on other things, several of which may hold one of the kind."""
+        places = self._on_table(sights, several=True)
+        if len(look.supports):
+            places += self._on_things(look.supports, sights, several=True)
+        return sorted(places, key=lambda place: -place.score)
+
+    def _on_table(self, sights: Mapping[str, Sight], several: bool = False) -> list[Place]:
+        ground = over_table(self.surface, self.backdrop.reach, (self.height,))
+        return search(self.surface, sights, ground, self._yaws, Freedom(not self.is_round), several)
+
+    def _on_things(self, supports: Array, sights: Mapping[str, Sight], several: bool = False) -> list[Place]:
+        table = self.backdrop.table_height
+        ground = over_supports(self.surface, supports, table, self.height - table)
+        low, high = self.backdrop.reach
+        ground = ground[((ground[:, :2] > low) & (ground[:, :2] < high)).all(1)]
+        if len(ground) == 0:
+            return []
+        return search(
+            self.surface, sights, ground, self._yaws, Freedom(not self.is_round, lifts=True), several
+        )
+
+    @property
+    def _yaws(self) -> tuple[float, ...]:
+        return YAWS[:1] if self.is_round else YAWS
 
     def _refined(self, sights: Mapping[str, Sight], T_world_obj: Array) -> Place:
-        pose, turns = _pose(T_world_obj), not self.is_round
-        quick = refine(self.surface, sights, pose, turns, QUICK_POINTS, QUICK_STEPS)
-        return refine(self.surface, sights, quick.pose, turns, FINE_POINTS, FINE_STEPS)
+        freedom = Freedom(not self.is_round)
+        quick = refine(self.surface, sights, _pose(T_world_obj), freedom, QUICK_POINTS, QUICK_STEPS)
+        return refine(self.surface, sights, quick.pose, freedom, FINE_POINTS, FINE_STEPS)
 
     def _estimate(self, look: Look, sights: Mapping[str, Sight], places: list[Place]) -> PoseEstimate:
         best = places[0]
@@ -162,7 +212,9 @@ class SurfaceModel:
         apart = max(SAME_PLACE_M, OVERLAP_SHARE * self.surface.radius)
         rivals = [one for one in places[1:] if np.linalg.norm(one.pose[:2] - best.pose[:2]) > apart]
         is_rivalled = any(one.score > RIVAL_SHARE * best.score for one in rivals)
-        status = "not_found" if share < FOUND_SHARE else "ambiguous" if is_rivalled else "found"
+        is_raised = best.pose[2] > self.height + LIFTED_M / 2
+        needed = max(self.found_share, RAISED_SHARE) if is_raised else self.found_share
+        status = "not_found" if share < needed else "ambiguous" if is_rivalled else "found"
         T = se3.from_yaw(best.pose[:3], float(best.pose[3]))
         covariance = covariance_at(self.surface, sights, best.pose, not self.is_round)
         visible = look.seen_share(se3.apply(T, self.surface.coloured))
@@ -179,7 +231,8 @@ class SurfaceModel:
         table = self.backdrop.table
         fields = {
             "kind": self.kind, "name": self.name, "height": self.height,
-            "typical_agreement": self.typical_agreement, "spacing": self.surface.spacing,
+            "typical_agreement": self.typical_agreement, "rival_agreement": self.rival_agreement,
+            "spacing": self.surface.spacing,
             "table_height": self.backdrop.table_height, "hand_cameras": list(self.backdrop.hand),
             "near": near_fields,
         }  # fmt: skip
@@ -236,8 +289,14 @@ def from_record(fields: Mapping[str, Any], arrays: Mapping[str, NDArray[Any]], w
     own = {key.removeprefix("near."): value for key, value in arrays.items() if key.startswith("near.")}
     return SurfaceModel(
         name, Surface(points, normals, colours, numbers["spacing"]), backdrop, numbers["height"],
-        numbers["typical_agreement"], patches.from_record(near, own, where),
+        numbers["typical_agreement"], numbers["rival_agreement"], patches.from_record(near, own, where),
     )  # fmt: skip
+
+
+def best_on_table(surface: Surface, sights: Mapping[str, Sight], backdrop: Backdrop, height: float) -> float:
+    """How well the best place on the table agrees, for a frame at a world z, turned anyhow."""
+    ground = over_table(surface, backdrop.reach, (height,))
+    return search(surface, sights, ground, YAWS, Freedom(turns=True))[0].score
 
 
 def _followed(seen: PoseEstimate) -> PoseEstimate:
@@ -253,6 +312,7 @@ def _followed(seen: PoseEstimate) -> PoseEstimate:
 BOUNDS = {
     "height": (-100.0, 100.0),
     "typical_agreement": (0.05, 1.0),
+    "rival_agreement": (0.0, 1.0),
     "spacing": (1e-6, 1.0),
     "table_height": (-100.0, 100.0),
 }

@@ -9,18 +9,31 @@ import numpy as np
 
 from lerobot_openspm.geometry.se3 import Array
 from lerobot_openspm.perception.objects.surface.compare import (
+    ENOUGH_SHOWN,
     FINE_POINTS,
-    Sight,
-    Surface,
+    Sample,
     agreement,
+    palette_likeness,
     rotations,
     samples_at,
+    shown_at,
+    spaced,
     take_sample,
 )
+from lerobot_openspm.perception.objects.surface.sight import Sight, Surface
 from lerobot_openspm.types import UNKNOWN_YAW_STD
 
-COARSE_POINTS, QUICK_POINTS = 50, 100
-CANDIDATES, CANDIDATES_PER_YAW, FINALISTS = 10, 2, 3
+CORE_POINTS, QUICK_POINTS = 12, 100
+# Points this near to the middle, as a share of the radius, are on the object however it is turned.
+CORE_SHARE = 0.7
+# What has the object's colours this far around, as a share of the radius, speaks this much against a place.
+AROUND_SHARE, AROUND_COST = 1.8, 0.5
+# Of all places these, where most looks like the object, are compared in every direction.
+KEPT_PLACES, MIN_PLACES, MAX_PLACES = 0.3, 600, 2000
+STARTS_PER_YAW, CANDIDATES, FINALISTS, MANY = 6, 4, 3, 12
+NUDGE_M = 0.006
+# Heights at which something may stand on other things are so far apart, metres.
+RISE_STEP_M = 0.025
 # Two candidates nearer than this are one, metres.
 SAME_PLACE_M = 0.035
 # Steps of the refinement: metres and radians.
@@ -40,76 +53,154 @@ class Place:
     score: float
 
 
+@dataclass(frozen=True)
+class Freedom:
+    """What of a pose may change in a refinement, beside the horizontal place.
+
+    Attributes:
+        turns: Whether its direction may change.
+        lifts: Whether its height may, where two views tell it.
+    """
+
+    turns: bool
+    lifts: bool = False
+
+
 def search(
     surface: Surface,
     sights: Mapping[str, Sight],
-    area: Array,
-    height: float,
+    ground: Array,
     yaws: Sequence[float],
-    turns: bool,
+    freedom: Freedom,
+    several: bool = False,
 ) -> list[Place]:
-    """The most likely places on the table, best first.
+    """The most likely places, best first.
 
     Args:
         surface: What is sought.
         sights: The views.
-        area: Least and largest x and y ``(2, 2)`` of the object's middle, metres.
-        height: World z of the object's frame.
-        yaws: Directions to begin from.
-        turns: Whether they may change a little.
+        ground: Where it may be ``(q, 3)``: x and y of its middle, z of its frame, world, metres.
+        yaws: Directions to begin from, radians.
+        freedom: What may change in the refinement.
+        several: Whether places beside the best one are sought as well, for others of its kind.
     """
-    step = float(np.clip(0.25 * surface.radius, 0.012, 0.02))
     apart = max(SAME_PLACE_M, 0.3 * surface.radius)
-    ground = np.stack(
-        np.meshgrid(*(np.arange(low, high, step) for low, high in area.T), indexing="ij"), -1
-    ).reshape(-1, 2)
-    starts = np.concatenate([_over_table(surface, sights, area, ground, height, yaw) for yaw in yaws])
-    places: list[Place] = []
-    begun: list[Array] = []
-    for i in np.argsort(-starts[:, 4])[:600]:
-        pose = starts[i, :4]
-        if all(_apart(pose, place, apart) for place in begun):
-            begun.append(pose)
-            places.append(refine(surface, sights, pose, turns, QUICK_POINTS, QUICK_STEPS))
-        if len(places) >= CANDIDATES + CANDIDATES_PER_YAW * len(yaws):
-            break
-    places.sort(key=lambda place: -place.score)
-    finest = [
-        refine(surface, sights, place.pose, turns, FINE_POINTS, FINE_STEPS) for place in places[:FINALISTS]
+    likely = _likely(surface, sights, ground)
+    starts = np.concatenate([_turned(surface, sights, likely, yaw, apart) for yaw in yaws])
+    places = [
+        refine(surface, sights, pose, freedom, QUICK_POINTS, QUICK_STEPS)
+        for pose in _distinct(starts, apart, MANY if several else CANDIDATES)[:, :4]
     ]
+    places.sort(key=lambda place: -place.score)
+    finalists = places[:FINALISTS]
+    if several:
+        for place in places[FINALISTS:]:
+            if all(np.linalg.norm(place.pose[:2] - one.pose[:2]) > apart for one in finalists):
+                finalists.append(place)
+    finest = [refine(surface, sights, place.pose, freedom, FINE_POINTS, FINE_STEPS) for place in finalists]
     return sorted(finest, key=lambda place: -place.score)
 
 
-def _over_table(
-    surface: Surface, sights: Mapping[str, Sight], area: Array, ground: Array, height: float, yaw: float
-) -> Array:
-    """Poses and agreement ``(q, 5)`` all over the table, by the points that cameras see in its middle."""
-    # The grid is of the object's middle, which is not its frame's origin.
-    offset = rotations(np.array([yaw]))[0][:2, :2] @ surface.middle
-    ground = ground - offset
-    poses = np.column_stack([ground, np.full(len(ground), height), np.full(len(ground), yaw)])
-    samples = {}
+def _distinct(scored: Array, metres: float, count: int) -> Array:
+    """The best of poses and agreement ``(q, 5)`` that are apart by so much, at most so many of them."""
+    chosen: list[Array] = []
+    for row in scored[np.argsort(-scored[:, 4])]:
+        if all(_apart(row, other, metres) for other in chosen):
+            chosen.append(row)
+        if len(chosen) >= count:
+            break
+    return np.array(chosen)
+
+
+def over_table(surface: Surface, area: Array, heights: Sequence[float]) -> Array:
+    """Places ``(q, 3)`` all over an area, least and largest x and y ``(2, 2)``, to be searched."""
+    axes = [*(np.arange(low, high, _step(surface)) for low, high in area.T), np.asarray(heights)]
+    return np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 3)
+
+
+def over_supports(surface: Surface, points: Array, table_height: float, frame_height: float) -> Array:
+    """Places ``(q, 3)`` on top of other things or in them, to be searched.
+
+    Args:
+        surface: What is sought.
+        points: Of the other things' surfaces ``(n, 3)``, world, metres.
+        table_height: World z of the table, metres.
+        frame_height: How high the sought object's frame is above what it stands on, metres.
+    """
+    step = _step(surface)
+    cells, index = np.unique(np.floor(points[:, :2] / step).astype(int), axis=0, return_inverse=True)
+    top = np.full(len(cells), -np.inf)
+    np.maximum.at(top, index.ravel(), points[:, 2])
+    # What can be seen from above may be hollow, or lower than it was taken to be.
+    rises = np.arange(RISE_STEP_M / 2, max(0.0, float(top.max() - table_height)) + RISE_STEP_M, RISE_STEP_M)
+    ground = np.column_stack([np.repeat((cells + 0.5) * step, len(rises), 0), np.tile(rises, len(cells))])
+    ground = ground[ground[:, 2] < np.repeat(top - table_height, len(rises)) + RISE_STEP_M / 2]
+    ground[:, 2] += table_height + frame_height
+    return np.asarray(ground, float)
+
+
+def _step(surface: Surface) -> float:
+    """Distance between places to be searched, metres."""
+    return float(np.clip(0.25 * surface.radius, 0.012, 0.03))
+
+
+def _likely(surface: Surface, sights: Mapping[str, Sight], places: Array) -> Array:
+    """Those of places ``(q, 3)`` where pictures show colours of the object, and others around it."""
+    offset = surface.coloured - np.append(surface.middle, 0.0)
+    core = offset[np.linalg.norm(offset[:, :2], axis=1) < CORE_SHARE * surface.radius]
+    core = core[spaced(np.argsort(core[:, 2]), CORE_POINTS)] if len(core) else offset[:CORE_POINTS]
+    angles = np.linspace(0, 2 * np.pi, CORE_POINTS, endpoint=False)
+    ring = np.zeros((CORE_POINTS, 3))
+    ring[:, :2] = AROUND_SHARE * surface.radius * np.stack([np.cos(angles), np.sin(angles)], -1)
+    ring[:, 2] = np.median(core[:, 2])
+    like, told = np.zeros(len(places)), np.zeros(len(places))
+    for sight in sights.values():
+        colours = palette_likeness(surface, sight)
+        inside, seen = shown_at(colours, sight, core, places)
+        around, _ = shown_at(colours, sight, ring, places)
+        like += inside - AROUND_COST * around
+        told += seen
+    like /= np.maximum(told, ENOUGH_SHOWN)
+    kept = int(np.clip(KEPT_PLACES * len(places), MIN_PLACES, MAX_PLACES))
+    return places[np.argsort(-like)[:kept]]
+
+
+def _turned(surface: Surface, sights: Mapping[str, Sight], places: Array, yaw: float, apart: float) -> Array:
+    """The best poses and their agreement ``(k, 5)`` at places ``(q, 3)``, for one direction.
+
+    They are compared by the points that cameras see of the object in the middle of the places.
+    """
+    # The places are of the object's middle, which is not its frame's origin.
+    offset = np.append(rotations(np.array([yaw]))[0][:2, :2] @ surface.middle, 0.0)
+    poses = np.column_stack([places - offset, np.full(len(places), yaw)])
+    height, low, high = float(np.median(places[:, 2])), places[:, :2].min(0), places[:, :2].max(0)
+    coarse, quick = dict[str, Sample](), dict[str, Sample]()
     for camera, sight in sights.items():
         T = sight.view.T_world_cam
         middle = T[:2, 3] + (height - T[2, 3]) / min(T[2, 2], -0.1) * T[:2, 2]
-        middle = np.clip(middle, area[0] + 0.1, area[1] - 0.1) - offset
-        sample = take_sample(surface, sight, np.array([*middle, height, yaw]), COARSE_POINTS)
+        middle = np.clip(middle, low, high) - offset[:2]
+        sample = take_sample(surface, sight, np.array([*middle, height, yaw]), QUICK_POINTS)
         if sample is not None:
-            samples[camera] = sample
-    score = agreement(samples, sights, poses, is_coarse=True) if samples else np.zeros(len(poses))
-    return np.column_stack([poses, score])
+            coarse[camera], quick[camera] = sample.thinned(2), sample
+    if not coarse:
+        return np.column_stack([poses[:1], [0.0]])
+    scores = agreement(coarse, sights, poses, is_coarse=True)
+    best = _distinct(np.column_stack([poses, scores]), apart, STARTS_PER_YAW)[:, :4]
+    around = np.stack([[a * NUDGE_M, b * NUDGE_M, 0, 0] for a in (-1, 0, 1) for b in (-1, 0, 1)])
+    nudged = (best[:, None] + around).reshape(-1, 4)
+    return np.column_stack([nudged, agreement(quick, sights, nudged)])
 
 
 def _apart(pose: Array, other: Array, metres: float) -> bool:
     turn = abs((pose[3] - other[3] + np.pi) % (2 * np.pi) - np.pi)
-    return bool(np.linalg.norm(pose[:2] - other[:2]) > metres or turn > 0.1)
+    return bool(np.linalg.norm(pose[:3] - other[:3]) > metres or turn > 0.1)
 
 
 def refine(
     surface: Surface,
     sights: Mapping[str, Sight],
     pose: Array,
-    turns: bool,
+    freedom: Freedom,
     count: int,
     steps: Sequence[tuple[float, float]],
 ) -> Place:
@@ -119,7 +210,7 @@ def refine(
         surface: What is sought.
         sights: The views.
         pose: Where to begin.
-        turns: Whether the yaw may change.
+        freedom: What may change beside the horizontal place.
         count: Points to compare in a view.
         steps: Metres and radians of each round.
     """
@@ -130,8 +221,10 @@ def refine(
         if not samples:
             return Place(pose, 0.0)
         moves = [np.zeros(4), *(np.array([a * metres, b * metres, 0.0, 0.0]) for a, b in beside)]
-        if turns:
+        if freedom.turns:
             moves += [np.array([0.0, 0.0, 0.0, sign * radians]) for sign in (-1, 1)]
+        if freedom.lifts and len(samples) > 1:
+            moves += [np.array([0.0, 0.0, sign * metres, 0.0]) for sign in (-1, 1)]
         for _ in range(MOVES_PER_STEP):
             scores = agreement(samples, sights, pose + np.stack(moves))
             best = int(scores.argmax())

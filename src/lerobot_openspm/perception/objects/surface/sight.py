@@ -1,0 +1,106 @@
+"""What is compared: the surface of an object, and a view."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from functools import cached_property
+
+import cv2
+import numpy as np
+
+from lerobot_openspm.geometry.se3 import Array
+from lerobot_openspm.perception.objects.surface.backdrop import Backdrop, Float32, lab
+from lerobot_openspm.perception.objects.surface.relief import WEIGHTS
+from lerobot_openspm.types import Mask, View
+
+# Pictures are smoothed by a Gaussian of so many pixels at least, if they are 256 wide.
+FINEST = 0.6
+# Colours this far apart, CIELAB, are alike in the search over the table.
+LIKE_COARSE = 12.0
+
+
+@dataclass(frozen=True)
+class Surface:
+    """Coloured points of an object, all in its own frame.
+
+    Attributes:
+        points: ``(n, 3)``, metres.
+        normals: Outward directions ``(n, 3)``.
+        colours: CIELAB ``(n, 2, 3)`` as the fixed and as the hand's camera show it; the colours in between
+            are expected too. Not a number for points that only hide what is behind them.
+        spacing: Distance between points, metres.
+    """
+
+    points: Array
+    normals: Array
+    colours: Float32
+    spacing: float
+
+    @cached_property
+    def coloured(self) -> Array:
+        """The points ``(n, 3)`` that have colours."""
+        return self.points[np.isfinite(self.colours[:, 0, 0])]
+
+    @cached_property
+    def middle(self) -> Array:
+        """Horizontal middle ``(2,)`` of the coloured points."""
+        return (
+            np.percentile(self.coloured[:, :2], 5, axis=0) + np.percentile(self.coloured[:, :2], 95, axis=0)
+        ) / 2
+
+    @cached_property
+    def palette(self) -> Float32:
+        """Weighted CIELAB ``(k, 3)`` of its colours, one for each that is :data:`LIKE_COARSE` from others."""
+        seen = (self.colours[np.isfinite(self.colours[:, 0, 0])] * WEIGHTS).reshape(-1, 3)
+        return np.unique(np.rint(seen / LIKE_COARSE), axis=0).astype(np.float32) * np.float32(LIKE_COARSE)
+
+    @cached_property
+    def radius(self) -> float:
+        """Horizontal distance from the middle within which most coloured points are, metres."""
+        return float(np.percentile(np.linalg.norm(self.coloured[:, :2] - self.middle, axis=1), 90))
+
+
+@dataclass(frozen=True)
+class Sight:
+    """One view, prepared for comparing.
+
+    Attributes:
+        view: The view.
+        P: Projection ``(3, 4)`` of world points to homogeneous pixels.
+        colours: Weighted CIELAB ``(H, W, 3)``.
+        table: Where the table is ``(H, W)``, 1 or 0.
+        hidden: Pixels ``(H, W)`` that are no evidence.
+    """
+
+    view: View
+    P: Float32
+    colours: Float32
+    table: Float32
+    hidden: Mask
+    _smoothed: dict[int, tuple[Float32, Float32]] = field(default_factory=dict[int, tuple[Float32, Float32]])
+
+    def smoothed(self, octave: int) -> tuple[Float32, Float32]:
+        """Colours and table, smoothed over about ``2 ** octave`` pixels of a picture 256 wide; made once."""
+        if octave not in self._smoothed:
+            sigma = FINEST * 2.0**octave * self.view.camera.width / 256
+            self._smoothed[octave] = (
+                np.asarray(cv2.GaussianBlur(self.colours, (0, 0), sigma), np.float32),
+                np.asarray(cv2.GaussianBlur(self.table, (0, 0), 1.3 * sigma), np.float32),
+            )
+        return self._smoothed[octave]
+
+
+def sight_of(view: View, camera: str, backdrop: Backdrop, hidden: Mask | None) -> Sight:
+    """Prepare a view."""
+    colours = lab(view.image)
+    table = cv2.morphologyEx(
+        backdrop.table.matches(colours).astype(np.uint8), cv2.MORPH_OPEN, np.ones((3, 3), np.uint8)
+    ).astype(np.float32)
+    covered = np.zeros(table.shape, bool) if hidden is None else hidden.copy()
+    own = backdrop.hidden(camera, view)
+    if own is not None:
+        covered |= own
+    T_cam_world = np.linalg.inv(view.T_world_cam)[:3]
+    c = view.camera
+    K = np.array([[c.fx, 0, c.cx], [0, c.fy, c.cy], [0, 0, 1]])
+    return Sight(view, (K @ T_cam_world).astype(np.float32), colours * WEIGHTS, table, covered)
