@@ -101,11 +101,13 @@ class FoundObjects:
         models: The models.
         poses: Per episode, the poses in its first frame.
         ends: Per episode, the final poses of the objects that it moved.
+        unlearned: By name, why objects that the hand touched could not be learned.
     """
 
     models: dict[str, KnownObject]
     poses: list[dict[str, Array]]
     ends: list[dict[str, Array]]
+    unlearned: dict[str, str]
 
 
 def find_objects(
@@ -129,13 +131,11 @@ def find_objects(
         shapes: Measures objects, for shape "sam3d".
     """
     named = sorted({cue.name for scene in scenes for cue in scene.cues} - set(known))
-    models = dict(known)
+    models, unlearned = dict(known), dict[str, str]()
     if named:
         logger.info("learning what these look like: %s", ", ".join(named))
-        learned = learn_objects(scenes, rng, known.values(), segmenter, shape, shapes)
+        learned, unlearned = learn_objects(scenes, rng, known.values(), segmenter, shape, shapes)
         models |= learned
-        if missing := [name for name in named if name not in learned]:
-            logger.warning("could not learn what %s looks like; no key pose will be anchored there", missing)
     found, ends = [], []
     for scene, item in tqdm(zip(scenes, mined, strict=True), "Finding objects", len(scenes), unit="episode"):
         wanted = dict.fromkeys(name for sub_task in item.sub_tasks for name in sub_task.objects)
@@ -144,7 +144,7 @@ def find_objects(
         places = {name: _place(name, estimate, scene.cues) for name, estimate in estimates.items()}
         found.append({name: T for name, T in places.items() if T is not None})
         ends.append(_ends(scene, item, found[-1], models, segmenter))
-    return FoundObjects(models, found, ends)
+    return FoundObjects(models, found, ends, unlearned)
 
 
 def _ends(

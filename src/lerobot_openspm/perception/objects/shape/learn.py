@@ -21,6 +21,7 @@ from lerobot_openspm.perception.objects.shape.first_poses import (
     first_poses,
     masked,
     pictures_of,
+    why_nowhere,
 )
 from lerobot_openspm.perception.objects.shape.fitting import (
     COARSE_CUTS_PX,
@@ -72,7 +73,10 @@ def learn_shapes(examples: Examples) -> dict[str, ShapeModel]:
         found = _learn_masked(examples.names, examples.scenes, floor, examples.segmenter)
     else:
         found = {name: _learn_coloured(name, examples.scenes, floor, examples.rng) for name in examples.names}
-    return {name: model for name, model in found.items() if model is not None}
+    for name, why in found.items():
+        if isinstance(why, str):
+            examples.leave_out(name, why)
+    return {name: model for name, model in found.items() if not isinstance(model, str)}
 
 
 SHAPE = Kind(ShapeModel.kind, learn_shapes, from_record)
@@ -80,38 +84,38 @@ SHAPE = Kind(ShapeModel.kind, learn_shapes, from_record)
 
 def _learn_coloured(
     name: str, scenes: Sequence[DemonstrationScene], floor: float, rng: Generator
-) -> ShapeModel | None:
-    """Colours and shape of an object from scenes with contact cues; None, with a warning, if in vain."""
+) -> ShapeModel | str:
+    """Colours and shape of an object from scenes with contact cues; why not, if in vain."""
     with_cue = [i for i, scene in enumerate(scenes) if any(cue.name == name for cue in scene.cues)]
     if len(with_cue) > MAX_SCENES:
         with_cue = sorted(rng.choice(with_cue, MAX_SCENES, replace=False).tolist())
     pictures = [picture for i in with_cue for picture in pictures_of(i, name, scenes[i], floor)]
+    if not any(picture.seed().any() for picture in pictures):
+        return "no camera sees where the hand touched it"
     log_odds = colour_bootstrap.learn_colours(pictures)
-    return _learn_shape(name, log_odds, coloured(pictures, log_odds), len(with_cue))
+    return _learn_shape(name, log_odds, coloured(pictures, log_odds))
 
 
 def _learn_masked(
     names: Sequence[str], scenes: Sequence[DemonstrationScene], floor: float, segmenter: Segmenter
-) -> dict[str, ShapeModel | None]:
-    """Shapes of objects from a segmenter's masks."""
-    models: dict[str, ShapeModel | None] = {}
+) -> dict[str, ShapeModel | str]:
+    """Shapes of objects from a segmenter's masks; why not, where there are none."""
+    models: dict[str, ShapeModel | str] = {}
     for name, pairs in segmented(names, scenes, segmenter).items():
         groups = {i: masked(name, scene, floor, found) for i, (scene, found) in enumerate(pairs)}
-        models[name] = _learn_shape(name, None, groups, len(pairs))
+        models[name] = _learn_shape(name, None, groups)
     return models
 
 
 def _learn_shape(
-    name: str, log_odds: NDArray[np.float32] | None, groups: Mapping[int, list[Patched]], count: int
-) -> ShapeModel | None:
+    name: str, log_odds: NDArray[np.float32] | None, groups: Mapping[int, list[Patched]]
+) -> ShapeModel | str:
     posed, half_size = first_poses(groups)
     if not posed:
-        log.warning("perception: %r was not found near the cues of its %d demonstrations", name, count)
-        return None
+        return why_nowhere(groups)
     found = _bootstrap(posed, half_size)
     if found is None:
-        log.warning("perception: the masks of %r in %d demonstrations agree on no shape", name, len(posed))
-        return None
+        return f"its outlines in {len(posed)} demonstrations agree on no shape"
     cloud, posed = found
     return _model(name, log_odds, *_finish(posed, half_size, cloud))
 
