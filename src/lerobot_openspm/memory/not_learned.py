@@ -36,10 +36,10 @@ class NotLearned:
         """It in a sentence, with what to do about it."""
         count = f"{self.demonstrations} demonstration{'s' * (self.demonstrations != 1)}"
         if self.what == "instruction":
-            return f"the instruction {self.name!r} is not learned, {count} of it: {self.reason}"
+            return f"{self.name!r} is not learned: none of its {count} is kept, because {self.reason}"
         return (
-            f"{self.name!r} is handled in {count} and could not be learned: {self.reason}. What is not about "
-            f"another object is not anchored to one in its place; {NEXT_STEP}"
+            f"{self.name!r} is handled in {count} and could not be learned: {self.reason}. Nothing is "
+            f"anchored to another object in its place. What helps: {NEXT_STEP}"
         )
 
 

@@ -32,7 +32,7 @@ def list_not_learned(mined: MinedDataset) -> tuple[NotLearned, ...]:
             lost.update(own)
         if all(missing):
             named = " and ".join(map(repr, sorted(frozenset[str]().union(*missing))))
-            why = f"its demonstrations handle {named}, and none of them shows all that it handles"
+            why = f"what they handle is not known: {named}"
             instructions.append(not_learned("instruction", task.episodes[0].episode.task, len(missing), why))
     found = frozenset[str]().union(*mined.object_poses)
     objects: list[NotLearned] = []

@@ -64,6 +64,10 @@ NEAR_YAWS = np.deg2rad([-30.0, -10.0, 10.0, 30.0])
 TURN_GAIN = 0.008
 
 
+class _NoShapeError(Exception):
+    """A shape that no picture of any demonstration shows."""
+
+
 def learn_shapes(examples: Examples) -> dict[str, ShapeModel]:
     """Learn the shapes of objects, from a segmenter's masks or from the objects' colours."""
     if examples.source != "demonstrations" and examples.segmenter is not None:
@@ -113,14 +117,14 @@ def _learn_shape(
     posed, half_size = first_poses(groups)
     if not posed:
         return why_nowhere(groups)
-    found = _bootstrap(posed, half_size)
-    if found is None:
-        return f"its outlines in {len(posed)} demonstrations agree on no shape"
-    cloud, posed = found
-    return _model(name, log_odds, *_finish(posed, half_size, cloud))
+    try:
+        cloud, posed = _bootstrap(posed, half_size)
+        return _model(name, log_odds, *_finish(posed, half_size, cloud))
+    except _NoShapeError:
+        return "what stands out where the hand touched it has another shape in every demonstration"
 
 
-def _bootstrap(posed: list[Posed], half_size: float) -> tuple[Cloud, list[Posed]] | None:
+def _bootstrap(posed: list[Posed], half_size: float) -> tuple[Cloud, list[Posed]]:
     """A first common shape: that of the scene whose own hull, turned and moved, explains the others best."""
     order = sorted(
         range(len(posed)), key=lambda i: -sum(bool((e.probability > 0.5).any()) for e in posed[i].evidence)
@@ -136,7 +140,7 @@ def _bootstrap(posed: list[Posed], half_size: float) -> tuple[Cloud, list[Posed]
         if best is None or total > best[0]:
             best = (total, cloud)
     if best is None:
-        return None
+        raise _NoShapeError
     cloud = best[1]
     anyhow = [_fit_yaws(scene, cloud, yaws) for scene in posed]
     # What keeps to about one direction in every scene must not be turned for a trifle: a fixture that looks
@@ -294,7 +298,7 @@ def _refit(scene: Posed, cloud: Cloud, period: float) -> Fit:
 
 
 def _reliable(posed: Sequence[Posed], cloud: Cloud) -> list[Posed]:
-    """The scenes that fit well, without the views in which the object is hidden."""
+    """The scenes that fit well, without the views in which the object is hidden; at least one."""
     kept = []
     for scene in posed:
         overlaps = measure(scene.evidence, cloud, scene.T_world_obj)
@@ -302,7 +306,10 @@ def _reliable(posed: Sequence[Posed], cloud: Cloud) -> list[Posed]:
         good = [one for one, value in zip(scene.evidence, overlaps, strict=True) if value > CLEAR_VIEW * best]
         kept.append((best, Posed(tuple(good), scene.T_world_obj)))
     level = 0.8 * float(np.median([best for best, _ in kept]))
-    return [scene for best, scene in kept if best >= level and scene.evidence]
+    reliable = [scene for best, scene in kept if best >= level and scene.evidence]
+    if not reliable:
+        raise _NoShapeError
+    return reliable
 
 
 def _fit_yaws(scene: Posed, cloud: Cloud, yaws: Array) -> Fit:
