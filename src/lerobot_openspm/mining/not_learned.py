@@ -41,6 +41,8 @@ def list_not_learned(mined: MinedDataset) -> tuple[NotLearned, ...]:
             continue
         if name not in found and name in mined.unlearned:
             objects.append(not_learned("object", name, count, mined.unlearned[name]))
+        elif lost[name] and name not in mined.objects and not mined.simulator_objects:
+            objects.append(not_learned("object", name, count, "the hand touches it in no demonstration"))
         elif lost[name]:
             why = f"its first picture does not show it clearly in {lost[name]} of them"
             objects.append(not_learned("object", name, count, why))
