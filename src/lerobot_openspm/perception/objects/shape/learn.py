@@ -35,7 +35,7 @@ from lerobot_openspm.perception.objects.shape.fitting import (
     measure,
     score,
 )
-from lerobot_openspm.perception.objects.shape.hull import Posed, Votes
+from lerobot_openspm.perception.objects.shape.hull import NoShapeError, Posed, Votes
 from lerobot_openspm.perception.objects.shape.model import ShapeModel, from_record
 from lerobot_openspm.perception.objects.yaw import search_range, yaw_range
 from lerobot_openspm.types import DemonstrationScene, Segmenter
@@ -44,11 +44,9 @@ log = logging.getLogger(__name__)
 
 MAX_SCENES = 30
 REFERENCES = 2
-JUDGES = 6
-AXIS_JUDGES = 12
+JUDGES, AXIS_JUDGES = 6, 12
 NARROW_YAW = np.deg2rad(60)
-ROUNDS = 4
-SYMMETRY_ROUNDS = 2
+ROUNDS, SYMMETRY_ROUNDS = 4, 2
 THRESHOLDS = (0.5, 0.6, 0.7, 0.8, 0.9, 0.97)
 # A more symmetric shape is preferred if it explains the masks as well as this.
 SYMMETRY_LOSS = 0.006
@@ -62,10 +60,6 @@ CLEAR_VIEW = 0.8
 TRIM_LOSS = 0.0007
 NEAR_YAWS = np.deg2rad([-30.0, -10.0, 10.0, 30.0])
 TURN_GAIN = 0.008
-
-
-class _NoShapeError(Exception):
-    """A shape that no picture of any demonstration shows."""
 
 
 def learn_shapes(examples: Examples) -> dict[str, ShapeModel]:
@@ -96,8 +90,14 @@ def _learn_coloured(
     pictures = [picture for i in with_cue for picture in pictures_of(i, name, scenes[i], floor)]
     if not any(picture.seed().any() for picture in pictures):
         return "no camera sees where the hand touched it"
-    log_odds = colour_bootstrap.learn_colours(pictures)
-    return _learn_shape(name, log_odds, coloured(pictures, log_odds))
+    reasons: list[str] = []
+    for among_others in (False, True):  # a second object just like it hides its colours from the first way
+        log_odds = colour_bootstrap.learn_colours(pictures, among_others)
+        found = _learn_shape(name, log_odds, coloured(pictures, log_odds))
+        if isinstance(found, ShapeModel):
+            return found
+        reasons.append(found)
+    return reasons[0]
 
 
 def _learn_masked(
@@ -120,7 +120,7 @@ def _learn_shape(
     try:
         cloud, posed = _bootstrap(posed, half_size)
         return _model(name, log_odds, *_finish(posed, half_size, cloud))
-    except _NoShapeError:
+    except NoShapeError:
         return "what stands out where the hand touched it has another shape in every demonstration"
 
 
@@ -140,7 +140,7 @@ def _bootstrap(posed: list[Posed], half_size: float) -> tuple[Cloud, list[Posed]
         if best is None or total > best[0]:
             best = (total, cloud)
     if best is None:
-        raise _NoShapeError
+        raise NoShapeError
     cloud = best[1]
     anyhow = [_fit_yaws(scene, cloud, yaws) for scene in posed]
     # What keeps to about one direction in every scene must not be turned for a trifle: a fixture that looks
@@ -308,7 +308,7 @@ def _reliable(posed: Sequence[Posed], cloud: Cloud) -> list[Posed]:
     level = 0.8 * float(np.median([best for best, _ in kept]))
     reliable = [scene for best, scene in kept if best >= level and scene.evidence]
     if not reliable:
-        raise _NoShapeError
+        raise NoShapeError
     return reliable
 
 
