@@ -27,6 +27,7 @@ from lerobot_openspm.memory.robot import RobotModel
 from lerobot_openspm.mining.dataset import Demonstrations, open_dataset
 from lerobot_openspm.mining.entries import build_entries
 from lerobot_openspm.mining.mined import MinedDataset, MinedEpisode, MinedKeyPoses
+from lerobot_openspm.mining.not_learned import list_not_learned
 from lerobot_openspm.mining.phase_labels.labelling import LabelCache, label_phases, make_judge
 from lerobot_openspm.mining.processor import DatasetProcessor, MiningOptions
 from lerobot_openspm.perception.objects.base import ShapeBackend
@@ -126,6 +127,9 @@ def memory_of(mined: MinedDataset, config: OpenSPMConfig) -> Memory:
         "mined %d entries from %d episodes (%d skipped); objects: %s",
         len(entries), len(mined.episodes), len(mined.skipped), ", ".join(sorted(mined.objects)),
     )  # fmt: skip
+    not_learned = list_not_learned(mined)
+    for one in not_learned:
+        logger.warning("%s", one)
     perception, segmentation = "demonstrations", config.perception
     if config.perception == "oracle":
         perception, segmentation = "oracle", "demonstrations"
@@ -133,6 +137,7 @@ def memory_of(mined: MinedDataset, config: OpenSPMConfig) -> Memory:
     return Memory(
         entries, dict(mined.objects), robot, dict(mined.cameras), perception,
         mined.simulator_objects, segmentation, config.segmenter.shape, config.layouts(),
+        not_learned=not_learned,
     )  # fmt: skip
 
 

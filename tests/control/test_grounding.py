@@ -2,9 +2,11 @@ import dataclasses
 
 import numpy as np
 import pytest
-from tests.control.test_controller import planning_context
+from tests.control.test_controller import HAND, Perception, controller, observe, planning_context
+from tests.memory.builders import entry
 
-from lerobot_openspm.control.grounding import Grounding, references
+from lerobot_openspm.control.grounding import Grounding, demonstrations, references
+from lerobot_openspm.control.state import Status
 from lerobot_openspm.geometry import se3
 from lerobot_openspm.memory.compose import Candidate
 from lerobot_openspm.memory.entry import MemoryEntry, RetrievalKey
@@ -110,3 +112,94 @@ def test_the_center_of_the_table_is_the_middle_of_where_the_hand_was():
     middle, side = at(*(low + high)[:2] / 2 + 0.03), at(*high[:2])
     estimates = {"bowl": seen(side, middle)}
     np.testing.assert_array_equal(grounding.sort_out(estimates, CONTEXT.surfaces)["bowl"].T_world_obj, middle)
+
+
+# Where nobody knows the landmark, the demonstrations of that instruction choose.
+
+
+def shown(*offsets, plate=(0.1, 0.1)):
+    """Demonstrations in which the bowl stood at offsets from the plate."""
+    return tuple({"bowl": at(plate[0] + x, plate[1] + y), "plate": at(*plate)} for x, y in offsets)
+
+
+BESIDE_PLATE = shown((0.0, -0.2), (0.01, -0.19), (-0.01, -0.2))
+
+
+def look_beside_plate(grounding, bowl, plate=(0.1, 0.1)):
+    return grounding.sort_out({"bowl": bowl, "plate": seen(at(*plate))}, {})["bowl"]
+
+
+def test_where_nobody_knows_the_landmark_the_demonstrations_choose():
+    grounding = Grounding({"bowl": NEXT_TO_RACK}, {"bowl": BESIDE_PLATE})
+    meant, other = at(0.11, -0.11), at(-0.2, 0.2)
+    for bowl in (seen(meant, other), seen(other, meant), seen(other, meant, status="found")):
+        found = look_beside_plate(Grounding({"bowl": NEXT_TO_RACK}, {"bowl": BESIDE_PLATE}), bowl)
+        assert found.status == "found"
+        np.testing.assert_array_equal(found.T_world_obj, meant)
+    look_beside_plate(grounding, seen(meant, other))
+    assert look_beside_plate(grounding, seen(other)).status == "not_found"
+
+
+def test_words_that_can_be_decided_are_never_overruled():
+    # The demonstrations would have it where FAR is.
+    grounding = Grounding({"bowl": NEXT_TO_RACK}, {"bowl": ({"bowl": FAR},)})
+    np.testing.assert_array_equal(look(grounding, seen(FAR, NEAR)).T_world_obj, NEAR)
+
+
+def test_without_what_they_show_it_beside_the_demonstrations_do_not_choose():
+    grounding = Grounding({"bowl": NEXT_TO_RACK}, {"bowl": BESIDE_PLATE})
+    assert grounding.sort_out({"bowl": seen(NEAR, FAR)}, {})["bowl"].status == "ambiguous"
+
+
+def test_what_the_demonstrations_show_is_looked_for():
+    grounding = Grounding({"bowl": NEXT_TO_RACK}, {"bowl": BESIDE_PLATE})
+    assert set(grounding.landmarks) == {"rack", "bowl", "plate"}
+
+
+def spoken(where, poses=None, **changes):
+    told = SubTask("put", "bowl", "", "on", "plate", where)
+    made = entry(object_poses=poses or {"bowl": NEAR, "plate": FAR}, **changes)
+    return dataclasses.replace(made, key=dataclasses.replace(made.key, sub_tasks=(told,)))
+
+
+def test_only_demonstrations_of_that_very_instruction_count_and_only_for_unknown_landmarks():
+    same, more = spoken(NEXT_TO_RACK, {"bowl": NEAR}), spoken(NEXT_TO_RACK, {"bowl": FAR})
+    others = (spoken(Reference("next to", ("cup",))), spoken(Reference("on", ("rack",))), spoken(None))
+    asked = same.key.sub_tasks
+    candidates = [Candidate(one, 1.0, one, asked) for one in (same, *others, more)]
+    found = demonstrations(candidates, str, {"bowl", "plate"})
+    assert found == {"bowl": (same.object_poses, more.object_poses)}
+    assert demonstrations(candidates, str, {"bowl", "plate", "rack"}) == {}
+
+
+def test_what_the_next_part_says_replaces_what_was_shown():
+    grounding = Grounding()
+    grounding.hear({"bowl": NEXT_TO_RACK}, {"bowl": BESIDE_PLATE})
+    grounding.hear({"cup": Reference("left")}, {})
+    assert grounding.shown == {"bowl": BESIDE_PLATE}
+    grounding.hear({"bowl": Reference("left")}, {})
+    assert grounding.shown == {}
+
+
+class TwoBowls(Perception):
+    """Sees two bowls that look alike."""
+
+    def _estimate(self, name):
+        one = super()._estimate(name)
+        if name != "bowl":
+            return one
+        return dataclasses.replace(one, status="ambiguous", others=(self.object_poses["second bowl"],))
+
+
+def test_an_instruction_with_an_unknown_landmark_is_acted_by_on_the_one_that_was_shown():
+    where = Reference("next to", ("ramekin",))
+    instruction = "put the bowl next to the ramekin on the plate"
+    known = {"bowl": at(0.0, -0.15), "plate": at(0.1, 0.1)}
+    made = spoken(where, known, instruction="put the bowl on the plate")
+    made = dataclasses.replace(made, language=instruction)
+    one = controller(made, instruction=instruction)
+    meant = at(0.02, -0.16)
+    perception = TwoBowls({"bowl": at(-0.25, 0.15), "second bowl": meant, "plate": at(0.11, 0.1)})
+    observe(one, HAND, perception)
+    assert one.state.status is Status.RUNNING
+    np.testing.assert_allclose(one.state.plan.object_poses["bowl"], meant)

@@ -6,7 +6,7 @@ from hypothesis import assume, given
 from hypothesis import strategies as st
 from tests.properties import examples
 
-from lerobot_openspm.control.spatial_relations import MARGIN_M, choose
+from lerobot_openspm.control.spatial_relations import MARGIN_M, choose, choose_as_shown
 from lerobot_openspm.errors import InstructionError
 from lerobot_openspm.geometry import se3
 from lerobot_openspm.types import Reference
@@ -162,3 +162,73 @@ def test_a_turned_scene_has_its_sides_turned(one, other, yaw, names, places):
     assert choose(Reference(other, names), turned, marks) == choose(
         Reference(one, names), candidates, landmarks
     )
+
+
+# As demonstrations show it.
+
+OFFSETS = st.lists(st.tuples(st.floats(-0.02, 0.02), st.floats(-0.02, 0.02)), min_size=1, max_size=6)
+SHIFT = st.tuples(st.floats(-0.5, 0.5), st.floats(-0.5, 0.5))
+
+
+def shown_at(place, errors, marks=MARKS):
+    """Demonstrations in which a bowl stood about at a place, each shifted as a whole."""
+    made = []
+    for i, (x, y) in enumerate(errors):
+        by = np.array([0.1 * i, -0.05 * i])
+        others = {name: at(*(np.array(xy) + by)) for name, xy in marks.items()}
+        made.append({"bowl": at(*(np.array(place) + by + (x, y))), **others})
+    return made
+
+
+@given(PLACES, OFFSETS, SHIFT)
+def test_a_shift_of_the_whole_scene_changes_nothing_of_what_is_shown(places, errors, shift):
+    shown = shown_at(places[0], errors)
+    candidates, marks = scene(places)
+    T = se3.from_yaw([*shift, 0.0], 0.0)
+    before = choose_as_shown("bowl", candidates, marks, shown)
+    after = choose_as_shown(
+        "bowl", [T @ one for one in candidates], {k: T @ v for k, v in marks.items()}, shown
+    )
+    gaps = np.sort(np.linalg.norm(np.array(places) - places[0], axis=1))
+    assume(before == after or gaps[1] > 0.1)  # near the margin rounding decides
+    assert before == after
+
+
+@given(PLACES, OFFSETS, st.randoms(use_true_random=False))
+def test_the_one_that_was_shown_is_chosen_whatever_their_order(places, errors, random):
+    assume(min(np.linalg.norm(np.array(places[1:]) - places[0], axis=1)) > 0.13)
+    order = list(range(len(places)))
+    random.shuffle(order)
+    candidates, marks = scene([places[i] for i in order])
+    assert choose_as_shown("bowl", candidates, marks, shown_at(places[0], errors)) == order.index(0)
+
+
+@given(SHIFT, st.floats(0.03, 0.3), st.floats(0.0, 2 * np.pi))
+def test_two_as_far_from_where_it_was_shown_are_a_tie(place, away, angle):
+    way = away * np.array([np.cos(angle), np.sin(angle)])
+    candidates, marks = scene([np.array(place) + way, np.array(place) - way])
+    assert choose_as_shown("bowl", candidates, marks, shown_at(place, [(0.0, 0.0)])) is None
+
+
+def test_demonstrations_that_differ_more_than_the_candidates_do_not_choose():
+    candidates, marks = scene([(0.0, 0.0), (0.1, 0.0)])
+    scattered = [(0.0, 0.0), (0.3, 0.0), (-0.3, 0.0), (0.0, 0.3), (0.0, -0.3)]
+    assert choose_as_shown("bowl", candidates, marks, shown_at((0.0, 0.0), scattered)) is None
+
+
+def test_neither_is_near_where_it_was_shown():
+    candidates, marks = scene([(0.5, 0.0), (0.6, 0.0)])
+    assert choose_as_shown("bowl", candidates, marks, shown_at((0.0, 0.0), [(0.0, 0.0)])) is None
+
+
+def test_where_nothing_else_was_shown_the_world_decides():
+    candidates, marks = scene([(0.3, 0.1), (0.0, 0.0)])
+    shown = [{"bowl": at(0.01, 0.01)}, {"bowl": at(0.0, -0.01)}]
+    assert choose_as_shown("bowl", candidates, marks, shown) == 1
+    assert choose_as_shown("bowl", candidates, {}, shown) == 1
+    # But not where it was shown beside something that is not found here.
+    beside = [{"bowl": at(0.0, 0.0), "plate": at(0.2, 0.2)}]
+    assert choose_as_shown("bowl", candidates, {}, beside) is None
+    assert choose_as_shown("bowl", candidates, marks, []) is None
+    assert choose_as_shown("bowl", [], marks, shown) is None
+    assert choose_as_shown("bowl", candidates[:1], marks, []) == 0

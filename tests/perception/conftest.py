@@ -19,7 +19,7 @@ def learn(folder: Path) -> None:
     rng = np.random.default_rng(1)
     scenes = [demonstration(rng, wrong=i == 3) for i in range(8)]
     folder.mkdir()
-    for name, model in learn_objects(scenes, np.random.default_rng(0)).items():
+    for name, model in learn_objects(scenes, np.random.default_rng(0)).models.items():
         fields, arrays = store.to_parts(model)
         (folder / f"{name}.json").write_text(json.dumps(fields))
         save_file({key: np.ascontiguousarray(array) for key, array in arrays.items()}, folder / f"{name}.st")

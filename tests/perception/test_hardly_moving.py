@@ -81,6 +81,6 @@ def test_a_movable_object_that_stood_still_in_a_few_scenes_is_learned_by_its_sha
     alike = [demonstration(np.random.default_rng(int(seed))) for seed in pair]
     alike = [replace(s, cues=tuple(replace(h, place=h.name) for h in s.cues)) for s in alike]
     known = [replace(model("bowl"), name=name) for name in ("bowl", "plate")]
-    models = learn_objects(alike, np.random.default_rng(0), known)
+    models = learn_objects(alike, np.random.default_rng(0), known).models
     assert "block" in models
     assert not isinstance(models["block"], PatchModel)

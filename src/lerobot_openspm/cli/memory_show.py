@@ -82,7 +82,7 @@ def list_entries(args: list[str]) -> None:
 
 
 def show(args: list[str]) -> None:
-    """Print entries with all their numbers, then one JSON object."""
+    """Print entries with all their numbers and what could not be learned, then one JSON object."""
     config = draccus.parse(ShowConfig, args=args)
     memory = read_memory(Path(config.path))
     wanted = (
@@ -98,8 +98,11 @@ def show(args: list[str]) -> None:
         )
     for entry in shown:
         print("\n".join(_table(entry)), end="\n\n")
+    for one in memory.not_learned:
+        print(one)
     per_task = Counter(entry.language for entry in memory.entries)
-    print(json.dumps({"entries": len(memory.entries), "shown": len(shown), "per_task": per_task}))
+    told = {"not_learned": [vars(one) for one in memory.not_learned]} if memory.not_learned else {}
+    print(json.dumps({"entries": len(memory.entries), "shown": len(shown), "per_task": per_task, **told}))
 
 
 def export(args: list[str]) -> None:

@@ -54,6 +54,7 @@ def main(args: list[str]) -> None:
         "key_poses": sum(len(entry.key_poses) for entry in memory.entries),
         "skipped": int(meta.total_episodes) - len(memory.entries),
         "objects": sorted(memory.objects),
+        "not_learned": [vars(one) for one in memory.not_learned],
         "output": config.output,
         "annotated": config.annotated,
         "seconds": round(time.monotonic() - start_s, 1),

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from lerobot_openspm.control.spatial_relations import choose
+from lerobot_openspm.control.spatial_relations import choose, choose_as_shown
 from lerobot_openspm.geometry.se3 import Array
 from lerobot_openspm.memory.compose import Candidate
 from lerobot_openspm.types import PoseEstimate, Reference
@@ -33,26 +33,64 @@ def references(candidate: Candidate, object_meant: Callable[[str], str]) -> dict
     return said
 
 
+def demonstrations(
+    candidates: Sequence[Candidate], object_meant: Callable[[str], str], known: Collection[str]
+) -> dict[str, tuple[Mapping[str, Array], ...]]:
+    """By the name of an object that is told by a landmark nobody knows: what shows which one is meant.
+
+    Args:
+        candidates: What the instruction, or a part of it, can be carried out by.
+        object_meant: Tells the name under which a thing is known.
+        known: Names of all known objects and surfaces.
+
+    Returns:
+        Per demonstration that said the same of the object, poses ``T_world_obj`` ``(4, 4)`` by name at its
+        start. No object whose landmarks are known: the words decide which one that is.
+    """
+    shown: dict[str, list[Mapping[str, Array]]] = {}
+    for one in candidates:
+        own = Candidate(one.entry, 1.0, one.entry, one.entry.key.sub_tasks)
+        told, then = references(one, object_meant), references(own, object_meant)
+        for name, where in told.items():
+            if then.get(name) == where and not set(where.landmarks) <= set(known):
+                shown.setdefault(name, []).append(one.source.object_poses)
+    return {name: tuple(poses) for name, poses in shown.items()}
+
+
 @dataclass
 class Grounding:
     """Tells objects of one name apart, in one environment.
 
     Attributes:
         said: By name, where the instruction says that the object is.
+        shown: By name, where demonstrations show what stood; for objects that their landmark cannot tell.
     """
 
     said: Mapping[str, Reference] = field(default_factory=dict[str, Reference])
+    shown: Mapping[str, Sequence[Mapping[str, Array]]] = field(
+        default_factory=dict[str, Sequence[Mapping[str, Array]]]
+    )
     _not_meant: dict[str, tuple[Array, ...]] = field(default_factory=dict[str, tuple[Array, ...]])
 
     @property
     def landmarks(self) -> tuple[str, ...]:
         """The objects that others are told by, each once."""
-        return tuple(dict.fromkeys(name for one in self.said.values() for name in one.landmarks))
+        marks = [name for one in self.said.values() for name in one.landmarks]
+        return tuple(dict.fromkeys([*marks, *(k for own in self.shown.values() for one in own for k in one)]))
 
-    def hear(self, said: Mapping[str, Reference]) -> frozenset[str]:
-        """Take in what a part of the instruction says; the names that mean another object from now on."""
+    def hear(
+        self, said: Mapping[str, Reference], shown: Mapping[str, Sequence[Mapping[str, Array]]] | None = None
+    ) -> frozenset[str]:
+        """Take in what a part of the instruction says; the names that mean another object from now on.
+
+        Args:
+            said: By name, where the instruction says that the object is.
+            shown: As :func:`demonstrations` gives it.
+        """
         changed = frozenset(name for name in said if name in self.said and self.said[name] != said[name])
         self.said = {**self.said, **said}
+        kept = {name: one for name, one in self.shown.items() if name not in said}
+        self.shown = {**kept, **(shown or {})}
         self._not_meant = {name: T for name, T in self._not_meant.items() if name not in changed}
         return changed
 
@@ -76,6 +114,8 @@ class Grounding:
         candidates = (estimate.T_world_obj, *estimate.others)
         landmarks = {mark: T for mark, T in object_poses.items() if mark != name}
         index = choose(self.said[name], candidates, landmarks) if name in self.said else None
+        if index is None and name in self.shown:
+            index = choose_as_shown(name, candidates, landmarks, self.shown[name])
         if index is None:
             where = self.said.get(name, "nothing")
             logger.info("cannot tell which of %d objects like the %r is meant: %s is said of it",

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lerobot_openspm.control.grounding import Grounding, references
+from lerobot_openspm.control.grounding import Grounding, demonstrations, references
 from lerobot_openspm.control.planning import Plan, PlanningContext
 from lerobot_openspm.control.transfer import Target
 from lerobot_openspm.geometry.se3 import Array
@@ -77,7 +77,8 @@ class SceneState:
         """Take in which of several like objects a part of the instruction is about."""
         meant = self._context.object_meant
         said = {k: where for one in candidates for k, where in references(one, meant).items()}
-        others = self.grounding.hear(said)
+        known = {*self._context.yaw_periods, *self._context.surfaces}
+        others = self.grounding.hear(said, demonstrations(candidates, meant, known))
         self.tracker.forget(others)
         self.altered -= others
 

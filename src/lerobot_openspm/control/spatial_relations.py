@@ -70,6 +70,61 @@ def choose(reference: Reference, candidates: Sequence[Array], landmarks: Mapping
     return best if is_clear else None
 
 
+def choose_as_shown(
+    name: str,
+    candidates: Sequence[Array],
+    objects: Mapping[str, Array],
+    shown: Sequence[Mapping[str, Array]],
+) -> int | None:
+    """Tell which of several objects of one name stands where demonstrations of an instruction show it.
+
+    Where it stood is compared relative to the other objects that a demonstration shows and that are found
+    here, along the world's axes as in :func:`choose`; in the world where demonstrations show nothing else.
+
+    Args:
+        name: Their name.
+        candidates: Poses ``T_world_obj`` ``(4, 4)`` of the objects of that name.
+        objects: Poses ``T_world_obj`` ``(4, 4)`` by name of what else is found here.
+        shown: For each demonstration, poses ``T_world_obj`` ``(4, 4)`` by name at its start.
+
+    Returns:
+        Index of the candidate. None where the second best is not worse than the best by :data:`MARGIN_M`, by
+        half of what the best is off, and by what the demonstrations themselves differ; or where no
+        demonstration shows the object, or nothing is found that they show it beside.
+    """
+    if len(candidates) == 1:
+        return 0
+    expected = _where_shown(name, objects, [one for one in shown if name in one])
+    if not expected or not candidates:
+        return None
+    places = np.stack(candidates)[:, :2, 3]
+    middles: list[Array] = [np.median(one, axis=0) for one in expected]
+    spread = sum(_median_distance(*pair) for pair in zip(expected, middles, strict=True)) / len(expected)
+    costs = np.linalg.norm(places[:, None] - np.stack(middles), axis=-1).mean(axis=1)
+    best = int(np.argmin(costs))
+    margin = max(MARGIN_M, spread, float(costs[best]) / 2)
+    return best if np.delete(costs, best).min() - costs[best] >= margin else None
+
+
+def _where_shown(
+    name: str, objects: Mapping[str, Array], shown: Sequence[Mapping[str, Array]]
+) -> list[Array]:
+    """Where demonstrations show an object: places ``(k, 2)`` here by each other object that it is beside."""
+    beside = sorted({mark for one in shown for mark in one} - {name})
+    if not beside:
+        return [np.stack([one[name][:2, 3] for one in shown])] if shown else []
+    return [
+        np.stack([objects[mark][:2, 3] + (one[name] - one[mark])[:2, 3] for one in shown if mark in one])
+        for mark in beside
+        if mark in objects
+    ]
+
+
+def _median_distance(places: Array, middle: Array) -> float:
+    away: Array = np.linalg.norm(places - middle, axis=1)
+    return float(np.median(away))
+
+
 # Each relation gives costs (n,) in metres of candidates (n, 3), given landmarks (k, 3). The least is meant.
 # An infinite cost excludes a candidate, even if it lay more favourably by `slack` metres.
 

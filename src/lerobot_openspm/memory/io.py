@@ -13,11 +13,11 @@ import re
 from collections.abc import Generator, Mapping
 from contextlib import contextmanager, nullcontext, suppress
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import msgspec
 import numpy as np
-from msgspec import Meta, Struct
+from msgspec import Meta, Struct, field
 from numpy.typing import NDArray
 from safetensors import SafetensorError
 from safetensors.numpy import load as load_arrays
@@ -27,12 +27,14 @@ from lerobot_openspm.errors import MemoryFormatError
 from lerobot_openspm.files import locked, rename, write_beside, written
 from lerobot_openspm.geometry.camera import cameras_from_dict, cameras_to_dict, load_cameras
 from lerobot_openspm.memory.memory import Memory
+from lerobot_openspm.memory.not_learned import MAX_RECORDS, NotLearned
 from lerobot_openspm.memory.schema import (
     AGAIN,
     VERSION,
     Count,
     Name,
     Origin,
+    Record,
     checked,
     loads,
     memory_from,
@@ -66,6 +68,13 @@ NO_FILE = (FileNotFoundError, NotADirectoryError, IsADirectoryError)
 Arrays = Mapping[str, NDArray[Any]]
 
 
+class _NotLearned(Record):
+    what: Literal["object", "instruction"]
+    name: Name
+    demonstrations: Count
+    reason: Name
+
+
 class Header(Origin):
     """What ``memory.json`` says before its entries.
 
@@ -75,6 +84,7 @@ class Header(Origin):
         anchored: Names of all objects that entries have key poses at.
         n_entries: How many of the entries are in use; those after them are superseded.
         arrays: Name of the file of arrays; its SHA-256 is part of the name.
+        not_learned: What the demonstrations could not teach.
     """
 
     cameras: dict[str, Any]
@@ -82,6 +92,7 @@ class Header(Origin):
     anchored: list[Name]
     n_entries: Count
     arrays: Annotated[str, Meta(pattern=r"\Amemory-[0-9a-f]{64}\.safetensors\Z")]
+    not_learned: Annotated[list[_NotLearned], Meta(max_length=MAX_RECORDS)] = field(default_factory=list)
 
 
 class _Named(Struct):
@@ -137,6 +148,7 @@ def _header_of(memory: Memory) -> tuple[Header, Arrays]:
         "anchored": anchored,
         "n_entries": len(memory.entries),
         "arrays": ARRAYS.format("0" * 64),
+        "not_learned": memory.not_learned,
     }
     return record_of(fields, Header, "the memory"), arrays
 
@@ -236,6 +248,7 @@ def _loaded(file: OpenFile, header: Header, start: int, cameras_file: Path | Non
         superseded=tuple(superseded) if is_small else superseded,
         objects=_objects(header.objects, arrays, where),
         cameras=cameras,
+        not_learned=tuple(NotLearned(**msgspec.structs.asdict(one)) for one in header.not_learned),
     )
 
 

@@ -14,6 +14,7 @@ from lerobot_openspm.geometry.camera import Camera
 from lerobot_openspm.geometry.se3 import Array
 from lerobot_openspm.geometry.vector_layout import VectorLayout
 from lerobot_openspm.memory.entry import MemoryEntry
+from lerobot_openspm.memory.not_learned import NotLearned, still_not_learned
 from lerobot_openspm.memory.quality import with_success
 from lerobot_openspm.memory.robot import RobotModel
 from lerobot_openspm.perception.objects.base import KnownObject
@@ -36,6 +37,7 @@ class Memory:
         simulator_objects: Objects in the order of the simulator's pose vector (oracle ablation only).
         layouts: How the robot's state and action vectors are laid out; None where it is not known.
         superseded: Entries that were replaced, merged or removed. They are kept to look at, never retrieved.
+        not_learned: What the demonstrations could not teach.
     """
 
     entries: Sequence[MemoryEntry]
@@ -48,6 +50,7 @@ class Memory:
     shape: str = "demonstrations"
     layouts: Layouts | None = None
     superseded: Sequence[MemoryEntry] = ()
+    not_learned: tuple[NotLearned, ...] = ()
 
     @property
     def yaw_periods(self) -> dict[str, float]:
@@ -99,13 +102,15 @@ class Memory:
                 replaced.append(known.pop(old))
                 new = replace(new, version=replaced[-1].version + 1)
             added.append(new)
+        objects = {**newer.objects, **self.objects}
         return replace(
             self,
             entries=(*known.values(), *added),
-            objects={**newer.objects, **self.objects},
+            objects=objects,
             robot=robot,
             layouts=self.layouts or newer.layouts,
             superseded=(*self.superseded, *replaced),
+            not_learned=still_not_learned(self.not_learned, newer.not_learned, objects, newer.entries),
         )
 
     def restored(self, index: int) -> Memory:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter, defaultdict
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -22,6 +22,10 @@ PRIOR_M = 0.05
 AXES_PRIOR_M = 0.03
 # The deviation of a good demonstration at its contacts is of this order.
 QUALITY_SCALE_M = 0.02
+
+# Where the object that the instruction suggests for a contact was not found, another one is believed if so
+# many demonstrations keep within this distance of one another in its frame, and not in the world's.
+MIN_SUPPORTING, SUPPORTED_M = 3, 0.010
 
 # Which contact a key pose belongs to, its phase, and its number among those with both the same.
 Role = tuple[int, str, int]
@@ -65,6 +69,16 @@ def _is_turn(role: Role) -> bool:
     return role[1] == "push" and role[2] > 0
 
 
+def contact_roles(key_poses: Sequence[KeyPose]) -> frozenset[Role]:
+    """The roles in which the hand touches something: contact phases, and where a push begins."""
+    following = [pose.phase for pose in key_poses[1:]]
+    return frozenset(
+        role
+        for role, after in zip(roles(key_poses), [*following, ""], strict=True)
+        if role[1] in CONTACT_PHASES or after == "push"
+    )
+
+
 def sub_task_of(pose: KeyPose, sub_tasks: Sequence[SubTask]) -> SubTask:
     """The sub-task a key pose serves, see :func:`sub_task_index`."""
     return sub_tasks[sub_task_index(pose.contact, pose.phase, len(sub_tasks))]
@@ -96,10 +110,20 @@ def suggested_anchor(pose: KeyPose, sub_tasks: Sequence[SubTask]) -> str:
     return sub_task.landmark if arriving and sub_task.relation else sub_task.target
 
 
-def consensus(demonstrations: Sequence[Demonstration], sub_tasks: Sequence[SubTask]) -> dict[Role, Anchor]:
-    """Choose an anchor for every role of one task.
+def consensus(
+    demonstrations: Sequence[Demonstration], sub_tasks: Sequence[SubTask], surfaces: Collection[str] = ()
+) -> dict[Role, Anchor]:
+    """Choose an anchor for every role of one task; none for a contact whose object is not known.
 
-    Only objects that the instruction names are candidates, because nothing looks for others when acting.
+    Only objects that the instruction names are candidates, because nothing looks for others when acting. A
+    contact belongs to the object that the instruction suggests. If that was found in few demonstrations, the
+    contact is anchored to another one only where the demonstrations show that it goes along with that.
+
+    Args:
+        demonstrations: The demonstrations of the task.
+        sub_tasks: What its instruction says.
+        surfaces: Names of what things stand on everywhere, such as the table: what is put there is put
+            relative to whatever the demonstrations agree about.
     """
     names = list(dict.fromkeys(name for sub_task in sub_tasks for name in sub_task.objects))
     candidates = [Anchor(place, axes) for place in names for axes in (place, WORLD, *names)]
@@ -107,10 +131,17 @@ def consensus(demonstrations: Sequence[Demonstration], sub_tasks: Sequence[SubTa
     for demonstration in demonstrations:
         for role, pose in zip(roles(demonstration.key_poses), demonstration.key_poses, strict=True):
             gathered[role].append((pose, demonstration))
+    touching = frozenset[Role]().union(*(contact_roles(one.key_poses) for one in demonstrations))
     anchors: dict[Role, Anchor] = {}
     for role, members in gathered.items():
         suggested = suggested_anchor(members[0][0], sub_tasks)
-        costs = {anchor: _cost(anchor, members, suggested) for anchor in dict.fromkeys(candidates)}
+        n_found = sum(suggested in demonstration.object_poses for _, demonstration in members)
+        is_free = role not in touching or suggested in surfaces or 2 * n_found >= len(members)
+        costs = {
+            anchor: _cost(anchor, members, suggested)
+            for anchor in dict.fromkeys(candidates)
+            if is_free or anchor.place == suggested or _goes_along(anchor, members)
+        }
         best = min(costs, key=lambda anchor: costs[anchor])
         if np.isfinite(costs[best]):
             anchors[role] = best
@@ -126,6 +157,16 @@ def _cost(anchor: Anchor, members: Sequence[tuple[KeyPose, Demonstration]], sugg
     prior = PRIOR_M * (anchor.place != suggested) + AXES_PRIOR_M * (anchor.axes != anchor.place)
     spread = float(np.median(deviations(np.stack(found))))
     return spread + prior / len(found) + PRIOR_M * (1 - len(found) / len(members))
+
+
+def _goes_along(anchor: Anchor, members: Sequence[tuple[KeyPose, Demonstration]]) -> bool:
+    """Whether key poses of one role move with an anchor: alike in its frame, unlike in the world's."""
+    pairs = [(demonstration.in_frame(anchor, pose), pose.T_world_ee) for pose, demonstration in members]
+    found = [(T, T_world_ee) for T, T_world_ee in pairs if T is not None]
+    if len(found) < MIN_SUPPORTING:
+        return False
+    in_frame, in_world = (deviations(np.stack(ones)) for ones in zip(*found, strict=True))
+    return bool(np.percentile(in_frame, 75) <= SUPPORTED_M and np.median(in_world) > 2 * SUPPORTED_M)
 
 
 def deviations(T_obj_ee: Array) -> Array:

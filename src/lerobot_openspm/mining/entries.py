@@ -8,7 +8,6 @@ from collections.abc import Mapping
 from lerobot_openspm.errors import DatasetError
 from lerobot_openspm.memory.compose import sub_task_index
 from lerobot_openspm.memory.entry import (
-    CONTACT_PHASES,
     Anchor,
     Axis,
     MemoryEntry,
@@ -17,6 +16,7 @@ from lerobot_openspm.memory.entry import (
 )
 from lerobot_openspm.mining.anchors import Demonstration, Role, roles
 from lerobot_openspm.mining.mined import MinedDataset, MinedTask
+from lerobot_openspm.mining.not_learned import list_not_learned, missing_objects
 
 logger = logging.getLogger(__name__)
 
@@ -29,10 +29,11 @@ def build_entries(mined: MinedDataset) -> tuple[MemoryEntry, ...]:
     """
     entries = tuple(entry for task in mined.tasks for entry in task_entries(task, mined.name))
     if not entries:
+        why = "; ".join(f"{one.name!r}: {one.reason}" for one in list_not_learned(mined))
         raise DatasetError(
             f"dataset {mined.name} has key poses in {len(mined.episodes)} episodes, but the objects "
             "they belong to were found in none; check --policy.cameras, or record with the hand out of view "
-            "at the start"
+            f"at the start. What could not be learned: {why}"
         )
     return entries
 
@@ -44,12 +45,13 @@ def task_entries(task: MinedTask, source: str) -> tuple[MemoryEntry, ...]:
     for item, demonstration, axes, quality, outcomes in zip(
         task.episodes, task.aligned, task.axes, task.qualities, task.outcomes, strict=True
     ):
-        key_poses = _remember(demonstration, task.anchors, axes, len(sub_tasks))
-        if key_poses is None:
+        if missing := missing_objects(demonstration, task):
             logger.warning(
-                "skipping episode %d of %s: its anchors were not found", item.episode.index, source
-            )
+                "skipping episode %d of %s: it handles %s, which is not found",
+                item.episode.index, source, " and ".join(map(repr, sorted(missing))),
+            )  # fmt: skip
             continue
+        key_poses = _remember(demonstration, task.anchors, axes, len(sub_tasks))
         key = RetrievalKey(sub_tasks, tuple(pose.phase for pose in key_poses))
         where = f"{source}#{item.episode.index}"
         poses = {name: T for name, T in demonstration.object_poses.items() if name in named}
@@ -65,15 +67,13 @@ def _remember(
     anchors: Mapping[Role, Anchor],
     axes: Mapping[Role, Axis],
     n_sub_tasks: int,
-) -> tuple[MemoryKeyPose, ...] | None:
-    """Express key poses in their anchors' frames; None if a contact's anchor was not found."""
+) -> tuple[MemoryKeyPose, ...]:
+    """Express key poses in their anchors' frames, as far as these were found."""
     kept = []
     for role, pose in zip(roles(demonstration.key_poses), demonstration.key_poses, strict=True):
         anchor = anchors.get(role)
         T_obj_ee = None if anchor is None else demonstration.in_frame(anchor, pose)
         if anchor is None or T_obj_ee is None:
-            if pose.phase in CONTACT_PHASES:
-                return None
             continue
         kept.append(
             MemoryKeyPose(

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass, field
 
 from lerobot_openspm.geometry.camera import Camera
 from lerobot_openspm.geometry.se3 import Array
@@ -85,6 +85,8 @@ class MinedDataset(MinedKeyPoses):
         objects: Models of the objects by name.
         object_poses: Per episode, ``T_world_obj`` ``(4, 4)`` of the objects found in its first frame.
         tasks: The episodes by instruction, with their anchors.
+        unlearned: By name, why objects that the hand touched could not be learned.
+        surfaces: Names of what things stand on everywhere; nobody learns it.
         simulator_objects: Objects in the order of the simulator's pose vector (oracle ablation only).
     """
 
@@ -92,4 +94,6 @@ class MinedDataset(MinedKeyPoses):
     objects: Mapping[str, KnownObject]
     object_poses: tuple[Mapping[str, Array], ...]
     tasks: tuple[MinedTask, ...]
+    unlearned: Mapping[str, str] = field(default_factory=dict[str, str])
+    surfaces: Collection[str] = ()
     simulator_objects: tuple[str, ...] = ()

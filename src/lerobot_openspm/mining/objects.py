@@ -13,6 +13,7 @@ from typing import Literal
 import numpy as np
 from tqdm import tqdm
 
+from lerobot_openspm.geometry import se3
 from lerobot_openspm.geometry.camera import Camera
 from lerobot_openspm.geometry.se3 import Array
 from lerobot_openspm.memory.entry import CONTACT_PHASES
@@ -41,6 +42,10 @@ logger = logging.getLogger(__name__)
 FILMED_PER_TASK, FILM_STEP = 3, 4
 # The hand may touch an object so many frames before the motion to a contact begins.
 FRAMES_BEFORE_CONTACT = 4
+# What the hand takes hold of or pushes has its surface within this distance of the hand, seen from above.
+TOUCH_M = 0.08
+# Where one of these is said, the hand lets go above the landmark.
+UPON = ("on", "in", "at")
 # A pushed object's final pose counts from this confidence on.
 MIN_END_CONFIDENCE = 0.8
 
@@ -101,11 +106,13 @@ class FoundObjects:
         models: The models.
         poses: Per episode, the poses in its first frame.
         ends: Per episode, the final poses of the objects that it moved.
+        unlearned: By name, why objects that the hand touched could not be learned.
     """
 
     models: dict[str, KnownObject]
     poses: list[dict[str, Array]]
     ends: list[dict[str, Array]]
+    unlearned: dict[str, str]
 
 
 def find_objects(
@@ -129,22 +136,20 @@ def find_objects(
         shapes: Measures objects, for shape "sam3d".
     """
     named = sorted({cue.name for scene in scenes for cue in scene.cues} - set(known))
-    models = dict(known)
+    models, unlearned = dict(known), dict[str, str]()
     if named:
         logger.info("learning what these look like: %s", ", ".join(named))
-        learned = learn_objects(scenes, rng, known.values(), segmenter, shape, shapes)
+        learned, unlearned = learn_objects(scenes, rng, known.values(), segmenter, shape, shapes)
         models |= learned
-        if missing := [name for name in named if name not in learned]:
-            logger.warning("could not learn what %s looks like; no key pose will be anchored there", missing)
     found, ends = [], []
     for scene, item in tqdm(zip(scenes, mined, strict=True), "Finding objects", len(scenes), unit="episode"):
         wanted = dict.fromkeys(name for sub_task in item.sub_tasks for name in sub_task.objects)
         sought = {name: models[name] for name in wanted if name in models}
         estimates = detect(scene.views, sought, segmenter)
-        places = {name: _place(name, estimate, scene.cues) for name, estimate in estimates.items()}
+        places = {name: place_touched(models[name], one, scene.cues) for name, one in estimates.items()}
         found.append({name: T for name, T in places.items() if T is not None})
         ends.append(_ends(scene, item, found[-1], models, segmenter))
-    return FoundObjects(models, found, ends)
+    return FoundObjects(models, found, ends, unlearned)
 
 
 def _ends(
@@ -165,15 +170,28 @@ def _ends(
     return {**carried, **{name: estimate.T_world_obj for name, estimate in sure.items()}}
 
 
-def _place(name: str, estimate: PoseEstimate, touched: Sequence[ContactCue]) -> Array | None:
-    """Pose of an object; of several that look alike, that of the one the hand went to. None if unknown."""
-    points = [cue.point_world[:2] for cue in touched if cue.name == name]
-    if estimate.status == "not_found" or (estimate.status == "ambiguous" and not points):
+def place_touched(model: KnownObject, estimate: PoseEstimate, touched: Sequence[ContactCue]) -> Array | None:
+    """Pose of an object in a first frame; of several that look alike, that of the one the hand went to.
+
+    Args:
+        model: The object.
+        estimate: Where one or several such objects are seen.
+        touched: Where the demonstration touched what; only its first touch is of what the first frame shows.
+
+    Returns:
+        ``T_world_obj`` ``(4, 4)``. None if it is not known, or if the hand took hold of something elsewhere.
+    """
+    cue = next((one for one in touched if one.name == model.name), None)
+    if estimate.status == "not_found" or (estimate.status == "ambiguous" and cue is None):
         return None
-    if not estimate.others or not points:
+    if cue is None:
         return estimate.T_world_obj
     places = (estimate.T_world_obj, *estimate.others)
-    return min(places, key=lambda T: float(np.linalg.norm(np.asarray(points) - T[:2, 3], axis=1).min()))
+    points = np.asarray(model.points, float) if len(model.points) else np.zeros((1, 3))
+    gaps = [np.linalg.norm(se3.apply(T, points)[:, :2] - cue.point_world[:2], axis=1).min() for T in places]
+    nearest = int(np.argmin(gaps))
+    is_elsewhere = cue.kind != "release" and len(model.points) > 0 and gaps[nearest] > TOUCH_M
+    return None if is_elsewhere else places[nearest]
 
 
 def simulator_poses(
@@ -209,7 +227,7 @@ def contact_cues(item: MinedEpisode) -> tuple[ContactCue, ...]:
         sub_task = sub_task_of(pose, item.sub_tasks)
         if pose.phase == "grasp":
             add(sub_task.target, pose, "grasp")
-        elif pose.phase == "release" and sub_task.relation and not sub_task.part:
+        elif pose.phase == "release" and sub_task.relation in UPON and not sub_task.part:
             # With a part, the release is inside a drawer that was shut in the first frame.
             add(sub_task.landmark, pose, "release")
     for before, pose in pairwise(item.key_poses):

@@ -147,10 +147,11 @@ class DatasetProcessor:
                 self.demonstrations, found.episodes, objects.models
             )
         yaw_periods = {name: model.yaw_period for name, model in objects.models.items()}
-        tasks = compare(found.episodes, poses, ends, yaw_periods)
+        surfaces = self._options.lexicon.surfaces
+        tasks = compare(found.episodes, poses, ends, yaw_periods, surfaces)
         return MinedDataset(
             **vars(found), cameras=cameras, objects=objects.models, object_poses=tuple(poses), tasks=tasks,
-            simulator_objects=simulator_objects,
+            unlearned=objects.unlearned, surfaces=surfaces, simulator_objects=simulator_objects,
         )  # fmt: skip
 
     def key_poses(self, held_out: bool = False) -> MinedKeyPoses:
@@ -247,6 +248,7 @@ def compare(
     object_poses: Sequence[Mapping[str, Array]],
     ends: Sequence[Mapping[str, Array]],
     yaw_periods: Mapping[str, float],
+    surfaces: Collection[str] = (),
 ) -> tuple[MinedTask, ...]:
     """Compare the demonstrations of each task: anchors, axes, outcomes, and how closely they agree.
 
@@ -255,6 +257,7 @@ def compare(
         object_poses: For each, ``T_world_obj`` ``(4, 4)`` of the objects found in its first frame.
         ends: For each, the final poses of the objects that it moved.
         yaw_periods: Rotational symmetry of each object about its vertical axis, radians.
+        surfaces: Names of what things stand on everywhere, such as the table.
     """
     by_task: dict[str, list[int]] = defaultdict(list)
     for i, item in enumerate(episodes):
@@ -264,7 +267,7 @@ def compare(
         own, sub_tasks = tuple(episodes[i] for i in members), episodes[members[0]].sub_tasks
         found = [Demonstration(episodes[i].key_poses, object_poses[i]) for i in members]
         aligned = align_symmetric(found, yaw_periods)
-        anchors = consensus(aligned, sub_tasks)
+        anchors = consensus(aligned, sub_tasks, surfaces)
         tasks.append(
             MinedTask(
                 episodes=own,

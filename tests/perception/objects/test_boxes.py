@@ -193,19 +193,20 @@ def test_something_quite_different_is_not_found(models, unseen):
     assert localise(views, models["block"], huge).status == "not_found"
 
 
-def test_what_is_never_seen_near_the_hints_is_left_out(scenes, caplog):
+def test_what_is_never_seen_near_the_hints_is_left_out(scenes):
     away = [
         replace(s, cues=tuple(replace(h, point_world=h.point_world + np.array([0, 0.5, 0])) for h in s.cues))
         for s in scenes
     ]
-    assert learn_boxes(examples(["block"], away, (), segmenter(), "box")) == {}
-    assert "no mask of 'block' near where the hand touched it" in caplog.text
+    learned = learn_objects(away, np.random.default_rng(0), segmenter=segmenter(), source="box")
+    assert learned.models == {}
+    assert "the segmenter shows it in no picture" in learned.left_out["block"]
 
 
 def test_learning_chooses_by_segmenter_and_shape(scenes, unseen):
-    boxes = learn_objects(scenes, np.random.default_rng(0), segmenter=segmenter(), source="box")
+    boxes = learn_objects(scenes, np.random.default_rng(0), segmenter=segmenter(), source="box").models
     assert {name: type(model) for name, model in boxes.items()} == dict.fromkeys(NAMES, BoxModel)
-    shapes = learn_objects(scenes, np.random.default_rng(0), segmenter=segmenter())
+    shapes = learn_objects(scenes, np.random.default_rng(0), segmenter=segmenter()).models
     for name, model in shapes.items():
         assert isinstance(model, ShapeModel)
         assert model.log_odds is None, name

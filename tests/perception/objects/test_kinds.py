@@ -50,7 +50,7 @@ def marker(monkeypatch):
 
 def test_a_new_kind_is_learned_found_and_kept(marker):
     scene = demonstration(np.random.default_rng(0))
-    objects = learn_objects([scene], np.random.default_rng(0))
+    objects = learn_objects([scene], np.random.default_rng(0)).models
     assert objects == {name: Marker(name, 0.5) for name in ("block", "cup")}
     assert detect(scene.views, objects)["cup"].T_world_obj[0, 3] == 0.5
     assert store.from_parts(*store.to_parts(objects["cup"]), "here") == objects["cup"]
@@ -76,6 +76,6 @@ def test_kinds_learn_in_turn_what_those_before_them_left(marker, monkeypatch):
 
     monkeypatch.setitem(KINDS, "patches", replace(KINDS["patches"], learn=learn_cups))
     monkeypatch.setitem(KINDS, "box", replace(KINDS["box"], learn=learn_rest))
-    learned = learn_objects([demonstration(np.random.default_rng(0))], np.random.default_rng(0))
+    learned = learn_objects([demonstration(np.random.default_rng(0))], np.random.default_rng(0)).models
     assert asked == {"before": ["block", "cup"], "after": ["block"]}
     assert learned["cup"] == Marker("cup", 0.1)

@@ -77,7 +77,7 @@ def test_what_often_hides_a_part_does_not_shrink_the_shape():
         dataclasses.replace(scene, cues=tuple(cue for cue in scene.cues if cue.name == "block"))
         for scene in hidden
     ]
-    block = learn_objects(scenes, np.random.default_rng(0))["block"]
+    block = learn_objects(scenes, np.random.default_rng(0)).models["block"]
     half = np.sort(np.abs(block.points[:, :2]).max(axis=0))[::-1] + block.spacing / 2
     assert half == pytest.approx(SHAPES["block"][0], abs=0.008)
 

@@ -42,7 +42,7 @@ def demonstration(rng):
 @pytest.fixture(scope="module")
 def models():
     rng = np.random.default_rng(1)
-    return learn_objects([demonstration(rng) for _ in range(8)], np.random.default_rng(0))
+    return learn_objects([demonstration(rng) for _ in range(8)], np.random.default_rng(0)).models
 
 
 @pytest.fixture(scope="module")

@@ -6,6 +6,7 @@ A kind is one folder with a class that is a :class:`KnownObject` and a :class:`K
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable, Collection, Hashable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, Protocol
@@ -20,6 +21,8 @@ from lerobot_openspm.geometry.camera import project
 from lerobot_openspm.geometry.se3 import Array
 from lerobot_openspm.perception.foreground import Bins, lab_bins
 from lerobot_openspm.types import DemonstrationScene, Mask, PoseEstimate, Segmentation, Segmenter, Shape, View
+
+logger = logging.getLogger(__name__)
 
 # Fingers close above the plane that objects stand on; where nothing else tells it, it is taken to lie this
 # far below the lowest point that they ever went to, metres.
@@ -241,6 +244,7 @@ class Examples:
         segmenter: Finds the objects' masks; None where the demonstrations teach their looks.
         source: What a segmenter's masks are to teach.
         shapes: Tells the sizes of objects, for source "sam3d".
+        left_out: By name, why objects could not be learned; the kinds write it with :meth:`leave_out`.
     """
 
     names: Sequence[str]
@@ -250,6 +254,12 @@ class Examples:
     segmenter: Segmenter | None = None
     source: Shape = "demonstrations"
     shapes: ShapeBackend | None = None
+    left_out: dict[str, list[str]] = field(default_factory=dict[str, list[str]])
+
+    def leave_out(self, name: str, why: str) -> None:
+        """Say why a kind cannot learn an object; another kind may still learn it."""
+        logger.info("perception: %r: %s", name, why)
+        self.left_out.setdefault(name, []).append(why)
 
     @property
     def floor(self) -> float:
@@ -263,7 +273,8 @@ class Kind:
 
     Attributes:
         name: As it is called in records.
-        learn: Learns from examples the objects that this kind can represent, and leaves the others out.
+        learn: Learns from examples the objects that this kind can represent. Of those that it tried in vain
+            it says why, with :meth:`Examples.leave_out`.
         from_record: The object of a record's fields and arrays, all of them checked; the last argument names
             their origin in a MemoryFormatError.
     """

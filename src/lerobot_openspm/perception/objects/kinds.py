@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Sequence
 from dataclasses import replace
+from typing import NamedTuple
 
 from numpy.random import Generator
 
@@ -15,8 +16,21 @@ from lerobot_openspm.perception.objects.shape.learn import SHAPE
 from lerobot_openspm.perception.objects.surface.learn import SURFACE
 from lerobot_openspm.types import DemonstrationScene, Segmenter, Shape
 
+UNTRIED = "no kind of object fits what was asked for"
 # In the order in which they are asked to learn: each gets the objects that those before it left.
 KINDS = {kind.name: kind for kind in (SURFACE, PATCHES, SHAPE, BOX)}
+
+
+class LearnedObjects(NamedTuple):
+    """What learning makes of contact cues.
+
+    Attributes:
+        models: Objects by name.
+        left_out: By name, why the others could not be learned.
+    """
+
+    models: dict[str, KnownObject]
+    left_out: dict[str, str]
 
 
 def learn_objects(
@@ -26,7 +40,7 @@ def learn_objects(
     segmenter: Segmenter | None = None,
     source: Shape = "demonstrations",
     shapes: ShapeBackend | None = None,
-) -> dict[str, KnownObject]:
+) -> LearnedObjects:
     """Learn every object that some scene's contact cues name and that is not known.
 
     Args:
@@ -37,10 +51,6 @@ def learn_objects(
         source: With a segmenter, "box" learns the boxes around the objects and "demonstrations" their shapes;
             without one, there is only the latter. "sam3d" learns boxes of the sizes that `shapes` tells.
         shapes: Tells the sizes of objects, for "sam3d".
-
-    Returns:
-        Objects by name. One that cannot be learned (never visible, no consistent colour) is left out, and the
-        log says so.
 
     Raises:
         DatasetError: No scene has a contact cue.
@@ -56,4 +66,5 @@ def learn_objects(
     for kind in KINDS.values():
         left = [name for name in names if name not in learned]
         learned |= kind.learn(replace(examples, names=left))
-    return learned
+    why = {name: examples.left_out.get(name, [UNTRIED]) for name in names if name not in learned}
+    return LearnedObjects(learned, {name: "; ".join(dict.fromkeys(told)) for name, told in why.items()})

@@ -65,7 +65,7 @@ def demonstration(rng):
 @pytest.fixture(scope="module")
 def models():
     rng = np.random.default_rng(1)
-    return learn_objects([demonstration(rng) for _ in range(6)], np.random.default_rng(0))
+    return learn_objects([demonstration(rng) for _ in range(6)], np.random.default_rng(0)).models
 
 
 def test_what_hardly_moves_and_was_filmed_is_known_by_its_surface(models):
@@ -205,7 +205,7 @@ def test_nothing_is_learned_of_surfaces_without_a_camera_in_the_hand():
         )
         for scene in scenes
     ]
-    learned = learn_objects(fixed, np.random.default_rng(0))
+    learned = learn_objects(fixed, np.random.default_rng(0)).models
     assert not any(isinstance(model, SurfaceModel) for model in learned.values())
 
 

@@ -70,7 +70,7 @@ def learn_boxes(examples: Examples) -> dict[str, BoxModel]:
     """Learn the boxes of objects from where their demonstrations' first frames show them.
 
     The outlines of all an object's masks tell its size; for source "sam3d" the shape backend does, from the
-    view that shows the object largest. One that is seen in no demonstration is left out, and the log says so.
+    view that shows the object largest. One that is seen in no demonstration is left out.
     """
     if examples.segmenter is None or examples.source == "demonstrations":
         return {}
@@ -80,7 +80,7 @@ def learn_boxes(examples: Examples) -> dict[str, BoxModel]:
         if kept := [one for one in ones if one is not None]:
             seen[name] = kept
         else:
-            log.warning("perception: no mask of %r near where the hand touched it", name)
+            examples.leave_out(name, "the segmenter shows it in no picture where the hand touched it")
     if examples.shapes is None:
         trials = {name: _from_outlines(name, ones, floor) for name, ones in seen.items()}
     else:

@@ -53,6 +53,9 @@ SAME_MOTION_SHARE = 0.3
 TURN_DEG, TURN_GAIN, TURN_SHARE = 10.0, 0.01, 0.25
 REFERENCES = 5
 MAX_PROBES = 4
+# Why an object that hardly moves could not be learned.
+UNFOLLOWED = "nothing where the hand touched it looks alike in its other demonstrations"
+ELSEWHERE = "what moves where the hand touched it turns, or is another object"
 MIN_STD_M = 5e-4
 
 
@@ -111,6 +114,8 @@ def learn_patches(examples: Examples) -> dict[str, PatchModel]:
         models = (_model(one.name, group, one.scenes) for group in free)
         if model := next((model for model in models if model is not None), None):
             learned[one.name] = model
+        else:
+            examples.leave_out(one.name, ELSEWHERE if one.groups else UNFOLLOWED)
     return learned
 
 

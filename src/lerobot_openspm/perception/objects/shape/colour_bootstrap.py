@@ -28,6 +28,10 @@ CHANGED_LEVELS = 25
 ROUNDS = 5
 PRESENCE = 0.55
 MIN_ENCLOSED = 4
+# Of two like objects the cameras see one at most so many times as large as the other, in pixels.
+ALIKE = 4.0
+# Among like objects, a colour of theirs is so many times as dense where the hand touched as elsewhere.
+DENSER = 3.0
 
 
 @dataclass(frozen=True)
@@ -83,11 +87,19 @@ def changed_pixels(first: View, later: View) -> Mask | None:
     return difference > CHANGED_LEVELS
 
 
-def learn_colours(pictures: Sequence[Picture]) -> NDArray[np.float32]:
-    """Log-odds ``(N_BINS,)`` per colour of the object that the pictures' cues touch."""
+def learn_colours(pictures: Sequence[Picture], among_others: bool = False) -> NDArray[np.float32]:
+    """Log-odds ``(N_BINS,)`` per colour of the object that the pictures' cues touch.
+
+    Args:
+        pictures: The pictures.
+        among_others: Whether others just like it may be in them, which are no evidence against its colours.
+    """
     regions = [picture.seed() for picture in pictures]
     outsides = [~(picture.neutral() | region) for picture, region in zip(pictures, regions, strict=True)]
-    log_odds = _evidence(pictures, regions, outsides)
+    near, far = (sum(int(mask.sum()) for mask in masks) for masks in (regions, outsides))
+    # By density: the whole of another such object has far more pixels than the seeds within this one.
+    weight = DENSER * near / far if among_others and far else 1.0
+    log_odds = _evidence(pictures, regions, outsides, weight)
     for _ in range(ROUNDS):
         regions, outsides = [], []
         for picture in pictures:
@@ -98,9 +110,21 @@ def learn_colours(pictures: Sequence[Picture]) -> NDArray[np.float32]:
                 else grow(blob.mask, 1 + 0.2 * blob.area**0.5)
             )
             regions.append(region)
-            outsides.append(~grow(region, 2) if region.any() else region)
+            own = region
+            if among_others and blob is not None:
+                own = region | _alike(picture, log_odds, blob)
+            outsides.append(~grow(own, 2) if region.any() else region)
         log_odds = _evidence(pictures, regions, outsides)
     return log_odds
+
+
+def _alike(picture: Picture, log_odds: NDArray[np.float32], blob: Blob) -> Mask:
+    """Pixels ``(H, W)`` of patches that have a patch's colours and about its size."""
+    mask = np.zeros(picture.bins.shape, bool)
+    for other in find_blobs(foreground.probability(picture.bins, log_odds), 8, 6):
+        if 1 / ALIKE < other.area / blob.area < ALIKE:
+            mask |= grow(other.mask, 1 + 0.2 * other.area**0.5)
+    return mask
 
 
 def hinted_blob(picture: Picture, log_odds: NDArray[np.float32]) -> Blob | None:
@@ -141,8 +165,9 @@ def hiding_pixels(
 
 
 def _evidence(
-    pictures: Sequence[Picture], regions: Sequence[Mask], outsides: Sequence[Mask]
+    pictures: Sequence[Picture], regions: Sequence[Mask], outsides: Sequence[Mask], weight: float = 1.0
 ) -> NDArray[np.float32]:
+    """Log-odds ``(N_BINS,)`` of what is inside; what is outside counts by a weight."""
     inside = [
         foreground.histogram(p.bins[region])
         for p, region in zip(pictures, regions, strict=True)
@@ -151,4 +176,4 @@ def _evidence(
     outside = sum(foreground.histogram(p.bins[mask]) for p, mask in zip(pictures, outsides, strict=True))
     if not inside:
         return np.full(foreground.N_BINS, -foreground.MAX_LOG_ODDS, np.float32)
-    return foreground.evidence(inside, np.asarray(outside), PRESENCE)
+    return foreground.evidence(inside, weight * np.asarray(outside), PRESENCE)

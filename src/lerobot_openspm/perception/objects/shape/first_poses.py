@@ -65,6 +65,16 @@ def masked(name: str, scene: DemonstrationScene, floor: float, instances: Instan
     return group
 
 
+def why_nowhere(groups: Mapping[int, list[Patched]]) -> str:
+    """Why :func:`first_poses` finds no place."""
+    shown = max((sum(blob is not None for _, blob in group) for group in groups.values()), default=0)
+    if shown == 0:
+        return "nothing where the hand touched it stands out from what is around it, in any picture"
+    if shown == 1:
+        return "no two cameras show it at once"
+    return "the cameras disagree about where it is"
+
+
 def first_poses(groups: Mapping[int, list[Patched]]) -> tuple[list[Posed], float]:
     """Places from the patches' centres, at one height and yaw 0, and half the size of a cube around them."""
     places: dict[int, Array] = {}

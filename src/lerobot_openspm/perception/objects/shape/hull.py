@@ -19,6 +19,10 @@ from lerobot_openspm.perception.objects.shape.silhouette import bilinear
 VOXELS_PER_AXIS = 44
 
 
+class NoShapeError(Exception):
+    """A shape that no picture of any demonstration shows."""
+
+
 @dataclass(frozen=True)
 class Posed:
     """One scene's evidence with the object's pose ``(4, 4)`` in it."""

@@ -21,6 +21,7 @@ from lerobot_openspm.perception.objects.shape.first_poses import (
     first_poses,
     masked,
     pictures_of,
+    why_nowhere,
 )
 from lerobot_openspm.perception.objects.shape.fitting import (
     COARSE_CUTS_PX,
@@ -34,7 +35,7 @@ from lerobot_openspm.perception.objects.shape.fitting import (
     measure,
     score,
 )
-from lerobot_openspm.perception.objects.shape.hull import Posed, Votes
+from lerobot_openspm.perception.objects.shape.hull import NoShapeError, Posed, Votes
 from lerobot_openspm.perception.objects.shape.model import ShapeModel, from_record
 from lerobot_openspm.perception.objects.yaw import search_range, yaw_range
 from lerobot_openspm.types import DemonstrationScene, Segmenter
@@ -43,11 +44,9 @@ log = logging.getLogger(__name__)
 
 MAX_SCENES = 30
 REFERENCES = 2
-JUDGES = 6
-AXIS_JUDGES = 12
+JUDGES, AXIS_JUDGES = 6, 12
 NARROW_YAW = np.deg2rad(60)
-ROUNDS = 4
-SYMMETRY_ROUNDS = 2
+ROUNDS, SYMMETRY_ROUNDS = 4, 2
 THRESHOLDS = (0.5, 0.6, 0.7, 0.8, 0.9, 0.97)
 # A more symmetric shape is preferred if it explains the masks as well as this.
 SYMMETRY_LOSS = 0.006
@@ -72,7 +71,10 @@ def learn_shapes(examples: Examples) -> dict[str, ShapeModel]:
         found = _learn_masked(examples.names, examples.scenes, floor, examples.segmenter)
     else:
         found = {name: _learn_coloured(name, examples.scenes, floor, examples.rng) for name in examples.names}
-    return {name: model for name, model in found.items() if model is not None}
+    for name, why in found.items():
+        if isinstance(why, str):
+            examples.leave_out(name, why)
+    return {name: model for name, model in found.items() if not isinstance(model, str)}
 
 
 SHAPE = Kind(ShapeModel.kind, learn_shapes, from_record)
@@ -80,43 +82,49 @@ SHAPE = Kind(ShapeModel.kind, learn_shapes, from_record)
 
 def _learn_coloured(
     name: str, scenes: Sequence[DemonstrationScene], floor: float, rng: Generator
-) -> ShapeModel | None:
-    """Colours and shape of an object from scenes with contact cues; None, with a warning, if in vain."""
+) -> ShapeModel | str:
+    """Colours and shape of an object from scenes with contact cues; why not, if in vain."""
     with_cue = [i for i, scene in enumerate(scenes) if any(cue.name == name for cue in scene.cues)]
     if len(with_cue) > MAX_SCENES:
         with_cue = sorted(rng.choice(with_cue, MAX_SCENES, replace=False).tolist())
     pictures = [picture for i in with_cue for picture in pictures_of(i, name, scenes[i], floor)]
-    log_odds = colour_bootstrap.learn_colours(pictures)
-    return _learn_shape(name, log_odds, coloured(pictures, log_odds), len(with_cue))
+    if not any(picture.seed().any() for picture in pictures):
+        return "no camera sees where the hand touched it"
+    reasons: list[str] = []
+    for among_others in (False, True):  # a second object just like it hides its colours from the first way
+        log_odds = colour_bootstrap.learn_colours(pictures, among_others)
+        found = _learn_shape(name, log_odds, coloured(pictures, log_odds))
+        if isinstance(found, ShapeModel):
+            return found
+        reasons.append(found)
+    return reasons[0]
 
 
 def _learn_masked(
     names: Sequence[str], scenes: Sequence[DemonstrationScene], floor: float, segmenter: Segmenter
-) -> dict[str, ShapeModel | None]:
-    """Shapes of objects from a segmenter's masks."""
-    models: dict[str, ShapeModel | None] = {}
+) -> dict[str, ShapeModel | str]:
+    """Shapes of objects from a segmenter's masks; why not, where there are none."""
+    models: dict[str, ShapeModel | str] = {}
     for name, pairs in segmented(names, scenes, segmenter).items():
         groups = {i: masked(name, scene, floor, found) for i, (scene, found) in enumerate(pairs)}
-        models[name] = _learn_shape(name, None, groups, len(pairs))
+        models[name] = _learn_shape(name, None, groups)
     return models
 
 
 def _learn_shape(
-    name: str, log_odds: NDArray[np.float32] | None, groups: Mapping[int, list[Patched]], count: int
-) -> ShapeModel | None:
+    name: str, log_odds: NDArray[np.float32] | None, groups: Mapping[int, list[Patched]]
+) -> ShapeModel | str:
     posed, half_size = first_poses(groups)
     if not posed:
-        log.warning("perception: %r was not found near the cues of its %d demonstrations", name, count)
-        return None
-    found = _bootstrap(posed, half_size)
-    if found is None:
-        log.warning("perception: the masks of %r in %d demonstrations agree on no shape", name, len(posed))
-        return None
-    cloud, posed = found
-    return _model(name, log_odds, *_finish(posed, half_size, cloud))
+        return why_nowhere(groups)
+    try:
+        cloud, posed = _bootstrap(posed, half_size)
+        return _model(name, log_odds, *_finish(posed, half_size, cloud))
+    except NoShapeError:
+        return "what stands out where the hand touched it has another shape in every demonstration"
 
 
-def _bootstrap(posed: list[Posed], half_size: float) -> tuple[Cloud, list[Posed]] | None:
+def _bootstrap(posed: list[Posed], half_size: float) -> tuple[Cloud, list[Posed]]:
     """A first common shape: that of the scene whose own hull, turned and moved, explains the others best."""
     order = sorted(
         range(len(posed)), key=lambda i: -sum(bool((e.probability > 0.5).any()) for e in posed[i].evidence)
@@ -132,7 +140,7 @@ def _bootstrap(posed: list[Posed], half_size: float) -> tuple[Cloud, list[Posed]
         if best is None or total > best[0]:
             best = (total, cloud)
     if best is None:
-        return None
+        raise NoShapeError
     cloud = best[1]
     anyhow = [_fit_yaws(scene, cloud, yaws) for scene in posed]
     # What keeps to about one direction in every scene must not be turned for a trifle: a fixture that looks
@@ -290,7 +298,7 @@ def _refit(scene: Posed, cloud: Cloud, period: float) -> Fit:
 
 
 def _reliable(posed: Sequence[Posed], cloud: Cloud) -> list[Posed]:
-    """The scenes that fit well, without the views in which the object is hidden."""
+    """The scenes that fit well, without the views in which the object is hidden; at least one."""
     kept = []
     for scene in posed:
         overlaps = measure(scene.evidence, cloud, scene.T_world_obj)
@@ -298,7 +306,10 @@ def _reliable(posed: Sequence[Posed], cloud: Cloud) -> list[Posed]:
         good = [one for one, value in zip(scene.evidence, overlaps, strict=True) if value > CLEAR_VIEW * best]
         kept.append((best, Posed(tuple(good), scene.T_world_obj)))
     level = 0.8 * float(np.median([best for best, _ in kept]))
-    return [scene for best, scene in kept if best >= level and scene.evidence]
+    reliable = [scene for best, scene in kept if best >= level and scene.evidence]
+    if not reliable:
+        raise NoShapeError
+    return reliable
 
 
 def _fit_yaws(scene: Posed, cloud: Cloud, yaws: Array) -> Fit:

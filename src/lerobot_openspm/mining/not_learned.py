@@ -1,0 +1,56 @@
+"""What a dataset's demonstrations handle and could not teach, in how many of them, and why."""
+
+from __future__ import annotations
+
+from collections import Counter
+
+from lerobot_openspm.memory.not_learned import NotLearned, not_learned
+from lerobot_openspm.mining.anchors import Demonstration, contact_roles, roles, suggested_anchor
+from lerobot_openspm.mining.mined import MinedDataset, MinedTask
+
+
+def missing_objects(demonstration: Demonstration, task: MinedTask) -> frozenset[str]:
+    """The objects of a demonstration's contacts that it does not show; with any, it cannot be acted by."""
+    missing = set[str]()
+    touching = contact_roles(demonstration.key_poses)
+    for role, pose in zip(roles(demonstration.key_poses), demonstration.key_poses, strict=True):
+        if role not in touching:
+            continue
+        anchor = task.anchors.get(role)
+        needed = (suggested_anchor(pose, task.sub_tasks),) if anchor is None else anchor.objects
+        missing |= {name for name in needed if anchor is None or name not in demonstration.object_poses}
+    return frozenset(missing)
+
+
+def list_not_learned(mined: MinedDataset) -> tuple[NotLearned, ...]:
+    """The objects that could not be learned or found, then the instructions that are lost with them."""
+    handled, lost, instructions = Counter[str](), Counter[str](), list[NotLearned]()
+    for task in mined.tasks:
+        missing = [missing_objects(one, task) for one in task.aligned]
+        for demonstration, own in zip(task.aligned, missing, strict=True):
+            handled.update(_handled(demonstration, task) | own)
+            lost.update(own)
+        if all(missing):
+            named = " and ".join(map(repr, sorted(frozenset[str]().union(*missing))))
+            why = f"what they handle is not known: {named}"
+            instructions.append(not_learned("instruction", task.episodes[0].episode.task, len(missing), why))
+    found = frozenset[str]().union(*mined.object_poses)
+    objects: list[NotLearned] = []
+    for name, count in sorted(handled.items()):
+        if name in mined.surfaces:
+            continue
+        if name not in found and name in mined.unlearned:
+            objects.append(not_learned("object", name, count, mined.unlearned[name]))
+        elif lost[name] and name not in mined.objects and not mined.simulator_objects:
+            objects.append(not_learned("object", name, count, "the hand touches it in no demonstration"))
+        elif lost[name]:
+            why = f"its first picture does not show it clearly in {lost[name]} of them"
+            objects.append(not_learned("object", name, count, why))
+    return (*objects, *instructions)
+
+
+def _handled(demonstration: Demonstration, task: MinedTask) -> frozenset[str]:
+    """The objects that a demonstration's contacts belong to, as the instruction says."""
+    touching = contact_roles(demonstration.key_poses)
+    with_roles = zip(roles(demonstration.key_poses), demonstration.key_poses, strict=True)
+    return frozenset(suggested_anchor(pose, task.sub_tasks) for role, pose in with_roles if role in touching)

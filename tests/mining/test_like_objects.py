@@ -1,0 +1,80 @@
+"""Of several like objects in a first frame, the one that the demonstration took hold of is its object."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from numpy.testing import assert_array_equal
+from tests.memory.builders import robot
+from tests.mining.episodes import pick_and_place
+from tests.perception.builders import model, patch_model
+
+from lerobot_openspm.geometry import se3
+from lerobot_openspm.language.instruction import parse_instruction
+from lerobot_openspm.mining.key_poses import find_key_poses
+from lerobot_openspm.mining.mined import MinedEpisode
+from lerobot_openspm.mining.objects import contact_cues, place_touched
+from lerobot_openspm.types import ContactCue, PoseEstimate
+
+ANGLES = np.linspace(0, 2 * np.pi, 40, endpoint=False)
+RIM = np.column_stack([0.05 * np.cos(ANGLES), 0.05 * np.sin(ANGLES), np.full(40, 0.04)])
+BOWL = replace(model("bowl"), points=RIM.astype(np.float32))
+NEAR, FAR = se3.from_yaw([0.1, -0.2, 0.0], 0.3), se3.from_yaw([0.1, 0.1, 0.0], 0.0)
+
+
+def seen(*places, status=None):
+    status = status or ("ambiguous" if len(places) > 1 else "found")
+    return PoseEstimate(status, places[0], 1e-6 * np.eye(4), 1.0, others=tuple(places[1:]))
+
+
+def touch(T, *, kind="grasp", name="bowl", by=(0.0, 0.0)):
+    return ContactCue(name, np.array([*(T[:2, 3] + by), 0.03]), kind)
+
+
+@pytest.mark.parametrize("status", ["found", "ambiguous"])
+@pytest.mark.parametrize("places", [(NEAR, FAR), (FAR, NEAR), (FAR, se3.from_yaw([0.4, 0.4, 0], 0), NEAR)])
+@pytest.mark.parametrize("kind", ["grasp", "contact", "release"])
+def test_it_is_the_one_that_the_hand_went_to(places, status, kind):
+    found = place_touched(BOWL, seen(*places, status=status), (touch(NEAR, kind=kind),))
+    assert_array_equal(found, NEAR)
+
+
+@given(st.integers(0, 2), st.floats(-0.03, 0.03), st.floats(-0.03, 0.03))
+def test_whichever_of_three_is_grasped_anywhere_on_it_is_meant(meant, x, y):
+    places = [se3.from_yaw([0.15 * i, 0.1 * (i % 2), 0.0], 0.5 * i) for i in range(3)]
+    assert_array_equal(place_touched(BOWL, seen(*places), (touch(places[meant], by=(x, y)),)), places[meant])
+
+
+def test_only_the_first_touch_tells_where_it_stood_at_first():
+    again = touch(FAR)  # it was put down where another one stands, and taken again
+    assert_array_equal(place_touched(BOWL, seen(FAR, NEAR), (touch(NEAR), again)), NEAR)
+
+
+def test_other_objects_touches_tell_nothing():
+    assert place_touched(BOWL, seen(NEAR, FAR), (touch(NEAR, name="plate"),)) is None
+    assert_array_equal(place_touched(BOWL, seen(NEAR), ()), NEAR)
+
+
+def test_one_that_is_seen_where_the_hand_never_went_is_another_one():
+    assert place_touched(BOWL, seen(FAR), (touch(NEAR),)) is None
+    assert place_touched(BOWL, seen(FAR, status="not_found"), (touch(FAR),)) is None
+    # Where its shape is not known, nor is how far its middle is from the hand.
+    assert_array_equal(place_touched(patch_model("bowl"), seen(FAR), (touch(NEAR),)), FAR)
+
+
+@pytest.mark.parametrize(
+    ("relation", "touched"),
+    [
+        ("on", ["bowl", "plate"]),
+        ("in", ["bowl", "plate"]),
+        ("next to", ["bowl"]),
+        ("to the left of", ["bowl"]),
+    ],
+)
+def test_what_is_put_beside_a_thing_does_not_touch_it(relation, touched):
+    task = f"put the bowl {relation} the plate"
+    episode = pick_and_place()[0].episode(0, task)
+    item = MinedEpisode(episode, tuple(find_key_poses(episode, robot())), parse_instruction(task))
+    assert [cue.name for cue in contact_cues(item)] == touched

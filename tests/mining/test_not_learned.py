@@ -1,0 +1,68 @@
+"""A contact is anchored to what it belongs to, or to nothing."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from tests.memory.builders import hand_pose
+from tests.mining.test_anchors import GRASP, PLACE, SUB_TASKS, demonstrations, key_pose
+
+from lerobot_openspm.geometry import se3
+from lerobot_openspm.language.instruction import parse_instruction
+from lerobot_openspm.memory.entry import WORLD, Anchor
+from lerobot_openspm.mining.anchors import Demonstration, consensus, contact_roles
+
+
+def without(name: str, made: list[Demonstration], n_left: int = 0) -> list[Demonstration]:
+    """Demonstrations in which an object was found in the first few only."""
+    return [
+        replace(one, object_poses={k: T for k, T in one.object_poses.items() if k != name or i < n_left})
+        for i, one in enumerate(made)
+    ]
+
+
+@pytest.mark.parametrize("n", [1, 2, 3, 10])
+@pytest.mark.parametrize("seed", range(3))
+def test_a_grasp_of_what_is_not_known_belongs_to_nothing_else(n: int, seed: int):
+    anchors = consensus(without("bowl", demonstrations(n, WORLD, seed)), SUB_TASKS)
+    assert GRASP not in anchors
+    assert anchors[PLACE].place == "plate"
+
+
+def test_a_place_on_what_is_not_known_belongs_to_nothing_else():
+    anchors = consensus(without("plate", demonstrations(10)), SUB_TASKS)
+    assert set(anchors) == {GRASP}
+
+
+def test_a_grasp_of_what_was_rarely_found_is_kept_where_it_was_found():
+    anchors = consensus(without("bowl", demonstrations(10), n_left=2), SUB_TASKS)
+    assert anchors[GRASP] == Anchor("bowl", "bowl")
+
+
+def beside_the_plate(n: int, moves_m: float) -> list[Demonstration]:
+    """The hand grasps at a fixed pose from a plate that stands somewhere else in every demonstration."""
+    rng = np.random.default_rng(0)
+    made = []
+    for _ in range(n):
+        plate = se3.from_yaw([*(moves_m * rng.uniform(-1, 1, 2)), 0.0], 0.0)
+        made.append(Demonstration((key_pose("grasp", plate @ hand_pose(0, 0.1, 0.02)),), {"plate": plate}))
+    return made
+
+
+def test_demonstrations_may_show_that_it_goes_along_with_another_object():
+    assert consensus(beside_the_plate(6, 0.2), SUB_TASKS)[GRASP].place == "plate"
+    assert consensus(beside_the_plate(2, 0.2), SUB_TASKS) == {}  # two may agree by chance
+    assert consensus(beside_the_plate(6, 0.002), SUB_TASKS) == {}  # where nothing moves nothing is shown
+
+
+def test_what_is_put_on_the_table_is_put_relative_to_what_is_known():
+    sub_tasks = parse_instruction("put the bowl on the table")
+    made = without("plate", demonstrations(4, "bowl"))
+    assert PLACE not in consensus(made, sub_tasks)
+    assert consensus(made, sub_tasks, {"table"})[PLACE].place == "bowl"
+
+
+def test_where_a_push_begins_is_a_contact():
+    phases = ("approach", "approach", "push", "push", "retreat")
+    poses = [key_pose(phase, hand_pose(0, 0, 0.1), contact=0) for phase in phases]
+    assert contact_roles(poses) == {(0, "approach", 0), (0, "push", 0), (0, "push", 1)}
