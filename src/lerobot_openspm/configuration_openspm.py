@@ -138,7 +138,8 @@ class OpenSPMConfig(PreTrainedConfig):
             "quat" or "euler"; "none" ignores the rotation. Where the two differ, name them in the layouts.
         control_hz: Actions per second; the dataset's if not given. It tells how long things are out of sight.
         arm: URDF of the arm, from the world to the link ``ee``, the hand (see ``configs/arms``). Key poses
-            that its joints cannot reach are refused, grasps of round objects turned. A checkpoint carries it.
+            that its joints cannot reach are refused, grasps of symmetric objects turned. It is kept with
+            the checkpoint.
         hand_radius_m: Radius of the hand, in metres. It hides what is behind it, and keeps clear of objects.
         perception: What finds objects. "demonstrations": the colours and patches that the demonstrations
             showed. "sam3" and "grounded_sam2": pretrained segmenters that take any phrase. "given": the

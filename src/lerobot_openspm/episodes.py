@@ -64,7 +64,7 @@ def new_episode(
         names=names,
         points=memory.points,
         hand_radius_m=config.hand_radius_m,
-        middles=memory.middles,
+        symmetries=memory.symmetries,
     )
     fingerprint = observation.fingerprint()
     controller = EpisodeController(context, observation.instruction, fingerprint, config.noise_seed)

@@ -146,6 +146,19 @@ class Support:
 
 
 @dataclass(frozen=True)
+class Symmetry:
+    """How an object turns into itself: about a vertical axis of its frame.
+
+    Attributes:
+        middle: Where the axis is, x and y ``(2,)``, metres.
+        turn: The least angle that leaves its shape as it is, radians; 0 where any angle does.
+    """
+
+    middle: Array
+    turn: float
+
+
+@dataclass(frozen=True)
 class PoseEstimate:
     """Where an object is.
 

@@ -16,6 +16,7 @@ from lerobot_openspm.geometry import se3
 from lerobot_openspm.geometry.arm import load_arm
 from lerobot_openspm.memory.compose import Candidate
 from lerobot_openspm.perception.objects.box.model import BoxModel
+from lerobot_openspm.types import Symmetry
 
 HOME = hand_pose(0.0, 0.0, 0.3)
 RADIUS = 0.08
@@ -123,10 +124,10 @@ def panda(request):
     return load_arm(request.config.rootpath / LIBERO)
 
 
-def scene(panda, yaw, x=-0.1):
+def scene(panda, yaw, x=-0.1, turn=0.0):
     """A context with a Panda, poses of a bowl and a plate that were turned together, and the hand's."""
     poses = {"bowl": se3.from_yaw([x, 0.1, 0.9], yaw), "plate": se3.from_yaw([-0.05, -0.1, 0.9], yaw)}
-    context = planning_context(middles={"bowl": np.zeros(2)})
+    context = planning_context(symmetries={"bowl": Symmetry(np.zeros(2), turn)})
     own = robot(workspace=np.array([[-2.0, -2.0, 0.0], [2.0, 2.0, 2.0]]), arm=panda)
     return replace(context, robot=own), poses, hand_pose(-0.2, 0.0, 1.17)
 
@@ -149,6 +150,16 @@ def test_a_grasp_that_the_joints_cannot_reach_is_turned_about_a_round_object(pan
     plan = chosen(context, poses, home)
     assert plan.turned != 0
     assert not plan.problems(context, with_arm=True)
+
+
+@pytest.mark.parametrize(
+    ("turn", "expected"), [(np.pi, [0, 180]), (np.pi / 2, [0, 90, -90, 180]), (2.0, [0]), (None, [0])]
+)
+def test_grasps_are_turned_by_what_the_shape_allows(panda, turn, expected):
+    context, poses, home = scene(panda, 0.0, turn=turn)
+    if turn is None:
+        context = replace(context, symmetries={})
+    assert_allclose(np.rad2deg(Plan(context.entries[0], poses, home).turns(context)), expected)
 
 
 def test_a_grasp_within_reach_stays_as_shown(panda):

@@ -71,7 +71,7 @@ def test_the_shapes_of_objects_are_not_used_in_the_simulators_frames():
     assert set(known.points) == {"bowl", "cream cheese box", "rack", "mug"}  # the stove is known by patches
     oracle = a_memory(perception="oracle")
     assert oracle.points == {}
-    assert oracle.middles == {}
+    assert oracle.symmetries == {}
 
 
 def test_what_found_the_objects_is_remembered(tmp_path):

@@ -22,11 +22,12 @@ from lerobot_openspm.memory.compose import Candidate
 from lerobot_openspm.memory.entry import WORLD, MemoryEntry, MemoryKeyPose, Outcome, RetrievalKey
 from lerobot_openspm.memory.retrieval import Scored, retrieve
 from lerobot_openspm.memory.robot import RobotModel
-from lerobot_openspm.types import Execution, SubTask
+from lerobot_openspm.types import Execution, SubTask, Symmetry
 
 # An object this far from where the key poses took it to be takes them along; less is noise.
 MOVED_M, MOVED_RAD = 0.002, 0.05
-# Of the entries so many are tried, and grasps of round objects are turned by so much, radians.
+# Of the entries so many are tried, and grasps of objects that turn into themselves are turned by so much or
+# what their symmetry allows of it, radians.
 MAX_TRIED = 3
 TURNS = tuple(
     np.deg2rad([0, *(sign * turn for turn in range(30, 180, 30) for sign in (1, -1)), 180]).tolist()
@@ -50,8 +51,7 @@ class PlanningContext:
         names: Tells which names in an instruction mean the same thing.
         points: Points ``(n, 3)`` of each object's surface in its frame, where its shape is known.
         hand_radius_m: Radius of the hand, with which it keeps clear of other objects.
-        middles: Where the axis of each object is that looks alike from all sides: x and y ``(2,)`` in its
-            frame.
+        symmetries: How objects turn into themselves, of those that do.
     """
 
     entries: Sequence[MemoryEntry]
@@ -64,7 +64,7 @@ class PlanningContext:
     names: NameSimilarity = TABLE_NAMES
     points: Mapping[str, Array] = field(default_factory=dict[str, Array])
     hand_radius_m: float = 0.0
-    middles: Mapping[str, Array] = field(default_factory=dict[str, Array])
+    symmetries: Mapping[str, Symmetry] = field(default_factory=dict[str, Symmetry])
 
     def __deepcopy__(self, memo: dict[int, object]) -> PlanningContext:
         """Itself: nothing here ever changes, and the memory may be large."""
@@ -96,7 +96,7 @@ class PlanningContext:
         return tuple(retrieve(semantic, lambda entry: geometric[id(entry)], self.names))
 
     def choose(self, ranked: Sequence[Scored], object_poses: Mapping[str, Array], T_world_ee: Array) -> Plan:
-        """The best entry that the arm can follow, grasps of round objects turned as little as needed.
+        """The best entry that the arm can follow, its grasps turned by an object's symmetry if need be.
 
         Where none of the first can be followed, the best one as it is.
         """
@@ -105,7 +105,7 @@ class PlanningContext:
             return first
         for entry in (one.entry for one in ranked[:MAX_TRIED] if one.geometric > 0):
             plan = replace(first, entry=entry)
-            for radians in TURNS if plan.round_grasps(self) else TURNS[:1]:
+            for radians in plan.turns(self):
                 turned = replace(plan, turned=radians)
                 if not turned.problems(self, with_arm=True):
                     return turned
@@ -132,7 +132,8 @@ class Plan:
         object_poses: Poses ``T_world_obj`` ``(4, 4)`` that the key poses are carried over by. For what the
             hand has touched they are those from before.
         T_world_ee: The hand's pose ``(4, 4)`` where the plan begins.
-        turned: How far the hand is turned about the axis of round objects that it grasps, radians.
+        turned: How far the hand is turned about the axis of objects that it grasps, which turn into
+            themselves by that, radians.
     """
 
     entry: MemoryEntry
@@ -149,16 +150,25 @@ class Plan:
         """The key poses in the scene; see :func:`transfer`. Those after sub-task `last` are left out."""
         entry = self.entry if last is None else until(self.entry, last)
         turns = {
-            sub_task: Turn(self.object_poses[name], context.middles[name], self.turned)
-            for sub_task, name in self.round_grasps(context).items()
+            sub_task: Turn(self.object_poses[name], context.symmetries[name].middle, self.turned)
+            for sub_task, name in self.symmetric_grasps(context).items()
             if self.turned and name in self.object_poses
         }
         return transfer(entry, self.object_poses, context.yaw_periods, self.T_world_ee, gone, turns)
 
-    def round_grasps(self, context: PlanningContext) -> dict[int, str]:
-        """Round objects that are grasped, by sub-task."""
+    def symmetric_grasps(self, context: PlanningContext) -> dict[int, str]:
+        """Objects that are grasped and turn into themselves, by sub-task."""
         grasps = (pose for pose in self.entry.key_poses if pose.phase == "grasp")
-        return {p.sub_task: p.anchor.place for p in grasps if p.anchor.place in context.middles}
+        return {p.sub_task: p.anchor.place for p in grasps if p.anchor.place in context.symmetries}
+
+    def turns(self, context: PlanningContext) -> list[float]:
+        """By how much its grasps may be turned, the least first, radians; none but 0 without a symmetry."""
+        least = [context.symmetries[name].turn for name in self.symmetric_grasps(context).values()]
+        return [
+            radians
+            for radians in TURNS
+            if radians == 0 or (least and all(turn == 0 or _is_multiple(radians, turn) for turn in least))
+        ]
 
     def problems(self, context: PlanningContext, with_arm: bool = False) -> list[str]:
         """What keeps the hand from following the plan, in words; with what the arm's joints say, if asked."""
@@ -245,3 +255,8 @@ def _is_met(outcome: Outcome, poses: Mapping[str, Array], yaw_periods: Mapping[s
 
 # Before the first plan: nothing is done, nowhere.
 NO_PLAN = Plan(MemoryEntry(RetrievalKey((), ()), "", (), 0.0, 0, ""), {}, np.eye(4))
+
+
+def _is_multiple(radians: float, turn: float) -> bool:
+    """Whether an angle is some turns, to a degree."""
+    return abs(radians / turn - round(radians / turn)) * turn < np.deg2rad(1)

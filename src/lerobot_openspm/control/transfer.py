@@ -70,7 +70,7 @@ class PushPath:
 
 @dataclass(frozen=True)
 class Turn:
-    """A round object is grasped from another side than it was shown.
+    """An object that turns into itself is grasped from another side than it was shown.
 
     Attributes:
         T_world_obj: Where it stands ``(4, 4)``.
@@ -127,7 +127,7 @@ def transfer(
         yaw_periods: Angle by object that turns it into itself, radians; 0 for a body of revolution.
         T_world_ee: Present hand pose ``(4, 4)``.
         gone: How far a drawer or a knob has moved already, by sub-task, metres or radians.
-        turns: By how much the grasp of a round object is turned about its axis, by sub-task.
+        turns: By how much the grasp of an object is turned about its axis of symmetry, by sub-task.
     """
     chosen: dict[str, Array] = {}
     targets: list[Target] = []
@@ -161,7 +161,7 @@ def transfer(
 
 
 def _turned(targets: Sequence[Target], sub_task: int, turn: Turn) -> list[Target]:
-    """Key poses that grasp a round object turned about its axis, and put it where they would have put it.
+    """Key poses that grasp an object turned about its axis, and put it where they would have put it.
 
     The hand turns about the axis where it stands, and from the grasp on where the hand has carried it to.
     """

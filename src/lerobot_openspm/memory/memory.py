@@ -18,6 +18,7 @@ from lerobot_openspm.memory.not_learned import NotLearned, still_not_learned
 from lerobot_openspm.memory.quality import with_success
 from lerobot_openspm.memory.robot import RobotModel
 from lerobot_openspm.perception.objects.base import KnownObject
+from lerobot_openspm.types import Symmetry
 
 Layouts = tuple[VectorLayout, VectorLayout]
 
@@ -69,15 +70,15 @@ class Memory:
         return {name: own for name, own in points.items() if len(own)}
 
     @property
-    def middles(self) -> dict[str, Array]:
-        """Where the axis of each object is that looks alike from all sides: x and y ``(2,)`` in its frame.
+    def symmetries(self) -> dict[str, Symmetry]:
+        """How each object turns into itself, of those that do.
 
         None with the oracle, as with :attr:`points`.
         """
         if self.perception == "oracle":
             return {}
-        middles = {name: model.middle for name, model in self.objects.items()}
-        return {name: middle for name, middle in middles.items() if middle is not None}
+        symmetries = {name: model.symmetry for name, model in self.objects.items()}
+        return {name: one for name, one in symmetries.items() if one is not None}
 
     def appended(self, newer: Memory) -> Memory:
         """This memory with the entries of another one added.

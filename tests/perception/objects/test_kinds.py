@@ -24,7 +24,7 @@ class Marker:
     height: float = 0.0
     yaw_period: float = 0.0
     points = np.zeros((0, 3))
-    middle = None
+    symmetry = None
 
     def localise(self, look):
         return PoseEstimate("found", se3.from_yaw([self.place, 0, 0], 0.0), np.eye(4), 1.0)

@@ -20,7 +20,16 @@ from lerobot_openspm.geometry import se3
 from lerobot_openspm.geometry.camera import project
 from lerobot_openspm.geometry.se3 import Array
 from lerobot_openspm.perception.foreground import Bins, lab_bins
-from lerobot_openspm.types import DemonstrationScene, Mask, PoseEstimate, Segmentation, Segmenter, Shape, View
+from lerobot_openspm.types import (
+    DemonstrationScene,
+    Mask,
+    PoseEstimate,
+    Segmentation,
+    Segmenter,
+    Shape,
+    Symmetry,
+    View,
+)
 
 logger = logging.getLogger(__name__)
 
@@ -170,11 +179,8 @@ class KnownObject(Protocol):
         ...
 
     @property
-    def middle(self) -> Array | None:
-        """Where the axis of an object is that looks alike from all sides: x and y ``(2,)`` in its frame.
-
-        None for an object that has a direction, or of which it is not known.
-        """
+    def symmetry(self) -> Symmetry | None:
+        """How its shape turns into itself, whatever its colours do; None if it does not, or is not known."""
         ...
 
     def localise(self, look: Look) -> PoseEstimate:

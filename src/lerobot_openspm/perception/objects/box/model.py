@@ -20,7 +20,7 @@ from lerobot_openspm.perception.objects.box.outline import SIZES_M, OutlineFit, 
 from lerobot_openspm.perception.objects.mask_association import ObjectMasks, associate, whole_mask
 from lerobot_openspm.perception.objects.shape import fitting
 from lerobot_openspm.perception.objects.yaw import canonical
-from lerobot_openspm.types import UNKNOWN_YAW_STD, PoseEstimate, View
+from lerobot_openspm.types import UNKNOWN_YAW_STD, PoseEstimate, Symmetry, View
 
 # A box turned by more than this from where a fit begins may slip into a turn by a quarter.
 START_YAWS = np.arange(4) * np.pi / 4
@@ -78,9 +78,9 @@ class BoxModel:
         return self.size * GRID
 
     @property
-    def middle(self) -> Array | None:
+    def symmetry(self) -> Symmetry:
         """See :class:`lerobot_openspm.perception.objects.base.KnownObject`."""
-        return np.zeros(2) if self.yaw_period == 0 else None
+        return Symmetry(np.zeros(2), 0.0 if self.yaw_period == 0 else np.pi)
 
     def localise(self, look: Look) -> PoseEstimate:
         """Find the object in a segmenter's masks; an expected pose only tells its visibility.

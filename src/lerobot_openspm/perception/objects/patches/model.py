@@ -57,8 +57,8 @@ class PatchModel:
         return np.zeros((0, 3))
 
     @property
-    def middle(self) -> None:
-        """It is not known whether the object looks alike from all sides."""
+    def symmetry(self) -> None:
+        """None: patches have no shape."""
         return None
 
     def localise(self, look: Look) -> PoseEstimate:

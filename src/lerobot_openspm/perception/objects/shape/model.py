@@ -34,7 +34,7 @@ from lerobot_openspm.perception.objects.shape.fitting import (
     verdict,
 )
 from lerobot_openspm.perception.objects.yaw import canonical
-from lerobot_openspm.types import UNKNOWN_YAW_STD, PoseEstimate, Support
+from lerobot_openspm.types import UNKNOWN_YAW_STD, PoseEstimate, Support, Symmetry
 
 BLOBS_PER_VIEW = 3
 MAX_CANDIDATES = 3
@@ -105,9 +105,10 @@ class ShapeModel:
         return self.yaw_centre + steps * self.yaw_halfwidth
 
     @property
-    def middle(self) -> Array | None:
+    def symmetry(self) -> Symmetry | None:
         """See :class:`lerobot_openspm.perception.objects.base.KnownObject`."""
-        return np.zeros(2) if self.yaw_period == 0 else None
+        is_one_way = self.yaw_period >= 2 * np.pi
+        return None if is_one_way else Symmetry(np.zeros(2), self.yaw_period)
 
     def localise(self, look: Look) -> PoseEstimate:
         """Find the object: where it is expected, else on its support plane, at any place and learned yaw."""

@@ -34,7 +34,7 @@ from lerobot_openspm.perception.objects.surface.search import (
     search,
 )
 from lerobot_openspm.perception.objects.surface.sight import Sight, Surface, sight_of
-from lerobot_openspm.types import PoseEstimate
+from lerobot_openspm.types import PoseEstimate, Symmetry
 
 # What a record may hold: points, coloured ones at least, and the table's length and width in metres, rounded.
 MAX_POINTS, MIN_COLOURED, MAX_TABLE_M, ROUNDING_M = 60_000, 8, 10.0, 1e-3
@@ -66,6 +66,8 @@ YAWS = tuple(np.linspace(0, 2 * np.pi, 8, endpoint=False))
 CLEAR_SHARE, RAISED_SHARE, BETTER_SHARE = 0.9, 0.85, 0.93
 # Turned about its middle, a round object agrees with itself this well, CIELAB and share.
 ROUND_COLOUR, ROUND_SHARE, ROUND_SPACINGS = 20.0, 0.52, 3.0
+# Turned about its middle, an object has the same shape if this share of its points comes this near to others.
+SAME_SHAPE_SHARE, SAME_SHAPE_SPACINGS = 0.7, 2.0
 
 
 @dataclass(frozen=True)
@@ -103,9 +105,20 @@ class SurfaceModel:
         return self.surface.coloured
 
     @property
-    def middle(self) -> Array | None:
+    def symmetry(self) -> Symmetry | None:
         """See :class:`lerobot_openspm.perception.objects.base.KnownObject`."""
-        return self.surface.middle if self.is_round else None
+        middle = np.append(self.surface.middle, 0.0)
+        points = self.surface.coloured - middle
+        tree, near = KDTree(points), SAME_SHAPE_SPACINGS * self.surface.spacing
+
+        def same(degrees: int) -> bool:
+            R = se3.from_yaw(np.zeros(3), float(np.deg2rad(degrees)))[:3, :3]
+            return float((tree.query(points @ R.T)[0] < near).mean()) > SAME_SHAPE_SHARE
+
+        for turn, others in ((0.0, (60, 90, 150, 180)), (np.pi / 2, (90, 180)), (np.pi, (180,))):
+            if all(map(same, others)):
+                return Symmetry(self.surface.middle, turn)
+        return None
 
     @cached_property
     def is_round(self) -> bool:
