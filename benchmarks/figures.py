@@ -65,7 +65,7 @@ LIBERO = (
     *RECORDING["libero"],
     *EPISODES,
     *_package("cli/options.py", "cli/pipeline.py"),
-    *_benchmarks("stages", "libero/evaluate", "libero/variants"),
+    *_benchmarks("stages", "libero/contacts", "libero/evaluate", "libero/pro_objects", "libero/variants"),
     "configs/openspm_libero_train.yaml",
     "configs/cameras/libero.json",
 )
@@ -154,7 +154,7 @@ FIGURES: dict[str, Figure] = {
             (*LIBERO, *_benchmarks("libero_pro")),
             f"--suite={suite} --states=50",
         )
-        for suite in ("libero_goal_swap", "libero_goal_lan")
+        for suite in ("libero_goal_swap", "libero_goal_lan", "libero_goal_object")
     },
     "libero_few_shot_3": _libero("few_shot", options="--demos=3"),
     "libero_few_shot_1": _libero("few_shot", options="--demos=1 --states=10"),

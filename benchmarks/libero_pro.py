@@ -3,8 +3,9 @@
     python -m benchmarks.libero_pro --suite=libero_goal_swap --states=50
 
 The task files and initial states are LIBERO-PRO's own, unmodified: in `libero_goal_swap` objects change
-places, in `libero_goal_lan` the instructions are worded otherwise. Where its files are looked for is said by
-the error if they are not there.
+places, in `libero_goal_lan` the instructions are worded otherwise, in `libero_goal_object` the objects of the
+task have another colour or size. Their classes are run from LIBERO-PRO's unpacked files, and the installed
+LIBERO stays as it is. Where its files are looked for is said by the error if they are not there.
 """
 
 from __future__ import annotations
@@ -24,7 +25,7 @@ class ProConfig:
     """What to evaluate.
 
     Args:
-        suite: libero_goal_swap or libero_goal_lan.
+        suite: libero_goal_swap, libero_goal_lan or libero_goal_object.
         states: Initial states a task, from the first on.
         task: A task's name, several with commas, or "all".
         tuning: Take scenes of our own, drawn from tuning seeds, instead of LIBERO-PRO's.
@@ -60,7 +61,10 @@ def main(config: ProConfig) -> dict[str, Any]:
     figures = summary(episodes)
     if config.states == STATES and config.task == "all" and not config.tuning:
         write(config.suite, {"seed": SEED, "demonstrations": DEMOS, **figures}, THREADS)
-    return {key: figures[key] for key in ("success", "interval", "n", "mean_steps", "per_task")}
+    return {
+        key: figures[key]
+        for key in ("success", "interval", "n", "mean_steps", "touched", "moved", "per_task")
+    }
 
 
 if __name__ == "__main__":

@@ -69,7 +69,12 @@ def _origin(result: dict[str, Any]) -> str:
 
 def percent(run: dict[str, Any]) -> str:
     """A success rate; a dash for none of no episodes."""
-    return "-" if run["success"] is None else f"{100 * run['success']:.1f} %"
+    return share(run["success"])
+
+
+def share(fraction: float | None) -> str:
+    """A fraction of the episodes in percent; a dash for none of no episodes."""
+    return "-" if fraction is None else f"{100 * fraction:.1f} %"
 
 
 def interval(run: dict[str, Any]) -> str:

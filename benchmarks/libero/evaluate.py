@@ -18,6 +18,8 @@ from typing import Any
 import numpy as np
 from benchmarks.episodes import load, run_episode
 from benchmarks.harness import Row, checkpoint_files, measured_folder, resume
+from benchmarks.libero import contacts, pro_objects, variants
+from benchmarks.libero.contacts import Contacts, shares, task_objects
 from benchmarks.libero.variants import exchanged, variant_file, variant_states
 from benchmarks.results import run
 from benchmarks.worlds import LIBERO_IMAGE_SIZE, LiberoWorld
@@ -25,7 +27,7 @@ from benchmarks.worlds import LIBERO_IMAGE_SIZE, LiberoWorld
 from lerobot_openspm.cli.pipeline import rate
 from lerobot_openspm.control.controller import EpisodeController
 from lerobot_openspm.control.state import Status
-from lerobot_openspm.envs.libero.simulator import SUITE, LiberoSimulator, tasks
+from lerobot_openspm.envs.libero.simulator import SUITE, LiberoSimulator, task_file, tasks
 from lerobot_openspm.envs.seeds import TUNING_SEED_START
 from lerobot_openspm.geometry import se3
 from lerobot_openspm.language.instruction import parse_instruction
@@ -81,7 +83,8 @@ def evaluate(config: EvaluationConfig) -> list[Row]:
     if unknown := [task for task in wanted if task not in tasks()]:
         raise ValueError(f"libero_goal has no tasks {unknown}, expected some of {', '.join(tasks())}")
     settings = [f"{key}={getattr(config, key)}" for key in ("suite", "tuning", "tuning_seed", "execution")]
-    files = checkpoint_files(Path(config.checkpoint))
+    code = [Path(str(module.__file__)) for module in (contacts, pro_objects, variants)]
+    files = [*checkpoint_files(Path(config.checkpoint)), *code]
     folder = measured_folder(Path(config.output), files, settings, __file__)
     jobs = {f"{task} {i}": (config, task, i) for task in wanted for i in range(config.episodes)}
     return resume(folder / "episodes.jsonl", jobs, evaluate_one, config.workers)
@@ -119,10 +122,11 @@ def summary(episodes: list[Row]) -> dict[str, Any]:
 
 
 def _rate(episodes: Sequence[Row]) -> dict[str, Any]:
-    """Success rate, and mean steps of the successes; None if there is none."""
+    """Success rate, mean steps of the successes, None if there is none, and contacts as `shares` tells."""
     steps = [e["steps"] for e in episodes if e["success"]]
     mean = round(float(np.mean(steps)), 1) if steps else None
-    return {**rate(len(steps), len(episodes)), "mean_steps": mean}
+    found = shares([e["contacts"] for e in episodes])
+    return {**rate(len(steps), len(episodes)), "mean_steps": mean, **found}
 
 
 def reason(episode: Row) -> str:
@@ -143,7 +147,7 @@ def evaluate_one(config: EvaluationConfig, task: str, state: int) -> Row:
 
     Returns:
         What is kept of it. ``seen`` are the poses that the policy found when it planned, ``true`` the
-        simulator's poses of the objects that the instruction names.
+        simulator's poses of the objects that the instruction names, ``contacts`` as `Contacts` tells them.
     """
     seed = (config.tuning_seed if config.tuning else SEED) + state
     is_exchanged = config.tuning and config.suite != SUITE
@@ -156,9 +160,11 @@ def evaluate_one(config: EvaluationConfig, task: str, state: int) -> Row:
         simulator.reset_to(seed, variant_states(config.suite, task)[state])
     sub_tasks = parse_instruction(simulator.instruction)
     named = list(dict.fromkeys(name for sub_task in sub_tasks for name in sub_task.objects))
+    watch = Contacts(simulator, task_objects(simulator.instruction, file or task_file(task)))
     places: dict[str, Any] = {}
 
     def note(step: int, observation: Observation, controller: EpisodeController) -> None:
+        watch.note()
         if step == 0:
             true = name_simulator_poses(simulator.object_poses(), named, policy.require_memory().objects)
             seen = controller.scene.tracker.poses(observation.hand.T_world_ee)
@@ -166,7 +172,9 @@ def evaluate_one(config: EvaluationConfig, task: str, state: int) -> Row:
             places["true"] = {name: _place(T) for name, T in true.items()}
 
     episode = run_episode(policy, LiberoWorld(simulator), note=note)
-    return {"task": task, "state": state, "seed": seed, **episode.told(), **places}
+    watch.note()
+    found = {"contacts": watch.told(), **places}
+    return {"task": task, "state": state, "seed": seed, **episode.told(), **found}
 
 
 def _move_hand(simulator: LiberoSimulator, rng: np.random.Generator) -> None:

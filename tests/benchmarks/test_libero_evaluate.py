@@ -31,7 +31,8 @@ def ran(monkeypatch: pytest.MonkeyPatch) -> list[tuple[str, int]]:
         found.append((task, state))
         success = state != 1
         told = {"steps": 100 + state, "success": success, "status": "done", "phase": "retreat", "attempts": 0}
-        return {"task": task, "state": state, "seed": harness.SEED + state, **told}
+        contacts = {"plate": 12.0 * state} if task == "put_the_bowl" else {}
+        return {"task": task, "state": state, "seed": harness.SEED + state, **told, "contacts": contacts}
 
     monkeypatch.setattr(harness, "evaluate_one", run_one)
     return found
@@ -91,7 +92,9 @@ def test_tasks_may_be_chosen_and_unknown_ones_are_refused(config, ran):
 def test_the_summary_counts_and_says_why(config, ran):
     figures = summary(evaluate(config))
     assert (figures["success"], figures["n"], figures["mean_steps"]) == (0.5, 6, 100.0)
-    assert figures["per_task"]["put_the_bowl"]["success"] == 0.5
+    bowl = figures["per_task"]["put_the_bowl"]
+    assert (bowl["success"], bowl["touched"], bowl["moved"]) == (0.5, 1.0, 0.5)
+    assert (figures["touched"], figures["moved"]) == (0.3333, 0.1667)
     assert {(one["task"], one["state"], one["seed"]) for one in figures["failed"]} == {
         (task, 1, harness.SEED + 1) for task in TASKS
     }

