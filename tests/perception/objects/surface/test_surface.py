@@ -12,7 +12,7 @@ from lerobot_openspm.geometry.camera import project
 from lerobot_openspm.perception.objects import store
 from lerobot_openspm.perception.objects.base import Look, localise_all
 from lerobot_openspm.perception.objects.kinds import learn_objects
-from lerobot_openspm.perception.objects.surface.compare import without_pattern
+from lerobot_openspm.perception.objects.surface.compare import correlation
 from lerobot_openspm.perception.objects.surface.model import SurfaceModel
 from lerobot_openspm.types import ContactCue, DemonstrationScene, Moment
 
@@ -136,16 +136,18 @@ def test_of_what_words_tell_apart_every_one_is_found(models):
         assert place == pytest.approx(T[:2, 3] + away, abs=0.008)
 
 
-def test_colours_without_their_pattern_agree_less():
+def test_colours_vary_together_with_what_is_expected():
     rng = np.random.default_rng(0)
     expected = np.repeat(rng.uniform(40, 60, (50, 1, 3)), 2, axis=1).astype(np.float32)
     inside = np.ones((1, 50), np.float32)
-    as_expected, mixed = expected[None, :, 0] + 5.0, expected[None, rng.permutation(50), 0]
-    assert without_pattern(as_expected, expected, inside) == pytest.approx(0.0, abs=1e-3)
-    assert without_pattern(mixed, expected, inside) > 0.6
+    lighter, mixed = expected[None, :, 0] + 5.0, expected[None, rng.permutation(50), 0]
+    together, tells = correlation(lighter, expected, inside)
+    assert together == pytest.approx(1.0, abs=1e-3)
+    assert tells > 0.9
+    assert correlation(mixed, expected, inside)[0] < 0.3
     # Of what has one colour its pattern tells nothing.
     plain = np.full((50, 2, 3), 50.0, np.float32)
-    assert without_pattern(mixed, plain, inside) == pytest.approx(0.0, abs=1e-3)
+    assert correlation(mixed, plain, inside)[1] == pytest.approx(0.0, abs=1e-3)
 
 
 def test_where_it_is_found_from_is_told_by_what_looks_like_it_elsewhere(models):

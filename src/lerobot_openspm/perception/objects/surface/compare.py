@@ -61,6 +61,7 @@ class Sample:
         rim_colours: Weighted CIELAB ``(m, 2, 3)`` of the edge.
         weight: From 0 to 1; less where the camera sees only a small part of the surface.
         octave: How far pictures are smoothed to show as much detail as the surface has.
+        pattern: How much the variation of its colours tells; see :class:`Surface`.
     """
 
     points: Float32
@@ -69,6 +70,7 @@ class Sample:
     rim_colours: Float32
     weight: float
     octave: int
+    pattern: float
 
     def thinned(self, step: int) -> Sample:
         """Every so many-th of the points."""
@@ -119,6 +121,7 @@ def take_sample(surface: Surface, sight: Sight, pose: Array, count: int) -> Samp
         surface.points[chosen].astype(np.float32), colours[chosen].astype(np.float32),
         ((beside - t) @ R).astype(np.float32), colours[own[edge]].astype(np.float32),
         min(1.0, len(own) / (WHOLE_SHARE * len(surface.coloured))), _octave(surface, sight, depth[own]),
+        surface.pattern,
     )  # fmt: skip
 
 
@@ -169,7 +172,8 @@ def compare(sample: Sample, sight: Sight, poses: Array, is_coarse: bool = False)
     n = len(sample.points)
     score = (good - bad + BLOCKED_EVIDENCE * blocked) / np.maximum(told, 0.05 * n)
     weights = inside * (1 - (1 - PATTERN_BLOCKED) * (1 - match) * (1 - on_table))
-    score = score * (1 - PATTERN_COST * without_pattern(shown, sample.colours, weights))
+    together, tells = correlation(shown, sample.colours, weights)
+    score = score * (1 - PATTERN_COST * sample.pattern * tells * (1 - np.clip(together, 0, 1)))
     if len(sample.rim):
         shown, on_table, inside = _shown(sample.rim, sight, poses, colours, table)
         goes_on = (_match(shown, sample.rim_colours, like) * (1 - on_table) * inside).sum(1)
@@ -233,10 +237,11 @@ def _match(shown: Float32, expected: Float32, like: float) -> Float32:
     return np.exp(away / (-2 * like**2))
 
 
-def without_pattern(shown: Float32, expected: Float32, weights: Float32) -> Array:
-    """How little colours ``(q, n, 3)`` vary over an object as is expected ``(n, 2, 3)``, from 0 to 1.
+def correlation(shown: Float32, expected: Float32, weights: Float32) -> tuple[Array, Array]:
+    """How colours ``(q, n, 3)`` vary together with what is expected ``(n, 2, 3)``.
 
-    One minus their correlation; less for objects of one colour, of which it tells nothing.
+    Returns:
+        The correlation ``(q,)``, and how much it tells, from 0 to 1; less for an object of one colour.
     """
     middle = expected.mean(1)
     middle = middle - middle.mean(0)
@@ -246,9 +251,9 @@ def without_pattern(shown: Float32, expected: Float32, weights: Float32) -> Arra
     together = weighted.reshape(len(shown), -1) @ middle.ravel() - (sum_shown * sum_expected).sum(1) / n
     vary_shown = np.einsum("qnc,qnc->q", weighted, shown) - (sum_shown**2).sum(1) / n
     vary_expected = weights @ (middle**2).sum(1) - (sum_expected**2).sum(1) / n
-    correlation = together / np.sqrt(np.maximum(vary_shown * vary_expected, 1e-6))
+    together = together / np.sqrt(np.maximum(vary_shown * vary_expected, 1e-6))
     tells = vary_expected / (vary_expected + n * PATTERN_STD**2)
-    return np.asarray(tells * (1 - np.clip(correlation, 0, 1)), float)
+    return np.asarray(together, float), np.asarray(tells, float)
 
 
 def agreement(
@@ -275,3 +280,16 @@ def score_at(surface: Surface, sights: Mapping[str, Sight], pose: Array) -> floa
     """How well a pose agrees with all views; 0 where none shows it."""
     samples = samples_at(surface, sights, pose, FINE_POINTS)
     return float(agreement(samples, sights, pose[None])[0]) if samples else 0.0
+
+
+def correlation_at(surface: Surface, sights: Mapping[str, Sight], pose: Array) -> float:
+    """How the colours of all views vary together with the surface's at a pose; 0 where none shows it."""
+    total = weight = 0.0
+    for camera, sample in samples_at(surface, sights, pose, FINE_POINTS).items():
+        shown, _, inside = _shown(
+            sample.points, sights[camera], pose[None], *sights[camera].smoothed(sample.octave)
+        )
+        together, tells = correlation(shown, sample.colours, inside.astype(np.float32))
+        told = sample.weight * float(inside.mean() * tells[0])
+        total, weight = total + told * float(together[0]), weight + told
+    return total / max(weight, 1e-6)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -16,7 +17,7 @@ from lerobot_openspm.perception.objects.patches.learn import learn_patches
 from lerobot_openspm.perception.objects.patches.model import PatchModel
 from lerobot_openspm.perception.objects.surface.backdrop import Backdrop, Float32, learn_backdrop
 from lerobot_openspm.perception.objects.surface.carving import Carved, Frame, Frames, carve, silhouette
-from lerobot_openspm.perception.objects.surface.compare import score_at
+from lerobot_openspm.perception.objects.surface.compare import correlation_at, score_at
 from lerobot_openspm.perception.objects.surface.model import SurfaceModel, best_on_table, from_record
 from lerobot_openspm.perception.objects.surface.relief import WEIGHTS, find_relief
 from lerobot_openspm.perception.objects.surface.sight import Surface, sight_of
@@ -40,6 +41,9 @@ SIMILAR_M, SIMILAR_COLOUR = 0.03, 10.0
 BESIDE_M = 0.02
 # Silhouettes are filled in so many rounds, since one object's surface explains what is seen beside another.
 ROUNDS = 2
+# Of an object whose colours vary less together than this with what the demonstrations' first pictures show,
+# the pattern tells nothing; from the second value on it tells all.
+PATTERN_SEEN = 0.55, 0.8
 # In so many of the demonstrations it is measured what looks most like the object without it; what is this
 # near to it is hidden for that, pixels of a picture 256 wide.
 RIVAL_SCENES, MARGIN_PX = 6, 6
@@ -64,6 +68,7 @@ def _learn_surfaces(near: Mapping[str, PatchModel], examples: Examples) -> dict[
     surfaces = build_surfaces(_frames(films, near, backdrop), touched, heights, backdrop)
     models = {}
     for name, surface in surfaces.items():
+        surface = replace(surface, pattern=_pattern(name, surface, scenes, near[name], backdrop))
         typical, rival = _agreements(name, surface, scenes, near[name], backdrop)
         models[name] = SurfaceModel(name, surface, backdrop, heights[name], typical, rival, near[name])
         logger.info("surface of %s: %d coloured points, agreement %.2f, without it %.2f",
@@ -194,6 +199,20 @@ def _completed(points: Array, normals: Array, colours: Array) -> Float32:
             like = both[index]
             done[lacking, missing] += colours[like, missing] - colours[like, known]
     return done
+
+
+def _pattern(
+    name: str, surface: Surface, scenes: Sequence[DemonstrationScene], near: PatchModel, backdrop: Backdrop
+) -> float:
+    """How much the pattern of an object tells, from 0 to 1: by how well the demonstrations show it."""
+    seen = []
+    for scene in scenes:
+        T = _first_poses(scene, {name: near}).get(name)
+        if T is not None:
+            sights = {c: sight_of(view, c, backdrop, None) for c, view in scene.views.items()}
+            seen.append(correlation_at(surface, sights, np.array([*T[:3, 3], 0.0])))
+    low, high = PATTERN_SEEN
+    return float(np.clip((np.median(seen) - low) / (high - low), 0, 1)) if seen else 0.0
 
 
 def _agreements(

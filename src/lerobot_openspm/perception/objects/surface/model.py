@@ -45,6 +45,8 @@ FOUND_BETWEEN, LEAST_SHARE = 0.35, 0.55
 BELIEVED_SHARE = 0.8
 # A second place that explains the pictures nearly as well makes the first one doubtful.
 RIVAL_SHARE = 0.93
+# An object whose pattern tells nothing is at most this sure: it may be turned, or something alike.
+WITHOUT_PATTERN = 0.9
 # A place that agrees this well holds another of the kind.
 ANOTHER_SHARE = 0.85
 # Two places nearer than this share of the radius cannot both hold one.
@@ -236,7 +238,8 @@ class SurfaceModel:
             for one in rivals
             if one.score >= ANOTHER_SHARE * max(self.typical_agreement, best.score)
         )
-        return PoseEstimate(status, T, covariance, float(np.clip(share, 0, 1)), visible, None, others)
+        sure = WITHOUT_PATTERN + (1 - WITHOUT_PATTERN) * self.surface.pattern
+        return PoseEstimate(status, T, covariance, sure * float(np.clip(share, 0, 1)), visible, None, others)
 
     def to_record(self) -> Record:
         """See :class:`lerobot_openspm.perception.objects.base.KnownObject`."""
@@ -245,7 +248,7 @@ class SurfaceModel:
         fields = {
             "kind": self.kind, "name": self.name, "height": self.height,
             "typical_agreement": self.typical_agreement, "rival_agreement": self.rival_agreement,
-            "spacing": self.surface.spacing,
+            "spacing": self.surface.spacing, "pattern": self.surface.pattern,
             "table_height": self.backdrop.table_height, "hand_cameras": list(self.backdrop.hand),
             "near": near_fields,
         }  # fmt: skip
@@ -301,7 +304,8 @@ def from_record(fields: Mapping[str, Any], arrays: Mapping[str, NDArray[Any]], w
     backdrop = Backdrop(Colour(table[0], table[1:]), numbers["table_height"], area, {}, hand)
     own = {key.removeprefix("near."): value for key, value in arrays.items() if key.startswith("near.")}
     return SurfaceModel(
-        name, Surface(points, normals, colours, numbers["spacing"]), backdrop, numbers["height"],
+        name, Surface(points, normals, colours, numbers["spacing"], numbers["pattern"]), backdrop,
+        numbers["height"],
         numbers["typical_agreement"], numbers["rival_agreement"], patches.from_record(near, own, where),
     )  # fmt: skip
 
@@ -327,6 +331,7 @@ BOUNDS = {
     "typical_agreement": (0.05, 1.0),
     "rival_agreement": (0.0, 1.0),
     "spacing": (1e-6, 1.0),
+    "pattern": (0.0, 1.0),
     "table_height": (-100.0, 100.0),
 }
 

@@ -29,12 +29,14 @@ class Surface:
         colours: CIELAB ``(n, 2, 3)`` as the fixed and as the hand's camera show it; the colours in between
             are expected too. Not a number for points that only hide what is behind them.
         spacing: Distance between points, metres.
+        pattern: From 0 to 1: how much the variation of its colours tells of it.
     """
 
     points: Array
     normals: Array
     colours: Float32
     spacing: float
+    pattern: float = 1.0
 
     @cached_property
     def coloured(self) -> Array:
