@@ -36,7 +36,7 @@ DRAWS_PER_OBJECT = 30
 DRAWER_WAY = (0.36, 0.125)
 # What must be in reach before it: the hand after it has let go of the handle.
 DRAWER_HAND_X = 0.37
-REACH_X, REACH_Y = (-0.38, 0.48), (-0.44, 0.44)
+REACH_X, REACH_Y = (-0.34, 0.48), (-0.40, 0.44)
 
 
 def sample_anywhere(rng: np.random.Generator, setting: Setting, parts: Sequence[str]) -> Layout:

@@ -53,15 +53,18 @@ class TabletopSimulator:
 
     Args:
         others: Names of what stands there beside the tasks' objects: distractors, and second objects.
+
+    Attributes:
+        movable: Names of all objects that can be moved, those others among them.
     """
 
     def __init__(self, others: tuple[str, ...] = ()) -> None:
         self.model: mujoco.MjModel = copy.copy(compiled_model(others))
         self.data = mujoco.MjData(self.model)
-        self._movable = (*scene.MOVABLE_NAMES, *others)
+        self.movable = (*scene.MOVABLE_NAMES, *others)
         fingers = ("finger_left", "finger_right")
-        bodies = ("hand", *scene.OBJECT_NAMES, *self._movable, *scene.DRAWER_NAMES, "knob", *fingers)
-        joints = ("hand", *fingers, "knob", *self._movable, *scene.DRAWER_NAMES)
+        bodies = ("hand", *scene.OBJECT_NAMES, *self.movable, *scene.DRAWER_NAMES, "knob", *fingers)
+        joints = ("hand", *fingers, "knob", *self.movable, *scene.DRAWER_NAMES)
         self._body = {n: self.model.body(n).id for n in bodies}
         self._qpos = {n: int(self.model.joint(n).qposadr[0]) for n in joints}
         self._dof = {n: int(self.model.joint(n).dofadr[0]) for n in joints}
@@ -75,7 +78,7 @@ class TabletopSimulator:
         mujoco.mj_resetData(self.model, self.data)
         for name, at in layout.items():
             quat_wxyz = (math.cos(at.yaw / 2), 0.0, 0.0, math.sin(at.yaw / 2))
-            if name in self._movable:
+            if name in self.movable:
                 start = self._qpos[name]
                 self.data.qpos[start : start + 7] = (at.x, at.y, 0.0, *quat_wxyz)
             else:
@@ -174,7 +177,7 @@ class TabletopSimulator:
     def is_at_rest(self, name: str, linear: float = 0.02, angular: float = 0.4) -> bool:
         """Whether an object, a drawer or the knob moves slower than `linear` m/s and `angular` rad/s."""
         start = self._dof[name]
-        if name not in self._movable:
+        if name not in self.movable:
             return abs(self.data.qvel[start]) < (angular if name == "knob" else linear)
         velocity = self.data.qvel[start : start + 6]
         return bool(np.linalg.norm(velocity[:3]) < linear and np.linalg.norm(velocity[3:]) < angular)
@@ -237,7 +240,7 @@ class TabletopSimulator:
         roots = self.model.body_rootid[self.model.geom_bodyid]
         for name, number in scene.OBJECT_LABELS.items():
             labels[roots == self._body[name]] = number
-        for name in self._movable:
+        for name in self.movable:
             labels[roots == self._body[name]] = scene.OBJECT_LABELS.get(scene.kind(name), 0)
         return labels
 
