@@ -47,16 +47,16 @@ def agreement(evidence: Sequence[Evidence], cloud: Cloud, colours: Float32, T_wo
     A point whose colour was never seen may have that of any other one. What is not of the object's colours at
     all tells nothing here: that is what silhouettes are for.
     """
-    known = colours[:, 0] >= 0
+    known, shown = colours[:, 0] >= 0, colours.astype(float)
     if not known.any():
         return 0.0
-    palette = colours[known][:: max(1, int(known.sum()) // PALETTE)]
+    palette = shown[known][:: max(1, int(known.sum()) // PALETTE)]
     shares: list[NDArray[np.floating]] = []
     for index, seen, own in _seen(evidence, cloud, T_world_obj):
         index, seen = index[own], seen[own]
         is_known = known[index]
         alike = np.empty(len(index))
-        alike[is_known] = _alike(seen[is_known], colours[index[is_known]])
+        alike[is_known] = _alike(seen[is_known], shown[index[is_known]])
         alike[~is_known] = UNSEEN_SHARE * _alike(seen[~is_known, None], palette[None]).max(axis=1)
         shares.append(alike)
     together = np.concatenate(shares) if shares else np.zeros(0)
