@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Iterator, Sequence
+from collections.abc import Generator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -95,7 +95,7 @@ def _taken_away(world: TabletopWorld, names: Sequence[str]) -> list[tuple[str, s
 
 
 @contextlib.contextmanager
-def _without(world: TabletopWorld, name: str) -> Iterator[None]:
+def _without(world: TabletopWorld, name: str) -> Generator[None]:
     """A world in which one object is far away."""
     simulator, T_world_obj = world.env.simulator, world.object_poses()[name]
     away = T_world_obj.copy()
