@@ -126,7 +126,7 @@ def _with(figure: Figure, *paths: str) -> Figure:
     return replace(figure, paths=(*figure.paths, *paths))
 
 
-COMPARISONS = ("tabletop", "execution", "oracle", "conditioning", "compound", "two_bowls")
+COMPARISONS = ("tabletop", "execution", "oracle", "conditioning", "compound", "two_bowls", "anywhere")
 ON_LIBERO = "--env.type=libero"
 FIGURES: dict[str, Figure] = {
     **{

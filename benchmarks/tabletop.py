@@ -5,6 +5,7 @@
 tabletop: the policy as it is. execution: three ways to follow key poses. oracle: object poses from the
 simulator, not from perception. conditioning: the flow is told poses in the target's or in the world's frame.
 compound: instructions of which only the parts were demonstrated. two_bowls: with a second bowl on the table.
+anywhere: every object anywhere at any yaw, with distractors and a second one of the kind; first looks too.
 """
 
 from __future__ import annotations
@@ -14,14 +15,15 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from benchmarks.anywhere import looks
 from benchmarks.results import run, write
-from benchmarks.stages import DEMOS, TABLETOP, policy, run_folder
+from benchmarks.stages import DEMOS, TABLETOP, dataset, policy, run_folder
 from lerobot_openspm.cli.pipeline import EVALUATION_SEED, THREADS, collect_dataset, evaluate, success
 from lerobot_openspm.envs.tabletop.tasks import ANY_TASK, SELECTIONS
 
 EPISODES = 20
 # Seeds of evaluation that nothing else was measured on; the code was tuned on 2,600,000 and more.
-SELECTION_SEEDS = {"compound": 8000, "two_bowls": 11_000}
+SELECTION_SEEDS = {"compound": 8000, "two_bowls": 11_000, "anywhere": 14_000}
 
 
 @dataclass
@@ -84,7 +86,12 @@ def selection(name: str) -> dict[str, Any]:
     tasks, output = SELECTIONS[name], run_folder(TABLETOP) / f"eval_{name}"
     episodes = evaluate(policy(TABLETOP)[0], output, EPISODES, SELECTION_SEEDS[name], tasks=tasks)
     told = {task: ANY_TASK[task].instruction for task in tasks}
-    return {"instructions": told, **runs(**{name: success(episodes)})}
+    measured = {"instructions": told, **runs(**{name: success(episodes)})}
+    if name == "anywhere":
+        folder = run_folder(TABLETOP)
+        seen = looks(policy(TABLETOP)[0], dataset(TABLETOP), folder / f"looks_{name}", SELECTION_SEEDS[name])
+        measured["first_looks"] = seen
+    return measured
 
 
 def rate(name: str, checkpoint: Path, *options: str) -> dict[str, Any]:

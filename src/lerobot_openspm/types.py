@@ -172,6 +172,7 @@ class PoseEstimate:
         support: What the estimate rests on; None where the covariance needs no correction.
         others: Poses ``(4, 4)`` of further places that show such an object too, the most confident first;
             empty for kinds that cannot see several.
+        tipped: Whether it is seen to lie on its side or upside down, and so was not found as it should stand.
     """
 
     status: Literal["found", "not_found", "ambiguous"]
@@ -181,6 +182,7 @@ class PoseEstimate:
     visible: float = 1.0
     support: Support | None = None
     others: tuple[Array, ...] = ()
+    tipped: bool = False
 
 
 @dataclass(frozen=True)

@@ -4,7 +4,9 @@ import json
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
+from benchmarks.anywhere import summarise
 from benchmarks.results import PROVENANCE
 from benchmarks.tabletop import TabletopConfig, main
 
@@ -29,6 +31,7 @@ def _stages(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.setattr(module, "collect_dataset", collect)
     monkeypatch.setattr(stages, "train", lambda *_: (Path("checkpoint"), None))
     monkeypatch.setattr(tabletop, "evaluate", lambda *_, **__: EPISODES)
+    monkeypatch.setattr(tabletop, "looks", lambda *_: {"looks": 70})
 
 
 def test_the_policy_as_it_is_keeps_its_figures():
@@ -51,6 +54,7 @@ def test_the_policy_as_it_is_keeps_its_figures():
         ("oracle", ["oracle"], 1000),
         ("conditioning", ["equivariant", "paper"], 1000),
         ("two_bowls", ["two_bowls"], 11_000),
+        ("anywhere", ["anywhere"], 14_000),
     ],
 )
 def test_a_comparison_keeps_all_its_runs(name: str, runs: list[str], seed: int, tmp_path: Path):
@@ -66,3 +70,21 @@ def test_a_comparison_keeps_all_its_runs(name: str, runs: list[str], seed: int, 
 def test_an_unknown_comparison_is_refused():
     with pytest.raises(ValueError, match="comparison is 'weather', expected one of tabletop, execution"):
         TabletopConfig("weather")
+
+
+def test_first_looks_tell_errors_false_finds_and_whether_confidence_holds():
+    row = {
+        # Object, needed, its yaw shows, confidence, metres, radians.
+        "found": [
+            ["bowl", True, False, 0.99, 0.002, 1.0],
+            ["stove", True, True, 0.99, 0.004, 0.5],
+            ["rack", False, True, 0.90, None, None],
+        ],
+        "gone": [["plate", False], ["box", True]],
+    }
+    told = summarise([row])
+    assert told["poses"]["position_mm_mean"] == 3.0
+    assert told["poses"]["unknown"] == 1
+    assert told["poses_needed"]["yaw_deg_mean"] == round(float(np.rad2deg(0.5)), 2)
+    assert (told["false_finds"]["success"], told["false_finds"]["n"]) == (0.5, 2)
+    assert (told["confident_and_right"]["success"], told["confident_and_right"]["n"]) == (0.5, 2)

@@ -15,6 +15,7 @@ import numpy as np
 
 from lerobot_openspm.control.executor import Executor
 from lerobot_openspm.control.planning import PlanningContext
+from lerobot_openspm.control.reasons import why_missing
 from lerobot_openspm.control.scene import GIVE_UP_S, LOOK_AGAIN_S, SECOND_LOOK_S, LookRequest, SceneState
 from lerobot_openspm.control.state import LOOKS_AT_OUTCOME, EpisodeState, Status
 from lerobot_openspm.control.transfer import Target, pushed_by_landmark, rise
@@ -116,7 +117,8 @@ class EpisodeController:
         """Give up where a camera gave no sound picture for too long, unless all is done but to look."""
         for camera, fault in self.scene.detections.faults.items():
             if fault.seconds >= GIVE_UP_S and self.state.status is not Status.DONE:
-                logger.warning("%r: stopping, camera %r: %s", self.instruction, camera, fault.reason)
+                self.state.refusal = f"camera {camera!r}: {fault.reason}"
+                logger.warning("%r: stopping, %s", self.instruction, self.state.refusal)
                 self.executor.stop(Status.CAMERA_FAULT)
 
     # Planning.
@@ -146,12 +148,16 @@ class EpisodeController:
         state.ranked = self._context.rank(candidates, poses, hand.T_world_ee)
         plan = self._context.choose(state.ranked, poses, hand.T_world_ee)
         if missing := [name for name in plan.entry.objects if name not in poses]:
-            logger.info("%r: cannot find %s", self.instruction, missing)
+            seen = self.scene.detections.estimates
+            state.refusal = why_missing(missing, seen, hand, self._context.robot)
+            logger.info("%r: %s", self.instruction, state.refusal)
             state.go(Status.OBJECT_NOT_FOUND)
         elif problems := plan.problems(self._context, with_arm=True):
-            logger.warning("%r: %s", self.instruction, "; ".join(problems))
+            state.refusal = "; ".join(problems)
+            logger.warning("%r: %s", self.instruction, state.refusal)
             state.go(Status.INFEASIBLE)
         else:
+            state.refusal = ""
             state.plan = self._context.clear(plan)
             state.used = (*state.used, next(one.source for one in candidates if one.entry is plan.entry))
             self._begin(0, hand)

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lerobot_openspm.control.transfer import Target, transfer
+from lerobot_openspm.control.transfer import Target, half_turned, transfer
 from lerobot_openspm.geometry import se3
 from lerobot_openspm.geometry.se3 import Array
 from lerobot_openspm.memory.entry import CONSTRAINED_PHASES, MemoryEntry
@@ -94,14 +94,14 @@ def geometric_score(
 ) -> float:
     """``S_geo`` in 0..1: whether an entry can be executed here, and how like its demonstration it would be.
 
-    It is 0 where an object of its key poses was not found or the transferred key poses fail the checks. It is
-    1 where the objects lie to one another as in the demonstration, wherever that is. The arguments are those
-    of :func:`transfer` and :func:`check_transfer`.
+    It is 0 where an object of its key poses was not found or the transferred key poses fail the checks
+    whichever way round the hand is. It is 1 where the objects lie to one another as in the demonstration,
+    wherever that is. The arguments are those of :func:`transfer` and :func:`check_transfer`.
     """
     if any(name not in object_poses for name in entry.objects):
         return 0.0
     targets = transfer(entry, object_poses, yaw_periods, T_world_ee)
-    if check_transfer(targets, T_world_ee, robot, limits):
+    if all(check_transfer(way, T_world_ee, robot, limits) for way in (targets, half_turned(targets))):
         return 0.0
     return max(float(np.exp(-shape_deviation(entry, targets) / SHAPE_SCALE_M)), MIN_USABLE_SCORE)
 

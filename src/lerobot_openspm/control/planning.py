@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
@@ -14,7 +15,14 @@ from lerobot_openspm.control.feasibility import (
     check_transfer,
     geometric_score,
 )
-from lerobot_openspm.control.transfer import Target, Turn, pushed_by_landmark, transfer
+from lerobot_openspm.control.transfer import (
+    HALF_TURN,
+    Target,
+    Turn,
+    half_turned,
+    pushed_by_landmark,
+    transfer,
+)
 from lerobot_openspm.geometry import se3
 from lerobot_openspm.geometry.se3 import Array
 from lerobot_openspm.language.names import TABLE_NAMES, NameSimilarity
@@ -98,6 +106,8 @@ class PlanningContext:
     def choose(self, ranked: Sequence[Scored], object_poses: Mapping[str, Array], T_world_ee: Array) -> Plan:
         """The best entry that the arm can follow, its grasps turned by an object's symmetry if need be.
 
+        The hand goes the other way round, by half a turn about its approach axis, where nothing else does.
+
         Where none of the first can be followed, the best one as it is.
         """
         first = Plan(ranked[0].entry, object_poses, T_world_ee)
@@ -105,8 +115,8 @@ class PlanningContext:
             return first
         for entry in (one.entry for one in ranked[:MAX_TRIED] if one.geometric > 0):
             plan = replace(first, entry=entry)
-            for radians in plan.turns(self):
-                turned = replace(plan, turned=radians)
+            for is_half_turned, radians in itertools.product((False, True), plan.turns(self)):
+                turned = replace(plan, turned=radians, is_half_turned=is_half_turned)
                 if not turned.problems(self, with_arm=True):
                     return turned
         return first
@@ -134,12 +144,14 @@ class Plan:
         T_world_ee: The hand's pose ``(4, 4)`` where the plan begins.
         turned: How far the hand is turned about the axis of objects that it grasps, which turn into
             themselves by that, radians.
+        is_half_turned: Whether the hand is turned by half a turn about its approach axis.
     """
 
     entry: MemoryEntry
     object_poses: Mapping[str, Array]
     T_world_ee: Array
     turned: float = 0.0
+    is_half_turned: bool = False
 
     def targets(
         self,
@@ -154,7 +166,10 @@ class Plan:
             for sub_task, name in self.symmetric_grasps(context).items()
             if self.turned and name in self.object_poses
         }
-        return transfer(entry, self.object_poses, context.yaw_periods, self.T_world_ee, gone, turns)
+        # Which pose of a symmetric object is meant is told by the hand as it was demonstrated.
+        T_world_ee = self.T_world_ee @ HALF_TURN if self.is_half_turned else self.T_world_ee
+        targets = transfer(entry, self.object_poses, context.yaw_periods, T_world_ee, gone, turns)
+        return half_turned(targets) if self.is_half_turned else targets
 
     def symmetric_grasps(self, context: PlanningContext) -> dict[int, str]:
         """Objects that are grasped and turn into themselves, by sub-task."""

@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from lerobot_openspm.control.placing import carried_outcomes, placing_position
 from lerobot_openspm.geometry import se3
 from lerobot_openspm.geometry.se3 import Array
 from lerobot_openspm.memory.entry import CONTACT_PHASES, Axis, MemoryEntry, MemoryKeyPose, Outcome
@@ -17,6 +18,8 @@ RETREAT_M = 0.06
 LEVEL_M = 0.02
 # The direction of a push shorter than this is within the noise of the object's position.
 MIN_PUSH_M = 0.005
+# Of the hand about its approach axis, the z axis of its frame.
+HALF_TURN = se3.from_yaw(np.zeros(3), np.pi)
 
 
 @dataclass(frozen=True)
@@ -132,7 +135,7 @@ def transfer(
     chosen: dict[str, Array] = {}
     targets: list[Target] = []
     before = T_world_ee
-    paths = push_paths(entry, object_poses)
+    paths, carried = push_paths(entry, object_poses), carried_outcomes(entry)
     for i, pose in enumerate(entry.key_poses):
         for name in pose.anchor.objects:
             if name not in chosen:
@@ -144,6 +147,9 @@ def transfer(
         path = paths.get(pose.sub_task)
         if path is not None:
             before = se3.transform(before[:3, :3], path.position(pose, entry.object_poses))
+        if (outcome := carried.get(pose.sub_task)) is not None:
+            place = placing_position(pose, outcome, entry.object_poses, {**object_poses, **chosen})
+            before = before if place is None else se3.transform(before[:3, :3], place)
         axis = pose.axis
         if axis is not None:
             axis = replace(axis, direction=T_world_anchor[:3, :3] @ axis.direction)
@@ -180,6 +186,14 @@ def _turned(targets: Sequence[Target], sub_task: int, turn: Turn) -> list[Target
         about = se3.from_yaw(point, turn.radians) @ se3.from_yaw(-point, 0.0)
         turned[i] = replace(target, T_world_ee=about @ target.T_world_ee)
     return turned
+
+
+def half_turned(targets: Sequence[Target]) -> tuple[Target, ...]:
+    """The same key poses with the hand turned by half a turn about its approach axis.
+
+    Two fingers that close on one another take hold either way round.
+    """
+    return tuple(replace(one, T_world_ee=one.T_world_ee @ HALF_TURN) for one in targets)
 
 
 def push_paths(entry: MemoryEntry, object_poses: Mapping[str, Array]) -> dict[int, PushPath]:

@@ -12,14 +12,16 @@ import numpy as np
 from lerobot_openspm.geometry import se3
 from lerobot_openspm.geometry.camera import Camera, project
 from lerobot_openspm.geometry.se3 import Array
-from lerobot_openspm.perception.objects.base import KnownObject, localise_all, look_at
+from lerobot_openspm.perception.objects.base import KnownObject, Look, localise_all, look_at
 from lerobot_openspm.perception.observation import Observation
 from lerobot_openspm.perception.oracle import name_simulator_poses
-from lerobot_openspm.perception.tracking.camera_health import CameraWatch
-from lerobot_openspm.types import Detections, Mask, PoseEstimate, Segmenter, View
+from lerobot_openspm.perception.tracking.camera_health import MIN_COMMON, CameraWatch, disagreements
+from lerobot_openspm.types import Detections, Fault, Mask, PoseEstimate, Segmenter, View
 
 # How exact the simulator's poses are taken to be (oracle ablation only): metres and radians.
 ORACLE_STD = 1e-4
+# So many objects are compared between views at most.
+MOST_COMPARED = 6
 # The hand and the arm behind it as balls along the hand's approach axis: from its fingertips this far back.
 TIP_M, BACK_M, BALLS = 0.01, -0.30, 12
 # The fingers are slimmer than what carries them; they end here.
@@ -65,6 +67,7 @@ class Perception:
     segmenter: Segmenter | None = None
     _watch: CameraWatch = field(default_factory=CameraWatch)
     _has_looked: bool = False
+    _has_compared: bool = False
     _labelled: set[str] = field(default_factory=set[str])
 
     def detect(
@@ -107,13 +110,47 @@ class Perception:
         hidden = {camera: hand_mask(view, T_world_ee, self.hand_radius_m) for camera, view in sound.items()}
         known = {name: self.memory.objects[name] for name in names if name in self.memory.objects}
         look = look_at(sound, list(known), self.segmenter, hidden, expected, told_apart)
-        return Detections(localise_all(known, look), faults)
+        estimates = localise_all(known, look)
+        if not self._has_compared and not faults:
+            self._has_compared = True
+            faults = disagreeing_cameras(look, known, estimates)
+        return Detections(estimates, faults)
 
     def _simulator_poses(self, observation: Observation, names: Sequence[str]) -> dict[str, PoseEstimate]:
         poses = observation.simulator_poses(self.memory.simulator_objects)
         named = name_simulator_poses(poses, names, self.memory.objects)
         covariance = ORACLE_STD**2 * np.eye(4)
         return {name: PoseEstimate("found", T, covariance, 1.0) for name, T in named.items()}
+
+
+def disagreeing_cameras(
+    look: Look, known: Mapping[str, KnownObject], estimates: Mapping[str, PoseEstimate]
+) -> dict[str, Fault]:
+    """The cameras that, each by itself, show objects elsewhere than other cameras do.
+
+    Args:
+        look: What all cameras show.
+        known: Objects by name.
+        estimates: Where all cameras together show them; each camera looks for them there first.
+    """
+    if len(look.views) < 2:
+        return {}
+    expected = {name: one.T_world_obj for name, one in estimates.items() if one.status == "found"}
+    # Cameras that disagree much find hardly anything together.
+    names = list(expected if len(expected) >= MIN_COMMON else known)[:MOST_COMPARED]
+    places: dict[str, dict[str, list[Array]]] = {}
+    for camera, view in look.views.items():
+        instances = {name: {camera: found.get(camera, ())} for name, found in look.instances.items()}
+        hidden = {camera: look.hidden[camera]} if camera in look.hidden else {}
+        alone = Look({camera: view}, instances, hidden, expected)
+        seen = {name: known[name].localise(alone) for name in names}
+        places[camera] = {
+            name: [T[:2, 3] for T in (one.T_world_obj, *one.others)]
+            for name, one in seen.items()
+            if one.status != "not_found"
+        }
+    # What such a camera shows was never usable.
+    return {camera: Fault(reason, float("inf")) for camera, reason in disagreements(places).items()}
 
 
 def detect(

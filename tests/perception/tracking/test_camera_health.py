@@ -3,7 +3,7 @@ import pytest
 
 from lerobot_openspm.geometry import se3
 from lerobot_openspm.geometry.camera import Camera
-from lerobot_openspm.perception.tracking.camera_health import CameraWatch
+from lerobot_openspm.perception.tracking.camera_health import CameraWatch, disagreements
 from lerobot_openspm.types import View
 
 DOWN = np.diag([1.0, -1.0, -1.0])
@@ -78,3 +78,42 @@ def test_a_frozen_picture_is_timed_from_when_the_hand_began_to_move():
         assert watch.check({"front": view()}, {}, hand(), time_s) == {}
     watch.check({"front": view()}, {}, hand(0.01), 2.25)
     assert watch.check({"front": view()}, {}, hand(0.03), 2.5)["front"].seconds == 0.5
+
+
+NAMES = ("bowl", "plate", "box", "rack", "stove")
+
+
+def shown(seed: int, shift=(0.0, 0.0), names=NAMES) -> dict[str, list[np.ndarray]]:
+    """Where one camera shows objects: within millimetres, but one of them quite elsewhere."""
+    rng = np.random.default_rng(seed)
+    places = {
+        name: [0.1 * np.array([i, -i]) + rng.normal(0, 0.001, 2) + shift] for i, name in enumerate(NAMES)
+    }
+    places[NAMES[seed % len(NAMES)]][0] += 0.08
+    return {name: places[name] for name in names}
+
+
+def test_cameras_that_show_most_objects_at_the_same_place_agree():
+    assert disagreements({"front": shown(1), "side": shown(2), "wrist": shown(3)}) == {}
+
+
+def test_a_camera_that_shows_all_objects_elsewhere_is_named_with_how_far():
+    found = disagreements({"front": shown(1), "side": shown(2, (0.02, 0.0)), "wrist": shown(3)})
+    assert list(found) == ["side"]
+    assert found["side"].startswith("views disagree: it shows objects 2")
+    assert "from where front and wrist do" in found["side"]
+
+
+def test_of_two_cameras_that_disagree_both_are_named():
+    assert list(disagreements({"front": shown(1), "side": shown(2, (0.0, 0.02))})) == ["front", "side"]
+
+
+def test_too_few_objects_tell_nothing_of_the_cameras():
+    few = shown(2, (0.02, 0.0), NAMES[:2])
+    assert disagreements({"front": shown(1), "side": few}) == {}
+
+
+def test_of_several_like_objects_any_may_be_the_one_that_the_other_camera_shows():
+    both = shown(1)
+    both["bowl"].insert(0, np.array([0.5, 0.5]))
+    assert disagreements({"front": both, "side": shown(2)}) == {}

@@ -10,9 +10,11 @@ from scipy.spatial.transform import Rotation
 
 from lerobot_openspm.envs.recording import pose_names, pose_vector
 from lerobot_openspm.envs.tabletop import scene
-from lerobot_openspm.envs.tabletop.placement import sample_layout, sample_two_bowls
+from lerobot_openspm.envs.tabletop.anywhere import sample_anywhere
+from lerobot_openspm.envs.tabletop.experts import expert_solves
+from lerobot_openspm.envs.tabletop.placement import Layout, LayoutError, sample_layout, sample_with_second
 from lerobot_openspm.envs.tabletop.simulator import TabletopSimulator
-from lerobot_openspm.envs.tabletop.tasks import ANY_TASK, select_tasks
+from lerobot_openspm.envs.tabletop.tasks import ANY_TASK, SUCCESS_HOLD_STEPS, select_tasks
 
 STATE_NAMES = ("x", "y", "z", "axis_angle_x", "axis_angle_y", "axis_angle_z", "finger_left", "finger_right")
 ACTION_NAMES = (
@@ -25,9 +27,12 @@ ACTION_NAMES = (
     "gripper",
 )
 OBJECT_POSE_NAMES = tuple(pose_names(scene.OBJECT_NAMES))
-SUCCESS_HOLD_STEPS = 5
 MIN_IMAGE_SIZE, MAX_IMAGE_SIZE = 128, 256
 RENDER_SIZE = 256
+# Layouts of objects anywhere are drawn until they show which one is meant and the expert solves one.
+MAX_DRAWS = 50
+# Share of an object that some camera shows where an instruction tells it from another one.
+MIN_SHOWN = 0.5
 
 
 def axis_angle(rotation: np.ndarray) -> np.ndarray:
@@ -116,18 +121,35 @@ class TabletopEnv(gym.Env):
     def simulator(self) -> TabletopSimulator:
         """The physics behind this environment; made on first use, in the process that uses it."""
         if self._simulator is None:
-            self._simulator = TabletopSimulator(second_bowl=ANY_TASK[self.task].is_clear is not None)
+            setting = ANY_TASK[self.task].setting
+            self._simulator = TabletopSimulator(setting.others if setting is not None else ())
         return self._simulator
 
     def reset(self, *, seed: int | None = None, options: dict | None = None) -> tuple[dict, dict[str, Any]]:
         """Draw a new layout from the seed; the options are those of Gymnasium and are not used."""
         super().reset(seed=seed)
         self._seed = seed
-        is_clear = ANY_TASK[self.task].is_clear
-        rng = self.np_random
-        self.simulator.reset(sample_layout(rng) if is_clear is None else sample_two_bowls(rng, is_clear))
+        self.simulator.reset(self._sample_layout())
         self._steps = self._held = 0
         return self._observe(), self._info("running")
+
+    def _sample_layout(self) -> Layout:
+        task, rng = ANY_TASK[self.task], self.np_random
+        if task.setting is None:
+            return sample_layout(rng)
+        if not task.setting.is_anywhere:
+            return sample_with_second(rng, task.setting.twin, task.setting.is_clear)
+        # Which of two is meant is told by looking, and what stands in the way between two places by trying.
+        for _ in range(MAX_DRAWS):
+            layout = sample_anywhere(rng, task.setting, task.parts)
+            self.simulator.reset(layout)
+            told = (task.setting.twin, scene.second(task.setting.twin))
+            is_told = min(self.simulator.shown_share(name) for name in told) >= MIN_SHOWN
+            if is_told and expert_solves(self.simulator, self.task):
+                return layout
+        raise LayoutError(
+            f"none of {MAX_DRAWS} layouts of {self.task} can be told and is solved by its expert"
+        )
 
     def step(self, action: np.ndarray) -> tuple[dict, float, bool, bool, dict[str, Any]]:
         """Apply one action and render; see :meth:`advance`."""

@@ -22,7 +22,7 @@ from lerobot_openspm.envs.motions import (
 )
 from lerobot_openspm.envs.tabletop import scene
 from lerobot_openspm.envs.tabletop.simulator import MAX_STEP_M, MAX_STEP_RAD, TabletopSimulator
-from lerobot_openspm.envs.tabletop.tasks import ANY_TASK, TASKS
+from lerobot_openspm.envs.tabletop.tasks import ANY_TASK, SUCCESS_HOLD_STEPS, TASKS
 from lerobot_openspm.geometry.se3 import transform, yaw_of
 
 TabletopHand = ScriptedHand[TabletopSimulator]
@@ -77,6 +77,19 @@ def expert_actions(
             yield from hand.retreat(scene.HOME_POSITION[2] - float(simulator.ee_pose()[2, 3]))
         yield from EXPERTS[part](hand)
     yield from hand.hold(FINAL_HOLD_STEPS)
+
+
+def expert_solves(simulator: TabletopSimulator, task: str) -> bool:
+    """Whether the expert does a task in the simulator's present scene, which it leaves changed."""
+    held = 0
+    for action in expert_actions(simulator, task, np.random.default_rng(0)):
+        simulator.apply(action)
+        if simulator.is_unstable():
+            return False
+        held = held + 1 if ANY_TASK[task].is_done(simulator) else 0
+        if held >= SUCCESS_HOLD_STEPS:
+            return True
+    return False
 
 
 @dataclass(frozen=True)

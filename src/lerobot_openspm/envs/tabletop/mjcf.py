@@ -1,6 +1,7 @@
 """The tabletop as MJCF: everything is made of MuJoCo's primitives."""
 
 import math
+from collections.abc import Sequence
 
 from lerobot_openspm.envs.tabletop import scene
 
@@ -72,7 +73,8 @@ def _inertial(mass: float, height: float, inertia: tuple) -> str:
     return f'<inertial pos="0 0 {height:g}" mass="{mass:g}" diaginertia="{diagonal}"/>'
 
 
-def _movables(second_bowl: bool) -> str:
+def _shapes() -> dict[str, tuple[str, str]]:
+    """Geoms and inertia of everything that can be moved, by name."""
     bowl = (
         _feet(0.035, 0.003, 6, "bowl")
         + _cylinder(scene.BOWL_RADIUS - 0.002, 0.001, scene.BOWL_FLOOR, "bowl")
@@ -89,14 +91,42 @@ def _movables(second_bowl: bool) -> str:
         + _cylinder(scene.BOTTLE_RADIUS, 0.002, scene.BOTTLE_BODY_HEIGHT, "bottle")
         + _cylinder(scene.BOTTLE_NECK_RADIUS, scene.BOTTLE_BODY_HEIGHT, scene.BOTTLE_HEIGHT, "bottle")
     )
-    bowl_inertial = _inertial(0.15, 0.018, (2e-4, 2e-4, 3e-4))
-    return (
-        _movable("bowl", bowl, bowl_inertial)
-        + (_movable(scene.SECOND_BOWL, bowl, bowl_inertial) if second_bowl else "")
-        + _movable("plate", plate, _inertial(0.20, 0.006, (4e-4, 4e-4, 8e-4)))
-        + _movable("box", box, _inertial(0.08, scene.BOX_HALF[2], (1.7e-5, 3e-5, 3.5e-5)))
-        + _movable("bottle", bottle, _inertial(0.20, 0.035, (2.5e-4, 2.5e-4, 6e-5)))
+    return {
+        "bowl": (bowl, _inertial(0.15, 0.018, (2e-4, 2e-4, 3e-4))),
+        "plate": (plate, _inertial(0.20, 0.006, (4e-4, 4e-4, 8e-4))),
+        "box": (box, _inertial(0.08, scene.BOX_HALF[2], (1.7e-5, 3e-5, 3.5e-5))),
+        "bottle": (bottle, _inertial(0.20, 0.035, (2.5e-4, 2.5e-4, 6e-5))),
+        "mug": (_mug(), _inertial(0.25, 0.03, (3e-4, 3e-4, 3e-4))),
+        "arch": (_arch(), _inertial(0.20, scene.ARCH_HALF[2], (2e-4, 2e-4, 2e-4))),
+    }
+
+
+def _mug() -> str:
+    """A cup with a handle, blue as the bowl."""
+    radius, top, handle = scene.MUG_RADIUS, scene.MUG_HEIGHT, scene.MUG_HANDLE
+    bars = _boxes(
+        "bowl",
+        ((0.003, 0.004, 0.022), (radius + handle - 0.003, 0, 0.045)),
+        *(((handle / 2, 0.004, 0.004), (radius + handle / 2, 0, 0.045 + z)) for z in (-0.018, 0.018)),
     )
+    floor = _feet(radius - 0.008, 0.003, 6, "bowl") + _cylinder(radius - 0.002, 0.001, 0.006, "bowl")
+    return floor + _ring(radius, 0.004, 0.002, top, 16, "bowl") + bars
+
+
+def _arch() -> str:
+    """A block with a gate in it, yellow as the box."""
+    (hx, hy, hz), (gate, top) = scene.ARCH_HALF, scene.ARCH_OPENING
+    leg = (hx - gate) / 2
+    return _boxes(
+        "box",
+        ((hx, hy, hz - top / 2), (0, 0, hz + top / 2)),
+        *(((leg, hy, top / 2), (sign * (hx - leg), 0, top / 2)) for sign in (-1, 1)),
+    )
+
+
+def _movables(others: Sequence[str]) -> str:
+    shapes = _shapes()
+    return "".join(_movable(name, *shapes[scene.kind(name)]) for name in (*scene.MOVABLE_NAMES, *others))
 
 
 def _rack() -> str:
@@ -194,8 +224,12 @@ def _excludes() -> str:
     return "".join(f'<exclude body1="{a}" body2="{b}"/>' for a, b in pairs)
 
 
-def build_mjcf(second_bowl: bool = False) -> str:
-    """Return the scene as an MJCF string; object poses are set at reset, not here."""
+def build_mjcf(others: Sequence[str] = ()) -> str:
+    """Return the scene as an MJCF string; object poses are set at reset, not here.
+
+    Args:
+        others: Names of what stands there beside the tasks' objects: distractors, and second objects.
+    """
     table = _geom("box", (0.46, 0.49, 0.02), (0.03, 0, -0.0201), "table", 'contype="0" conaffinity="0"')
     floor = _geom("box", (4, 4, 0.01), (0, 0, -0.71), "floor", 'contype="0" conaffinity="0"')
     # Walls, so that the level hand's camera sees no black horizon; a skybox is slower by half.
@@ -225,7 +259,7 @@ def build_mjcf(second_bowl: bool = False) -> str:
     <camera name="front" pos="0.945 0 1.280" xyaxes="0 1 0 -0.788 0 0.616" fovy="35"/>
     <camera name="side" pos="0.060 -0.905 1.230" xyaxes="1 0 0 0 0.788 0.616" fovy="35"/>
     <geom name="table" type="plane" size="1 1 0.1" rgba="0 0 0 0" group="4"/>
-    {table}{floor}{_hand()}{_movables(second_bowl)}{_rack()}{_cabinet()}{_stove()}
+    {table}{floor}{_hand()}{_movables(others)}{_rack()}{_cabinet()}{_stove()}
   </worldbody>
   <contact>{_excludes()}</contact>
   <equality>

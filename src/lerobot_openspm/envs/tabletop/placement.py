@@ -1,7 +1,7 @@
 """Where everything stands at the start of an episode: uniform draws, rejected when they come too close."""
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -59,7 +59,12 @@ class Placement:
         return c * dx + s * dy, -s * dx + c * dy
 
 
-def sample_layout(rng: np.random.Generator) -> dict[str, Placement]:
+Layout = dict[str, Placement]
+# Middle (x, y) and radius in the world, metres.
+Disc = tuple[float, float, float]
+
+
+def sample_layout(rng: np.random.Generator) -> Layout:
     """Draw the placement of every object, uniform within its range, given that nothing is in another's way.
 
     Args:
@@ -78,17 +83,18 @@ def sample_layout(rng: np.random.Generator) -> dict[str, Placement]:
     raise LayoutError(f"no layout without overlaps in {MAX_TRIES} tries; is the nominal layout too crowded?")
 
 
-def sample_two_bowls(
-    rng: np.random.Generator, is_clear: Callable[[dict[str, Placement]], bool]
-) -> dict[str, Placement]:
-    """Draw a placement of every object and of a second bowl, which may stand anywhere on the table.
+def sample_with_second(
+    rng: np.random.Generator, twin: str, is_clear: Callable[[Layout, str], bool]
+) -> Layout:
+    """Draw a placement of every object and of a second one of a name, which may stand anywhere on the table.
 
     Args:
         rng: Source of randomness.
-        is_clear: Whether a layout leaves no doubt which of the two bowls is meant.
+        twin: Name of the movable object that stands there twice.
+        is_clear: Whether a layout leaves no doubt which of the two is meant.
 
     Returns:
-        Placement per name in `scene.OBJECT_NAMES`, and of `scene.SECOND_BOWL`.
+        Placement per name in `scene.OBJECT_NAMES`, and of ``scene.second(twin)``.
 
     Raises:
         LayoutError: No clear draw in `MAX_TRIES`.
@@ -97,13 +103,16 @@ def sample_two_bowls(
         layout = {name: _draw(name, rng) for name in scene.OBJECT_NAMES}
         x, y = rng.uniform((TABLE_X[0], TABLE_Y[0]), (TABLE_X[1], TABLE_Y[1])).tolist()
         second = Placement(x, y, 0.0)
-        # Either bowl in the other one's place must do: their footprints keep the gap, and so does the hand.
-        swapped = {**layout, "bowl": second}
-        apart = math.hypot(x - layout["bowl"].x, y - layout["bowl"].y) > 2 * scene.BOWL_RADIUS + HAND_RADIUS
-        both = {**layout, scene.SECOND_BOWL: second}
-        if apart and is_clear(both) and is_admissible(layout) and is_admissible(swapped):
+        # Either one in the other one's place must do: their footprints keep the gap, and so does the hand.
+        swapped = {**layout, twin: second}
+        (_, _, radius), *_ = footprint_discs(twin, second)
+        apart = math.hypot(x - layout[twin].x, y - layout[twin].y) > 2 * radius + HAND_RADIUS
+        both = {**layout, scene.second(twin): second}
+        if apart and is_clear(both, twin) and is_admissible(layout) and is_admissible(swapped):
             return both
-    raise LayoutError(f"no clear layout with two bowls in {MAX_TRIES} tries; is the condition too narrow?")
+    raise LayoutError(
+        f"no clear layout with two of {twin!r} in {MAX_TRIES} tries; is the condition too narrow?"
+    )
 
 
 def _draw(name: str, rng: np.random.Generator) -> Placement:
@@ -115,7 +124,7 @@ def _draw(name: str, rng: np.random.Generator) -> Placement:
     return Placement(x + dx, y + dy, yaw)
 
 
-def is_admissible(layout: dict[str, Placement]) -> bool:
+def is_admissible(layout: Layout) -> bool:
     """Whether no two footprints come too close, all stay on the table and the tasks' ways are free."""
     discs = {name: footprint_discs(name, layout[name]) for name in scene.OBJECT_NAMES if name not in FIXTURES}
     names = list(discs)
@@ -123,15 +132,15 @@ def is_admissible(layout: dict[str, Placement]) -> bool:
         if not all(_on_table(*d) for d in discs[a]):
             return False
         for b in names[i + 1 :]:
-            if _too_close(discs[a], discs[b], GAP) or _hand_blocked(layout, discs, a, b):
+            if too_close(discs[a], discs[b], GAP) or _hand_blocked(layout, discs, a, b):
                 return False
         for fixture in FIXTURES:
-            if any(_rectangle_distance(fixture, layout[fixture], x, y) < r + GAP for x, y, r in discs[a]):
+            if any(rectangle_distance(fixture, layout[fixture], x, y) < r + GAP for x, y, r in discs[a]):
                 return False
     return _ways_are_free(layout, discs)
 
 
-def footprint_discs(name: str, at: Placement) -> list[tuple[float, float, float]]:
+def footprint_discs(name: str, at: Placement) -> list[Disc]:
     """Cover an object's footprint with discs (x, y, radius), world frame, metres."""
     if name == "rack":
         hx, hy = scene.RACK_HALF
@@ -142,25 +151,28 @@ def footprint_discs(name: str, at: Placement) -> list[tuple[float, float, float]
         "plate": scene.PLATE_RADIUS,
         "box": math.hypot(*scene.BOX_HALF[:2]),
         "bottle": scene.BOTTLE_RADIUS,
-    }[name]
+        "mug": scene.MUG_RADIUS + scene.MUG_HANDLE,
+        "arch": math.hypot(*scene.ARCH_HALF[:2]),
+    }[scene.kind(name)]
     return [(at.x, at.y, radius)]
 
 
-def _hand_discs(layout: dict[str, Placement], name: str) -> list[tuple[float, float, float]]:
+def hand_discs(layout: Layout, name: str) -> list[Disc]:
     """What the hand covers while it grasps: the bowl's rim on the +y side, the middle of the box."""
-    at = layout[name]
+    at, name = layout[name], scene.kind(name)
     if name == "bowl":
         return [(at.x, at.y + scene.BOWL_RADIUS, HAND_RADIUS)]
     return [(at.x, at.y, HAND_RADIUS)] if name == "box" else []
 
 
-def _hand_blocked(layout: dict[str, Placement], discs: dict, a: str, b: str) -> bool:
-    return _too_close(_hand_discs(layout, a), discs[b], HAND_GAP) or _too_close(
-        _hand_discs(layout, b), discs[a], HAND_GAP
+def _hand_blocked(layout: Layout, discs: dict, a: str, b: str) -> bool:
+    return too_close(hand_discs(layout, a), discs[b], HAND_GAP) or too_close(
+        hand_discs(layout, b), discs[a], HAND_GAP
     )
 
 
-def _too_close(a: list, b: list, gap: float) -> bool:
+def too_close(a: Sequence[Disc], b: Sequence[Disc], gap: float) -> bool:
+    """Whether some disc comes nearer to one of the others than a gap in metres."""
     return any(math.hypot(xa - xb, ya - yb) < ra + rb + gap for xa, ya, ra in a for xb, yb, rb in b)
 
 
@@ -173,7 +185,8 @@ def _on_table(x: float, y: float, radius: float) -> bool:
     )
 
 
-def _rectangle_distance(fixture: str, at: Placement, x: float, y: float) -> float:
+def rectangle_distance(fixture: str, at: Placement, x: float, y: float) -> float:
+    """Metres from a point of the world to a fixture's footprint, its handles with it; 0 within."""
     hx, hy = scene.CABINET_HALF if fixture == "cabinet" else scene.STOVE_HALF
     front = scene.HANDLE_X if fixture == "cabinet" else hx
     local_x, local_y = at.to_local(x, y)
@@ -186,7 +199,7 @@ def plate_goal(stove: Placement) -> tuple[float, float]:
     return stove.to_world(scene.PLATE_GOAL_X, 0.0)
 
 
-def _ways_are_free(layout: dict[str, Placement], discs: dict) -> bool:
+def _ways_are_free(layout: Layout, discs: dict) -> bool:
     """Bottle and bowl stay out of the drawers' way, and nothing between plate and stove."""
     cabinet, plate = layout["cabinet"], layout["plate"]
     for name, (way_x, way_y) in DRAWERS_WAY.items():
@@ -198,12 +211,13 @@ def _ways_are_free(layout: dict[str, Placement], discs: dict) -> bool:
         return False
     others = [d for name in discs if name != "plate" for d in discs[name]]
     return all(
-        _segment_distance((plate.x, plate.y), goal, (x, y)) > scene.PLATE_RADIUS + r + HAND_GAP
+        segment_distance((plate.x, plate.y), goal, (x, y)) > scene.PLATE_RADIUS + r + HAND_GAP
         for x, y, r in others
     )
 
 
-def _segment_distance(a: tuple, b: tuple, p: tuple) -> float:
+def segment_distance(a: tuple, b: tuple, p: tuple) -> float:
+    """Metres from a point to the straight way between two others, all (x, y)."""
     ax, ay = b[0] - a[0], b[1] - a[1]
     along = ((p[0] - a[0]) * ax + (p[1] - a[1]) * ay) / (ax * ax + ay * ay)
     along = min(max(along, 0.0), 1.0)

@@ -32,6 +32,11 @@ DRAWER_TRAVEL = 0.160
 DRAWER_HALF_WIDTH = 0.104
 DRAWER_FRONT_X = 0.110
 HANDLE_X = 0.145
+MUG_RADIUS = 0.032
+MUG_HEIGHT = 0.085
+MUG_HANDLE = 0.018
+ARCH_HALF = (0.045, 0.020, 0.035)
+ARCH_OPENING = (0.022, 0.040)
 STOVE_HALF = (0.110, 0.100)
 STOVE_HEIGHT = 0.025
 BURNER_X = -0.030
@@ -49,12 +54,22 @@ OBJECT_NAMES = ("bowl", "plate", "box", "bottle", "rack", "cabinet", "stove")
 # Numbers in the simulator's own segmentation; 0 is everything else.
 OBJECT_LABELS = {name: number for number, name in enumerate(OBJECT_NAMES, 1)}
 MOVABLE_NAMES = ("bowl", "plate", "box", "bottle")
-# Another bowl just like the first, only in scenes whose instruction tells which one is meant.
-SECOND_BOWL = "second_bowl"
+# Never demonstrated, and of the colours of bowl and box: only their shapes tell that they are neither.
+DISTRACTOR_NAMES = ("mug", "arch")
 DRAWER_NAMES = ("drawer_bottom", "drawer_middle", "drawer_top")
 CAMERA_NAMES = ("front", "side", "wrist")
 # The frame that carries each camera.
 CAMERA_MOUNTS: dict[str, Literal["world", "ee"]] = {"front": "world", "side": "world", "wrist": "ee"}
+
+
+def second(name: str) -> str:
+    """Name of another object just like a movable one, in scenes whose instruction tells which is meant."""
+    return f"second_{name}"
+
+
+def kind(name: str) -> str:
+    """What an object is: the name of the one that it is just like, if it is a second one."""
+    return name.removeprefix("second_")
 
 
 def drawer_height(index: int) -> float:

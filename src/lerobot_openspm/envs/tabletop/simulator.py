@@ -32,13 +32,15 @@ SETTLE_STEPS = 120
 FINGER_OPEN_M = scene.FINGER_TRAVEL
 # Beyond closed, so that the position drive keeps pressing on whatever is between the fingers.
 FINGER_CLOSED_M = -0.02
+# What objects stand on is small, out of sight, and drawn by no camera.
+FEET_GROUP = 4
 HAND_BODIES = ("hand", "finger_left", "finger_right")
 
 
 @functools.cache
-def compiled_model(second_bowl: bool = False) -> mujoco.MjModel:
+def compiled_model(others: tuple[str, ...] = ()) -> mujoco.MjModel:
     """Compile a scene once per process; every simulator works on its own copy."""
-    return mujoco.MjModel.from_xml_string(build_mjcf(second_bowl))
+    return mujoco.MjModel.from_xml_string(build_mjcf(others))
 
 
 def _bounded(vector: np.ndarray, limit: float) -> np.ndarray:
@@ -50,16 +52,19 @@ class TabletopSimulator:
     """One tabletop. Instances share nothing but the compiled model, of which each has its own copy.
 
     Args:
-        second_bowl: Whether there is another bowl just like the first, `scene.SECOND_BOWL`.
+        others: Names of what stands there beside the tasks' objects: distractors, and second objects.
+
+    Attributes:
+        movable: Names of all objects that can be moved, those others among them.
     """
 
-    def __init__(self, second_bowl: bool = False) -> None:
-        self.model: mujoco.MjModel = copy.copy(compiled_model(second_bowl))
+    def __init__(self, others: tuple[str, ...] = ()) -> None:
+        self.model: mujoco.MjModel = copy.copy(compiled_model(others))
         self.data = mujoco.MjData(self.model)
-        self._movable = (*scene.MOVABLE_NAMES, *((scene.SECOND_BOWL,) if second_bowl else ()))
+        self.movable = (*scene.MOVABLE_NAMES, *others)
         fingers = ("finger_left", "finger_right")
-        bodies = ("hand", *scene.OBJECT_NAMES, *self._movable, *scene.DRAWER_NAMES, "knob", *fingers)
-        joints = ("hand", *fingers, "knob", *self._movable, *scene.DRAWER_NAMES)
+        bodies = ("hand", *scene.OBJECT_NAMES, *self.movable, *scene.DRAWER_NAMES, "knob", *fingers)
+        joints = ("hand", *fingers, "knob", *self.movable, *scene.DRAWER_NAMES)
         self._body = {n: self.model.body(n).id for n in bodies}
         self._qpos = {n: int(self.model.joint(n).qposadr[0]) for n in joints}
         self._dof = {n: int(self.model.joint(n).dofadr[0]) for n in joints}
@@ -73,7 +78,7 @@ class TabletopSimulator:
         mujoco.mj_resetData(self.model, self.data)
         for name, at in layout.items():
             quat_wxyz = (math.cos(at.yaw / 2), 0.0, 0.0, math.sin(at.yaw / 2))
-            if name in self._movable:
+            if name in self.movable:
                 start = self._qpos[name]
                 self.data.qpos[start : start + 7] = (at.x, at.y, 0.0, *quat_wxyz)
             else:
@@ -172,7 +177,7 @@ class TabletopSimulator:
     def is_at_rest(self, name: str, linear: float = 0.02, angular: float = 0.4) -> bool:
         """Whether an object, a drawer or the knob moves slower than `linear` m/s and `angular` rad/s."""
         start = self._dof[name]
-        if name not in self._movable:
+        if name not in self.movable:
             return abs(self.data.qvel[start]) < (angular if name == "knob" else linear)
         velocity = self.data.qvel[start : start + 6]
         return bool(np.linalg.norm(velocity[:3]) < linear and np.linalg.norm(velocity[3:]) < angular)
@@ -204,6 +209,27 @@ class TabletopSimulator:
         """
         return self._renderer.labels(self.data, camera, height, width)
 
+    def shown_share(self, name: str) -> float:
+        """Share of an object's geoms whose middle the camera that shows most of them sees."""
+        geoms = np.flatnonzero(self.model.geom_bodyid == self._body[name])
+        geoms = geoms[self.model.geom_group[geoms] != FEET_GROUP]
+        return max(
+            float(np.mean([self._is_shown(camera, int(geom)) for geom in geoms]))
+            for camera in scene.CAMERA_NAMES
+        )
+
+    def _is_shown(self, camera: str, geom: int) -> bool:
+        index = self.model.camera(camera).id
+        origin, at = self.data.cam_xpos[index], self.data.geom_xpos[geom]
+        p_cam = self.data.cam_xmat[index].reshape(3, 3).T @ (at - origin)  # MuJoCo's cameras look along -z
+        half = math.tan(math.radians(float(self.model.cam_fovy[index])) / 2)
+        if p_cam[2] >= 0 or np.abs(p_cam[:2]).max() > -half * p_cam[2]:
+            return False
+        hit = np.full(1, -1, np.int32)
+        groups = np.array([1, 1, 1, 1, 0, 1], np.uint8)
+        mujoco.mj_ray(self.model, self.data, origin, at - origin, groups, 1, -1, hit)
+        return bool(hit[0] >= 0) and self.model.geom_bodyid[hit[0]] == self.model.geom_bodyid[geom]
+
     def render_depth(self, camera: str, height: int, width: int) -> np.ndarray:
         """Distance along the optical axis of what each pixel shows, (height, width) float32 metres."""
         return self._renderer.depth(self.data, camera, height, width)
@@ -214,8 +240,8 @@ class TabletopSimulator:
         roots = self.model.body_rootid[self.model.geom_bodyid]
         for name, number in scene.OBJECT_LABELS.items():
             labels[roots == self._body[name]] = number
-        if scene.SECOND_BOWL in self._body:
-            labels[roots == self._body[scene.SECOND_BOWL]] = scene.OBJECT_LABELS["bowl"]
+        for name in self.movable:
+            labels[roots == self._body[name]] = scene.OBJECT_LABELS.get(scene.kind(name), 0)
         return labels
 
     def close(self) -> None:

@@ -1,7 +1,8 @@
 """The ten tasks: their instructions, and the physical predicates that say when one is done.
 
 Beside them, five tasks that are made of two of the ten: the parts can be demonstrated, the whole never is.
-And five of the ten with a second bowl on the table, where the instruction says which bowl is meant.
+And five of the ten with a second bowl on the table, where the instruction says which bowl is meant; and all
+ten with everything anywhere on the table, beside distractors and a second object of the kind.
 """
 
 from __future__ import annotations
@@ -14,7 +15,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from lerobot_openspm.envs.selection import select
-from lerobot_openspm.envs.tabletop import scene, two_bowls
+from lerobot_openspm.envs.tabletop import scene, settings
+from lerobot_openspm.envs.tabletop.settings import Setting
 
 if TYPE_CHECKING:
     from lerobot_openspm.envs.tabletop.simulator import TabletopSimulator
@@ -25,6 +27,8 @@ DRAWER_OPEN_M = 0.10
 KNOB_ON_RAD = math.radians(75)
 PLATE_TOLERANCE_M = 0.03
 STEPS_PER_PART = 300
+# Goals have to hold for so many control steps in a row.
+SUCCESS_HOLD_STEPS = 5
 UPRIGHT_COSINE = math.cos(math.radians(20))
 
 
@@ -108,15 +112,14 @@ class Task:
         instruction: What to say.
         is_done: Whether the goal is reached now.
         parts: Names of the tasks that it is made of, in the order of the instruction; none for the ten.
-        is_clear: Whether a layout with a second bowl leaves no doubt that the first one is meant; None where
-            there is one bowl.
+        setting: What else stands there; None where nothing does.
     """
 
     name: str
     instruction: str
     is_done: Predicate
     parts: tuple[str, ...] = ()
-    is_clear: two_bowls.Condition | None = None
+    setting: Setting | None = None
 
     @property
     def max_steps(self) -> int:
@@ -171,37 +174,80 @@ COMPOUND_TASKS = _by_name(
 )
 
 
-def _of_two_bowls(name: str, like: str, instruction: str, is_clear: two_bowls.Condition) -> Task:
-    """A task of the ten, done with the one of two bowls that the instruction names."""
-    return Task(name, instruction, TASKS[like].is_done, (like,), is_clear)
+def _of_two(name: str, like: str, instruction: str, setting: Setting) -> Task:
+    """A task of the ten, done with the one of two objects that the instruction names."""
+    return Task(name, instruction, TASKS[like].is_done, (like,), setting)
 
 
 # Not among "all" either: no demonstration shows two bowls.
 TWO_BOWL_TASKS = _by_name(
-    _of_two_bowls(
+    _of_two(
         "bowl_next_to_rack_on_plate",
         "bowl_on_plate",
         "pick up the bowl next to the rack and put it on the plate",
-        two_bowls.next_to("rack"),
+        Setting("bowl", settings.next_to("rack")),
     ),
-    _of_two_bowls(
+    _of_two(
         "bowl_between_plate_and_box_on_stove",
         "bowl_on_stove",
         "put the bowl between the plate and the cream cheese box on the stove",
-        two_bowls.between("plate", "box"),
+        Setting("bowl", settings.between("plate", "box")),
     ),
-    _of_two_bowls(
+    _of_two(
         "bowl_next_to_box_on_cabinet",
         "bowl_on_cabinet",
         "pick up the bowl next to the cream cheese box and place it on top of the cabinet",
-        two_bowls.next_to("box"),
+        Setting("bowl", settings.next_to("box")),
     ),
-    _of_two_bowls("left_bowl_on_plate", "bowl_on_plate", "put the left bowl on the plate", two_bowls.left),
-    _of_two_bowls("right_bowl_on_stove", "bowl_on_stove", "put the right bowl on the stove", two_bowls.right),
+    _of_two(
+        "left_bowl_on_plate",
+        "bowl_on_plate",
+        "put the left bowl on the plate",
+        Setting("bowl", settings.left),
+    ),
+    _of_two(
+        "right_bowl_on_stove",
+        "bowl_on_stove",
+        "put the right bowl on the stove",
+        Setting("bowl", settings.right),
+    ),
+)
+
+
+def _anywhere(like: str, instruction: str, twin: str, is_clear: settings.Condition) -> Task:
+    return _of_two(f"{like}_anywhere", like, instruction, Setting(twin, is_clear, is_anywhere=True))
+
+
+# Not among "all" either. A second cabinet or stove finds no room: there a second bowl stands about.
+ANYWHERE_TASKS = _by_name(
+    _anywhere("bowl_on_plate", "put the left bowl on the plate", "bowl", settings.left),
+    _anywhere("bowl_on_stove", "put the right bowl on the stove", "bowl", settings.right),
+    _anywhere(
+        "bowl_on_cabinet",
+        "pick up the bowl next to the cream cheese box and place it on top of the cabinet",
+        "bowl",
+        settings.next_to("box"),
+    ),
+    _anywhere("box_in_bowl", "put the left cream cheese box in the bowl", "box", settings.left),
+    _anywhere(
+        "bottle_on_cabinet", "put the right wine bottle on top of the cabinet", "bottle", settings.right
+    ),
+    _anywhere("bottle_on_rack", "put the left wine bottle on the rack", "bottle", settings.left),
+    _anywhere("open_middle_drawer", "open the middle drawer of the cabinet", "bowl", settings.not_told),
+    _anywhere(
+        "bowl_in_top_drawer", "open the top drawer and put the left bowl inside", "bowl", settings.left
+    ),
+    _anywhere("push_plate", "push the right plate to the front of the stove", "plate", settings.right),
+    _anywhere("turn_on_stove", "turn on the stove", "bowl", settings.not_told),
 )
 # Every task that can be named; a task's number is its place here.
-ANY_TASK = {**TASKS, **COMPOUND_TASKS, **TWO_BOWL_TASKS}
-SELECTIONS = {"all": TASK_NAMES, "compound": tuple(COMPOUND_TASKS), "two_bowls": tuple(TWO_BOWL_TASKS)}
+ANY_TASK = {**TASKS, **COMPOUND_TASKS, **TWO_BOWL_TASKS, **ANYWHERE_TASKS}
+SELECTIONS = {
+    "all": TASK_NAMES,
+    "compound": tuple(COMPOUND_TASKS),
+    "two_bowls": tuple(TWO_BOWL_TASKS),
+    "anywhere": tuple(ANYWHERE_TASKS),
+}
 
 
 def select_tasks(spec: str) -> list[str]:

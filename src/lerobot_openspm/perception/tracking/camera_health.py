@@ -1,9 +1,14 @@
-"""Which cameras can be believed: frames that are missing, black or frozen are no evidence of anything."""
+"""Which cameras can be believed.
+
+Frames that are missing, black or frozen are no evidence of anything. A camera that shows objects elsewhere
+than the other cameras do was moved, or its calibration is wrong.
+"""
 
 from __future__ import annotations
 
+import itertools
 import zlib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -19,6 +24,12 @@ MIN_CONTRAST = 2.0
 MOVED_M = 0.02
 # ... and one that moved less than this need not have.
 STILL_M = 0.001
+# Two cameras disagree if even the objects that they agree on best, this share of all, lie further apart than
+# this: by one view alone some objects are seen badly, but a camera that is off shifts all of them. Of fewer
+# than so many objects only the best one counts.
+BEST_SHARE, FEW, DISAGREE_M = 0.35, 5, 0.007
+# So many objects must be seen by both.
+MIN_COMMON = 3
 
 
 @dataclass
@@ -80,3 +91,44 @@ def _shows(view: View, T_world_ee: Array) -> bool:
     uv, depth = project(view.camera, view.T_world_cam, T_world_ee[:3, 3])
     size = np.array([view.camera.width, view.camera.height])
     return bool(depth > 0 and (uv > 0).all() and (uv < size - 1).all())
+
+
+def disagreements(places: Mapping[str, Mapping[str, Sequence[Array]]]) -> dict[str, str]:
+    """The cameras that show objects elsewhere than others do, and by how much, in words.
+
+    Where it cannot be told which of two is off, both are named.
+
+    Args:
+        places: By camera and object: where it stands ``(2,)``, metres, as this camera alone shows it; several
+            places where several objects look like it.
+    """
+    apart = {
+        pair: distances
+        for pair in itertools.combinations(places, 2)
+        if len(distances := _distances(*(places[camera] for camera in pair))) >= MIN_COMMON
+    }
+    off = {pair: _agreed(one) > DISAGREE_M for pair, one in apart.items()}
+    agreeing = {camera for pair, is_off in off.items() if not is_off for camera in pair}
+    suspects = {camera for pair, is_off in off.items() if is_off for camera in pair}
+    found: dict[str, str] = {}
+    for camera in sorted(suspects - agreeing):
+        others = [pair for pair, is_off in off.items() if is_off and camera in pair]
+        median_mm = 1000 * float(np.median(np.concatenate([apart[pair] for pair in others])))
+        names = sorted({name for pair in others for name in pair} - {camera})
+        found[camera] = (
+            f"views disagree: it shows objects {median_mm:.0f} mm from where {' and '.join(names)} do; "
+            "check where it is mounted, and calibrate it again"
+        )
+    return found
+
+
+def _distances(a: Mapping[str, Sequence[Array]], b: Mapping[str, Sequence[Array]]) -> Array:
+    """Metres between where two cameras show each object that both of them show."""
+    both = [name for name in a if a[name] and b.get(name)]
+    return np.array([min(float(np.linalg.norm(p - q)) for p in a[name] for q in b[name]) for name in both])
+
+
+def _agreed(distances: Array) -> float:
+    """How far apart at most the objects lie, metres, that two cameras agree on best."""
+    count = 1 if len(distances) < FEW else int(np.ceil(BEST_SHARE * len(distances)))
+    return float(np.sort(distances)[count - 1])

@@ -24,7 +24,7 @@ CORRELATED_PX = 4.0
 MIN_RESIDUAL_PX = 0.4
 MIN_VISIBLE_SHARE = 0.35
 # Relative to the overlap that is typical of the object's demonstrations.
-FOUND_CONFIDENCE = 0.5
+FOUND_CONFIDENCE = 0.74
 RIVAL_SHARE = 0.93
 # A further place must explain the images so well to count as another object of the kind.
 ANOTHER_CONFIDENCE = 0.75

@@ -15,6 +15,7 @@ from lerobot_openspm.geometry.se3 import Array
 from lerobot_openspm.perception.objects.base import Examples, Kind
 from lerobot_openspm.perception.objects.mask_association import segmented
 from lerobot_openspm.perception.objects.shape import colour_bootstrap, hull
+from lerobot_openspm.perception.objects.shape.colouring import learn_colours
 from lerobot_openspm.perception.objects.shape.first_poses import (
     Patched,
     coloured,
@@ -344,7 +345,9 @@ def _model(
     )
     yaw_centre, halfwidth = search_range(yaws, period)
     height = float(np.median([scene.T_world_obj[2, 3] for scene in posed])) + bottom
+    # What has no sides needs no colours to tell them by.
+    colours = learn_colours(posed, cloud) if period == 2 * np.pi else None
     return ShapeModel(
         name, log_odds, points.astype(np.float32), cloud.spacing, height, period, yaw_centre, halfwidth,
-        float(np.median(scores)),
+        float(np.median(scores)), colours,
     )  # fmt: skip

@@ -7,7 +7,7 @@ aligning silhouettes. An object that is followed is looked for where it is expec
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, ClassVar
 
 import numpy as np
@@ -20,6 +20,7 @@ from lerobot_openspm.geometry.se3 import Array
 from lerobot_openspm.perception import foreground
 from lerobot_openspm.perception.objects import records
 from lerobot_openspm.perception.objects.base import Look, Record
+from lerobot_openspm.perception.objects.shape.colouring import agreement
 from lerobot_openspm.perception.objects.shape.fitting import (
     COARSE_CUTS_PX,
     COARSE_PX,
@@ -33,6 +34,7 @@ from lerobot_openspm.perception.objects.shape.fitting import (
     others,
     verdict,
 )
+from lerobot_openspm.perception.objects.shape.tipped import NEAR_M, has_tipped, lying
 from lerobot_openspm.perception.objects.yaw import canonical
 from lerobot_openspm.types import UNKNOWN_YAW_STD, PoseEstimate, Support, Symmetry
 
@@ -42,6 +44,10 @@ MAX_CANDIDATES = 3
 WEAK_SHARE = 0.2
 # Candidates that fit less than 70 % as well as the best one are not fitted more finely.
 POOR_SHARE = 0.7
+# Yaws whose fits are this good, relative to the best one's, and this far apart, are sides to choose among.
+SIDES_SHARE, SAME_SIDE_RAD = 0.85, 0.4
+# What the agreement of the colours counts beside that of the silhouettes.
+COLOURS_SHARE = 2.0
 # Visibility is estimated on every 5th point.
 SHARE_STEP = 5
 # An object that is followed: how far from where it is expected it is looked for before everywhere else, and
@@ -72,6 +78,8 @@ class ShapeModel:
         yaw_centre: Middle of the yaws seen in the demonstrations, radians.
         yaw_halfwidth: Half the width of the range of yaws to search, at most ``yaw_period / 2``, radians.
         typical_overlap: Intersection over union of drawing and mask, median over the demonstrations.
+        colours: Colours ``(n, 3)`` of the points, see :func:`learn_colours`, which tell its sides apart; None
+            where its yaw is searched in the demonstrated range alone.
     """
 
     kind: ClassVar[str] = "shape"
@@ -85,6 +93,7 @@ class ShapeModel:
     yaw_centre: float
     yaw_halfwidth: float
     typical_overlap: float
+    colours: NDArray[np.float32] | None = None
 
     @property
     def radius(self) -> float:
@@ -100,9 +109,11 @@ class ShapeModel:
         """Yaws ``(k,)`` in radians to start a search from, at most about 45 degrees apart."""
         if self.yaw_period == 0:
             return np.zeros(1)
-        count = max(1, int(np.ceil(2 * self.yaw_halfwidth / np.deg2rad(46))))
+        # Demonstrations that all show one side say nothing of how it stands elsewhere.
+        halfwidth = self.yaw_halfwidth if self.colours is None else self.yaw_period / 2
+        count = max(1, int(np.ceil(2 * halfwidth / np.deg2rad(46))))
         steps = (np.arange(count) + 0.5) / count * 2 - 1
-        return self.yaw_centre + steps * self.yaw_halfwidth
+        return self.yaw_centre + steps * halfwidth
 
     @property
     def symmetry(self) -> Symmetry | None:
@@ -118,17 +129,48 @@ class ShapeModel:
             there = fit(evidence, self.cloud, T_expected, _nearby(self, T_expected), NEARBY_CUTS_PX)
             fits = [there] if there.score >= NEARBY_CONFIDENCE * self.typical_overlap else []
         if not fits:
-            prior, starts = PosePrior(yaw=0.0 if self.yaw_period == 0 else np.inf), list[Fit]()
+            prior, starts = PosePrior(yaw=0.0 if self.yaw_period == 0 else np.inf), list[list[Fit]]()
             for point in candidates(evidence, self):
                 poses = [se3.from_yaw(point, yaw) for yaw in self.search_yaws()]
-                turned = [fit(evidence, self.cloud, T, prior, COARSE_CUTS_PX, COARSE_PX) for T in poses]
-                starts.append(max(turned, key=lambda one: one.score))
-            enough = POOR_SHARE * max((one.score for one in starts), default=0.0)
-            good = [one.T_world_obj for one in starts if one.score > 0 and one.score >= enough]
-            fits = [fit(evidence, self.cloud, T, prior, FINE_CUTS_PX) for T in good]
+                starts.append([fit(evidence, self.cloud, T, prior, COARSE_CUTS_PX, COARSE_PX) for T in poses])
+            enough = POOR_SHARE * max((one.score for turned in starts for one in turned), default=0.0)
+            for turned in starts:
+                best = max(one.score for one in turned)
+                if best > 0 and best >= enough:
+                    fits.append(self._finely(evidence, turned, prior))
             fits.sort(key=lambda one: -one.score)
             fits = [fits[i] for i in distinct([one.T_world_obj for one in fits], self.radius)]
+            if fits and self._has_tipped(evidence, fits[0]):
+                return replace(self._estimate(look, evidence, fits), status="not_found", tipped=True)
         return self._estimate(look, evidence, fits)
+
+    def _has_tipped(self, evidence: Sequence[Evidence], best: Fit) -> bool:
+        """Whether the object lies about where it fits best upright."""
+        there = [
+            point
+            for point in candidates(evidence, self)
+            if np.linalg.norm(point[:2] - best.T_world_obj[:2, 3]) < NEAR_M
+        ]
+        sides = lying(self.cloud, self.yaw_period == 0)
+        return has_tipped(evidence, sides, there, best.score, self.typical_overlap)
+
+    def _finely(self, evidence: Sequence[Evidence], turned: Sequence[Fit], prior: PosePrior) -> Fit:
+        """The best of the fits at one place, at several yaws, fitted finely.
+
+        Where silhouettes are nearly alike from several sides, the colours of these decide.
+        """
+        ordered = sorted(turned, key=lambda one: -one.score)
+        if (colours := self.colours) is None:
+            return fit(evidence, self.cloud, ordered[0].T_world_obj, prior, FINE_CUTS_PX)
+        sides = list[Fit]()
+        for one in ordered:
+            apart = [float(se3.distances(one.T_world_obj, side.T_world_obj)[1]) for side in sides]
+            if one.score >= SIDES_SHARE * ordered[0].score and min(apart, default=np.inf) > SAME_SIDE_RAD:
+                sides.append(one)
+        fits = [fit(evidence, self.cloud, one.T_world_obj, prior, FINE_CUTS_PX) for one in sides]
+        shown = [agreement(evidence, self.cloud, colours, one.T_world_obj) for one in fits]
+        worth = [one.score + COLOURS_SHARE * share for one, share in zip(fits, shown, strict=True)]
+        return fits[int(np.argmax(worth))]
 
     def _estimate(self, look: Look, evidence: Sequence[Evidence], fits: Sequence[Fit]) -> PoseEstimate:
         """What fits at distinct places say, the best first."""
@@ -157,6 +199,8 @@ class ShapeModel:
         arrays = {"points": self.points.astype(np.float32)}
         if self.log_odds is not None:
             arrays = {"log_odds": self.log_odds.astype(np.float32), **arrays}
+        if self.colours is not None:
+            arrays = {**arrays, "colours": self.colours.astype(np.float32)}
         return fields | {name: float(getattr(self, name)) for name in NUMBERS}, arrays
 
 
@@ -172,7 +216,8 @@ def from_record(fields: Mapping[str, Any], arrays: Mapping[str, NDArray[Any]], w
     points = records.array(arrays, "points", (-1, 3), where)
     if not 8 <= len(points) <= MAX_POINTS:
         raise MemoryFormatError(f"{where}: 'points' has {len(points)} rows, expected 8 to {MAX_POINTS}")
-    return ShapeModel(name, log_odds, points, **numbers)
+    shown = records.array(arrays, "colours", points.shape, where) if "colours" in arrays else None
+    return ShapeModel(name, log_odds, points, **numbers, colours=shown)
 
 
 def _evidence(model: ShapeModel, look: Look) -> list[Evidence]:

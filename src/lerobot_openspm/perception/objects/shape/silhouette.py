@@ -20,6 +20,8 @@ from lerobot_openspm.types import View
 
 Float32 = NDArray[np.float32]
 PAD_PX = 6
+# Points this near the edge make up the rim, where the half voxel that they lie inside of it is no more.
+RIM_PX = 1.5
 
 
 @dataclass(frozen=True)
@@ -31,12 +33,14 @@ class Drawing:
         distance: Signed distance to the silhouette's edge over the crop, pixels.
         corner: Image coordinates ``(2,)`` of the crop's first pixel.
         scale: Crop pixels per image pixel.
+        rim: Signed distance, in pixels, within which a point belongs to the rim.
     """
 
     uv: Array
     distance: Float32
     corner: Array
     scale: float
+    rim: float = RIM_PX
 
     def sample(self, field: Float32, uv: Array) -> Float32:
         """Bilinear values ``(n,)`` of a crop-shaped field at image coordinates ``(n, 2)``."""
@@ -112,7 +116,7 @@ def draw(
     )
     # The points are centres of voxels: the surface is half a voxel further out.
     distance = signed_distance(np.asarray(mask, np.uint8)) / scale + spacing_px / 2
-    return Drawing(uv, distance.astype(np.float32), corner, scale)
+    return Drawing(uv, distance.astype(np.float32), corner, scale, max(RIM_PX, spacing_px / 2 + 1.0))
 
 
 def overlap(drawing: Drawing, probability: Float32, visible: Float32 | None) -> tuple[float, float, float]:
@@ -160,7 +164,7 @@ def normal_equations(
     u, v = drawing.uv[:, 0], drawing.uv[:, 1]
     inside = (u > 1) & (u < size[0] - 2) & (v > 1) & (v < size[1] - 2)
     own = drawing.sample(drawing.distance, drawing.uv)
-    rim = np.flatnonzero(inside & (own < 1.5))
+    rim = np.flatnonzero(inside & (own < drawing.rim))
     if len(rim) < 8:
         return np.zeros((4, 4)), np.zeros(4), 0.0, 0.0
     uv = drawing.uv[rim]

@@ -1,0 +1,36 @@
+"""Why an instruction cannot be carried out in a scene, in words that name the objects."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+from lerobot_openspm.memory.robot import RobotModel
+from lerobot_openspm.types import Hand, PoseEstimate
+
+# Fingers that are open by such a share are around something, as far as can be felt.
+FINGERS_AROUND = (0.03, 0.9)
+
+
+def why_missing(
+    missing: Sequence[str], estimates: Mapping[str, PoseEstimate], hand: Hand, robot: RobotModel
+) -> str:
+    """What is known of objects that were not found.
+
+    Args:
+        missing: Their names, at least one.
+        estimates: What the last look brought, by name.
+        hand: The hand, which may hold one of them.
+        robot: The robot.
+    """
+    reasons = list[str]()
+    for name in missing:
+        if name in estimates and estimates[name].tipped:
+            reasons.append(f"the {name} has tipped over")
+        elif name in estimates and estimates[name].status == "ambiguous":
+            reasons.append(f"cannot tell which {name} is meant, or where it stands")
+        else:
+            reasons.append(f"cannot find the {name}: it is in no view, hidden, or not as it was shown")
+    low, high = FINGERS_AROUND
+    if low < hand.opening / robot.open_width < high:
+        reasons.append("the fingers are around something, which may be it")
+    return "; ".join(reasons)

@@ -1,0 +1,27 @@
+import numpy as np
+import pytest
+from tests.memory.builders import OPEN_WIDTH, hand_pose, robot
+
+from lerobot_openspm.control.reasons import why_missing
+from lerobot_openspm.types import Hand, PoseEstimate
+
+
+@pytest.mark.parametrize(
+    ("status", "tipped", "words"),
+    [
+        ("not_found", True, "the bowl has tipped over"),
+        ("ambiguous", False, "cannot tell which bowl is meant"),
+        ("not_found", False, "cannot find the bowl: it is in no view"),
+    ],
+)
+def test_each_missing_object_is_named_with_what_is_known_of_it(status, tipped, words):
+    estimate = PoseEstimate(status, np.eye(4), np.eye(4), 0.0, tipped=tipped)
+    told = why_missing(["bowl", "plate"], {"bowl": estimate}, Hand(hand_pose(0, 0, 0.3), OPEN_WIDTH), robot())
+    assert told.startswith(words)
+    assert "cannot find the plate" in told
+    assert "fingers" not in told
+
+
+def test_what_is_missing_may_be_in_the_hand():
+    told = why_missing(["bowl"], {}, Hand(hand_pose(0, 0, 0.3), OPEN_WIDTH / 3), robot())
+    assert told.endswith("the fingers are around something, which may be it")
