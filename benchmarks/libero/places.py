@@ -56,7 +56,7 @@ class PlacesConfig:
 
     Args:
         suite: libero_goal, libero_spatial or libero_object.
-        exchanged: Whether things change places in the scenes (libero_goal only).
+        exchanged: Whether things change places in the scenes, see `variants`.
         demos: Demonstrations a task to learn from.
         scenes: In all, as many of each task.
         dataset: The demonstrations; recorded if not given.
@@ -75,8 +75,6 @@ class PlacesConfig:
     def __post_init__(self) -> None:
         if self.suite not in OBJECTS:
             raise ValueError(f"suite is {self.suite!r}, expected one of {', '.join(OBJECTS)}")
-        if self.exchanged and self.suite != SUITE:
-            raise ValueError(f"things change places in {SUITE} only, got {self.suite}")
 
     @property
     def simulator(self) -> str:
