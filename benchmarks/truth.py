@@ -23,7 +23,7 @@ from lerobot_openspm.perception.oracle import name_simulator_poses
 from lerobot_openspm.training import open_demonstrations
 
 # Objects that truly turn into themselves, by a word of their name; what was learned may differ.
-ROUND, HALF_TURN = ("bowl", "plate", "bottle"), ("box", "cheese")
+ROUND, HALF_TURN = ("bowl", "plate", "bottle"), ("box", "cheese", "basket")
 # Metres and radians off; None where the object was not found, or its yaw says nothing.
 type Error = tuple[float | None, float | None]
 
@@ -40,7 +40,13 @@ def offsets(checkpoint: Path, dataset: Path) -> dict[str, Array]:
     demonstrations = open_demonstrations(
         dataset_metadata("local/demonstrations", str(dataset)), policy.config
     )
-    return {name: _offset(memory, name, demonstrations) for name in memory.objects}
+    return offsets_in(memory, demonstrations)
+
+
+def offsets_in(memory: Memory, demonstrations: Demonstrations) -> dict[str, Array]:
+    """As :func:`offsets`, of the objects that were found in the demonstrations they were learned from."""
+    found = {name for entry in memory.entries for name in entry.object_poses}
+    return {name: _offset(memory, name, demonstrations) for name in memory.objects if name in found}
 
 
 def _offset(memory: Memory, name: str, demonstrations: Demonstrations) -> Array:

@@ -152,10 +152,10 @@ def evaluate_one(config: EvaluationConfig, task: str, state: int) -> Row:
     seed = (config.tuning_seed if config.tuning else SEED) + state
     is_exchanged = config.tuning and config.suite != SUITE
     file = exchanged(task, seed) if is_exchanged else variant_file(config.suite, task)
-    policy, simulator = _policy(config), _simulator(task, file)
+    policy, simulator = _policy(config), kept_simulator(task, file)
     if config.tuning:
         simulator.reset(seed)
-        _move_hand(simulator, np.random.default_rng(seed))
+        move_hand(simulator, np.random.default_rng(seed))
     else:
         simulator.reset_to(seed, variant_states(config.suite, task)[state])
     sub_tasks = parse_instruction(simulator.instruction)
@@ -177,7 +177,7 @@ def evaluate_one(config: EvaluationConfig, task: str, state: int) -> Row:
     return {"task": task, "state": state, "seed": seed, **episode.told(), **found}
 
 
-def _move_hand(simulator: LiberoSimulator, rng: np.random.Generator) -> None:
+def move_hand(simulator: LiberoSimulator, rng: np.random.Generator) -> None:
     """Begin elsewhere, as the benchmark's own states do; a seeded reset always begins in the same place."""
     towards = rng.uniform(-0.6, 0.6, size=3)
     for share in (1.0, 1.0, 1.0, 0.0, 0.0):
@@ -204,7 +204,8 @@ def _policy(config: EvaluationConfig) -> OpenSPMPolicy:
     return _KEPT["policy"]
 
 
-def _simulator(task: str, file: Path | None) -> LiberoSimulator:
+def kept_simulator(task: str, file: Path | None) -> LiberoSimulator:
+    """A task's simulator, the same one as before if it was asked for last; else that is closed."""
     if _KEPT.get("scene") != (task, file):
         if "simulator" in _KEPT:
             _KEPT["simulator"].close()

@@ -28,7 +28,7 @@ from benchmarks.libero.guessed_key_poses import (
 )
 from benchmarks.results import run
 
-from lerobot_openspm.envs.libero.simulator import OBJECTS, LiberoSimulator, tasks
+from lerobot_openspm.envs.libero.simulator import OBJECTS, SUITE, LiberoSimulator, tasks
 from lerobot_openspm.errors import PhaseLabelError
 from lerobot_openspm.geometry import se3
 from lerobot_openspm.geometry.se3 import Array
@@ -241,7 +241,7 @@ class _Guesser:
 
 def _box(simulator: LiberoSimulator, noun: str) -> tuple[Array, Array]:
     """Centre of an object's box ``(3,)`` from its origin, and its size ``(3,)``, along the world's axes."""
-    name = next(name for name in OBJECTS if name in noun.split())
+    name = next(name for name in OBJECTS[SUITE] if name in noun.split())
     model, data = simulator.sim.model._model, simulator.sim.data._data
     body = simulator.root_body(name)
     root = model.body(body).id

@@ -1,4 +1,4 @@
-"""Variants of libero_goal's tasks: LIBERO-PRO's, from its own files, and exchanges of our own to tune on."""
+"""Variants of LIBERO's tasks: LIBERO-PRO's of libero_goal, from its own files, and exchanges of our own."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import numpy as np
 from benchmarks.libero.pro_objects import register_objects
 from benchmarks.worlds import initial_states
 
-from lerobot_openspm.envs.libero.simulator import SUITE, task_file
+from lerobot_openspm.envs.libero.simulator import SUITE, suite_of, task_file
 
 # LIBERO-PRO's: things change places, look otherwise, or the instructions are worded otherwise.
 OTHER_OBJECTS = "libero_goal_object"
@@ -23,6 +23,8 @@ FURNITURE = (("wooden_cabinet_1", "wine_rack_1"), ("wooden_cabinet_1", "flat_sto
 STOVE, SMALLEST = "flat_stove_1", "cream_cheese_1"
 # How often furniture changes places too, and how often it is the stove with a thing.
 FURNITURE_SHARE, STOVE_SHARE = 0.4, 0.2
+# What stays where it is in the other suites, where places are drawn from this much more on each side, metres.
+STAYING, WIDER_M = ("wooden_cabinet_1", "flat_stove_1", "basket_1"), 0.02
 
 
 def variant_file(suite: str, task: str) -> Path | None:
@@ -71,9 +73,27 @@ def _assets() -> Path:
 
 
 def exchanged(task: str, seed: int) -> Path:
-    """A task file of our own in which some of libero_goal's objects change places, drawn from a seed."""
+    """A task file of our own in which some of a suite's objects change places, drawn from a seed.
+
+    In libero_goal a few do. In the other suites, whose scenes hardly differ, all small things do, and they
+    stand less exactly there.
+    """
     rng, text = np.random.default_rng(seed), task_file(task).read_text()
-    place = dict(re.findall(r"\(On (\w+_1) main_table_(\w+_region)\)", text))
+    place = dict(re.findall(r"\(On (\w+_\d) (?:main_table|floor)_(\w+)\)", text))
+    if suite_of(task) == SUITE:
+        new = _some_exchanged(place, rng)
+    else:
+        things = [name for name in place if name not in STAYING]
+        new = place | dict(zip(things, [place[name] for name in rng.permutation(things)], strict=True))
+        text = re.sub(r"\(((?:-?[\d.]+ ){3}-?[\d.]+)\s*\)", _widened, text)
+    for name, region in place.items():
+        text = re.sub(rf"\(On {name} (main_table|floor)_{region}\)", rf"(On {name} \1_{new[name]})", text)
+    file = Path(tempfile.mkdtemp(prefix="exchanged_")) / f"{task}.bddl"
+    file.write_text(text)
+    return file
+
+
+def _some_exchanged(place: dict[str, str], rng: np.random.Generator) -> dict[str, str]:
     swaps = [tuple(rng.choice(THINGS, 2, replace=False)) for _ in range(rng.integers(1, 3))]
     draw = rng.random()
     if draw < FURNITURE_SHARE:
@@ -83,8 +103,11 @@ def exchanged(task: str, seed: int) -> Path:
     new = dict(place)
     for one, other in swaps:
         new[one], new[other] = new[other], new[one]
-    for name, region in place.items():
-        text = text.replace(f"(On {name} main_table_{region})", f"(On {name} main_table_@{new[name]})")
-    file = Path(tempfile.mkdtemp(prefix="exchanged_")) / f"{task}.bddl"
-    file.write_text(text.replace("main_table_@", "main_table_"))
-    return file
+    return new
+
+
+def _widened(ranges: re.Match[str]) -> str:
+    """LIBERO's range of places, least x and y and then greatest."""
+    least_x, least_y, most_x, most_y = (float(number) for number in ranges[1].split())
+    wider = (least_x - WIDER_M, least_y - WIDER_M, most_x + WIDER_M, most_y + WIDER_M)
+    return f"({' '.join(f'{number:.4f}' for number in wider)})"

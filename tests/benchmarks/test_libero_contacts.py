@@ -7,9 +7,9 @@ from typing import Any
 import mujoco
 import numpy as np
 import pytest
-from benchmarks.libero.contacts import Contacts, shares, task_objects
+from benchmarks.libero.contacts import THINGS, Contacts, shares, task_objects
 
-from lerobot_openspm.envs.libero.simulator import OBJECTS, LiberoSimulator
+from lerobot_openspm.envs.libero.simulator import LiberoSimulator
 from lerobot_openspm.envs.seeds import TUNING_SEED_START
 
 # A robot's finger that is led along x pushes the bowl, the bowl the cheese that lies behind it and the bottle
@@ -34,8 +34,8 @@ def scene() -> Any:
         '<body name="{0}_main" pos="{1} {2} 0"><joint type="slide" axis="1 0 0" damping="5"/>'
         '<body name="{0}_part"><geom type="box" size="0.03 0.03 0.03" mass="0.1"/></body></body>'
     )
-    far = {name: (1.0, i) for i, name in enumerate(OBJECTS)}
-    objects = "".join(body.format(name, *{**far, **PLACES}[name]) for name in OBJECTS)
+    far = {name: (1.0, i) for i, name in enumerate(THINGS)}
+    objects = "".join(body.format(name, *{**far, **PLACES}[name]) for name in THINGS)
     model = mujoco.MjModel.from_xml_string(ROW.format(objects=objects))
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)

@@ -46,7 +46,7 @@ MAX_DISCARDED_SHARE = 0.5
 class SimulatorConfig:
     """Which simulator, and which of its tasks."""
 
-    type: str = "openspm_tabletop"  # openspm_tabletop, or libero (its suite libero_goal)
+    type: str = "openspm_tabletop"  # or libero (its suite libero_goal), libero_spatial, libero_object
     task: str = "all"  # a task name, a comma list of them, or "all"
 
 

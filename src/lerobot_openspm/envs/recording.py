@@ -151,10 +151,20 @@ def record(scene: Scene, task: str, seed: int) -> RecordedEpisode:
     )
 
 
-def pose_vector(poses: Mapping[str, np.ndarray]) -> np.ndarray:
-    """Position (m) and quat_wxyz (w >= 0) of every object's ``T_world_obj``, in their order, (7 * n,)."""
+def pose_vector(poses: Mapping[str, np.ndarray], objects: Sequence[str] | None = None) -> np.ndarray:
+    """Position (m) and quat_wxyz (w >= 0) of objects' ``T_world_obj``, (7 * n,).
+
+    Args:
+        poses: Those that are there.
+        objects: All there can be, in their order; zeros stand for one that is not there. Those that are there
+            if not given.
+    """
     parts = []
-    for T_world_obj in poses.values():
+    for name in poses if objects is None else objects:
+        if name not in poses:
+            parts.append(np.zeros(len(POSE_COMPONENTS)))
+            continue
+        T_world_obj = poses[name]
         x, y, z, w = Rotation.from_matrix(T_world_obj[:3, :3]).as_quat(canonical=True)
         parts.append([*T_world_obj[:3, 3], w, x, y, z])
     return np.concatenate(parts)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 
 from lerobot_openspm.envs.recording import Suite
 
@@ -13,14 +14,19 @@ def _tabletop() -> Suite:
     return Tabletop()
 
 
-def _libero() -> Suite:
-    from lerobot_openspm.envs.libero.recording import LiberoGoal
+def _libero(suite: str) -> Suite:
+    from lerobot_openspm.envs.libero.recording import LiberoSuite
 
-    return LiberoGoal()
+    return LiberoSuite(suite)
 
 
 # By the name that --env.type takes. A suite's simulator is imported only if it is asked for.
-SUITES: dict[str, Callable[[], Suite]] = {"openspm_tabletop": _tabletop, "libero": _libero}
+SUITES: dict[str, Callable[[], Suite]] = {
+    "openspm_tabletop": _tabletop,
+    "libero": partial(_libero, "libero_goal"),
+    "libero_spatial": partial(_libero, "libero_spatial"),
+    "libero_object": partial(_libero, "libero_object"),
+}
 
 
 def find_suite(env_type: str) -> Suite:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Mapping, Sequence
 
 import numpy as np
@@ -12,12 +13,16 @@ from lerobot_openspm.perception.objects.base import KnownObject
 
 
 def decode_object_poses(values: Array, names: Sequence[str]) -> dict[str, Array]:
-    """Read position and quat_wxyz ``(n * 7,)``; names are ``<object>`` or ``<object>.<component>``."""
+    """Read position and quat_wxyz ``(n * 7,)``; names are ``<object>`` or ``<object>.<component>``.
+
+    Objects whose numbers are all zero are not in the scene, and left out.
+    """
     objects = list(dict.fromkeys(name.rsplit(".", 1)[0] for name in names))
     rows = np.asarray(values, float).reshape(len(objects), 7)
-    quat_xyzw = rows[:, [4, 5, 6, 3]]
-    T = se3.transform(se3.matrix_from_quat_xyzw(quat_xyzw), rows[:, :3])
-    return dict(zip(objects, T, strict=True))
+    present = np.abs(rows).max(axis=1) > 0
+    quat_xyzw = rows[present][:, [4, 5, 6, 3]]
+    T = se3.transform(se3.matrix_from_quat_xyzw(quat_xyzw), rows[present, :3])
+    return dict(zip(itertools.compress(objects, present), T, strict=True))
 
 
 def name_simulator_poses(
@@ -25,11 +30,13 @@ def name_simulator_poses(
 ) -> dict[str, Array]:
     """Simulator poses under the nouns of the instructions: "bottle" is the "wine bottle".
 
+    A name in several words, such as "cookie_box", is that of a noun with all of them.
+
     The yaw of a body of revolution is dropped, as perception, which cannot see it, does.
     """
     named = {}
     for noun in nouns:
-        match = next((name for name in poses if name in noun.split()), None)
+        match = next((name for name in poses if set(name.split("_")) <= set(noun.split())), None)
         if match is None:
             continue
         T = poses[match]

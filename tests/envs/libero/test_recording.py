@@ -5,7 +5,7 @@ import pytest
 from benchmarks.worlds import initial_states
 
 from lerobot_openspm.envs.libero import recording
-from lerobot_openspm.envs.libero.recording import LiberoGoal
+from lerobot_openspm.envs.libero.recording import LiberoSuite
 from lerobot_openspm.envs.libero.simulator import DO_NOTHING, LiberoSimulator, tasks
 from lerobot_openspm.envs.recording import RecordedEpisode, record
 from lerobot_openspm.envs.seeds import DEMO_SEED_START
@@ -46,7 +46,7 @@ def test_no_demonstration_starts_from_an_evaluation_state(task):
 
 
 def recorded(size: int) -> RecordedEpisode:
-    scene = LiberoGoal().scene(TASKS[0], size, size)
+    scene = LiberoSuite().scene(TASKS[0], size, size)
     episode = record(scene, TASKS[0], DEMO_SEED_START)
     scene.close()
     return episode
@@ -64,7 +64,7 @@ def test_recording_only_ever_draws_scenes_by_their_seed(monkeypatch):
 
 def test_the_layout_is_the_public_datasets(monkeypatch):
     monkeypatch.setattr(recording, "expert_actions", lambda *_: iter([np.array(DO_NOTHING)]))
-    suite, episode = LiberoGoal(), recorded(256)
+    suite, episode = LiberoSuite(), recorded(256)
     assert suite.cameras == ("image", "image2")
     shapes = {name: images.shape for name, images in episode.images.items()}
     assert shapes == dict.fromkeys(suite.cameras, (1, 256, 256, 3))

@@ -83,9 +83,9 @@ def _batched(state):
 
 
 def test_the_calibration_file_is_the_simulators():
-    from lerobot_openspm.envs.libero.recording import LiberoGoal
+    from lerobot_openspm.envs.libero.recording import LiberoSuite
 
-    written, read = json.loads(CALIBRATION.read_text()), LiberoGoal().calibration(256, 256)
+    written, read = json.loads(CALIBRATION.read_text()), LiberoSuite().calibration(256, 256)
     assert written.keys() == read.keys()
     for key, camera in read["cameras"].items():
         for field, value in camera.items():

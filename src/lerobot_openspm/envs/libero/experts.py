@@ -1,4 +1,6 @@
-"""Scripted experts for LIBERO's ten goal tasks: they read the true poses and act by the same 7-D actions.
+"""Scripted experts for LIBERO's tasks: they read the true poses and act by the same 7-D actions.
+
+All of libero_goal's are here, beside the first of two other suites, see `picks`.
 
 Positions are in LIBERO's world frame unless a comment says otherwise: x points from the robot over the table,
 y to the robot's left, z up; the table's top is at z = 0.9. All lengths are in metres. Every object is always
@@ -10,48 +12,39 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from lerobot_openspm.envs.libero.simulator import LiberoSimulator
-from lerobot_openspm.envs.motions import (
-    DOWN,
-    Actions,
-    Pace,
-    ScriptedHand,
-    in_world,
-    pointing_down,
-    raised,
-    yaw_matrix,
+from lerobot_openspm.envs.libero.picks import OBJECT, SPATIAL
+from lerobot_openspm.envs.libero.puts import (
+    BOWL_ON_PLATE,
+    BOWL_RIM,
+    CHEESE_MIDDLE,
+    PACE,
+    PRE_GRASP,
+    RETREAT_RISE,
+    LiberoHand,
+    Put,
+    backed,
+    grasp,
+    on,
+    on_region,
+    place,
+    region,
+    take_and_put,
 )
+from lerobot_openspm.envs.libero.simulator import LiberoSimulator
+from lerobot_openspm.envs.motions import DOWN, Actions, in_world, raised, yaw_matrix
 from lerobot_openspm.geometry.se3 import transform
 
-LiberoHand = ScriptedHand[LiberoSimulator]
-
-# Measured: LIBERO's controller covers about a quarter of an action before the next one replaces it.
-PACE = Pace(
-    step_m=0.012, step_rad=0.065, closing_steps=(14, 18), opening_steps=(8, 11), asked_m=0.05, asked_rad=0.5
-)
-
-PRE_GRASP = 0.08
-CARRY_RISE = 0.12
-# The least height above a place from which an object is lowered to it.
-LOWERING = 0.06
-RETREAT_RISE = 0.08
-RELEASE_GAP = 0.004
 FINAL_HOLD_STEPS = 15
 
-# Grasp points from the object's origin, along the world's axes.
-# The bowl looks alike from everywhere: always take its rim on the stove's side, which is free in every task.
-BOWL_RIM = np.array([0.0, 0.050, 0.046])
-CHEESE_MIDDLE = np.array([0.0, 0.0, 0.006])
+# A grasp point from the object's origin, along the world's axes.
 BOTTLE_NECK = np.array([0.0, 0.0, 0.135])
 
 # Where an object's origin goes, from the origin of what it goes onto.
-BOWL_ON_PLATE = np.array([0.0, 0.0, 0.008])
 CHEESE_IN_BOWL = np.array([0.0, 0.0, 0.040])
 # In the rack's frame: a third up the tilted upper shelf, far from both of its ends.
 BOTTLE_ON_RACK = np.array([0.0, -0.050, 0.240])
@@ -114,62 +107,6 @@ def expert_actions(
     yield from hand.hold(FINAL_HOLD_STEPS)
 
 
-@dataclass(frozen=True)
-class Put:
-    """What to pick up, where from its origin to grasp it, where its origin goes, how high to lift it."""
-
-    name: str
-    grasp: np.ndarray
-    goal: Callable[[LiberoHand], np.ndarray]
-    rise: float = CARRY_RISE
-
-
-def _put(put: Put, hand: LiberoHand) -> Actions:
-    """Grasp from above, fingers opening along the world's y, lift straight up and place."""
-    grasp = hand.origin(put.name) + put.grasp
-    offset, turn = hand.grasp_noise()
-    at_grasp = pointing_down(grasp + offset, turn)
-    yield from _grasp(hand, at_grasp)
-    yield from hand.travel(raised(at_grasp, put.rise))
-    yield from _place(hand, put.name, put.goal(hand))
-
-
-def _grasp(hand: LiberoHand, at_grasp: np.ndarray) -> Actions:
-    """Go before T_world_ee `at_grasp`, advance along the fingers and close them."""
-    yield from hand.travel(_backed(at_grasp, PRE_GRASP))
-    yield from hand.advance(at_grasp)
-    yield from hand.grip(closing=True)
-
-
-def _place(hand: LiberoHand, name: str, goal: np.ndarray) -> Actions:
-    """Put the grasped object's origin at a world point (3,), let go and retreat upwards.
-
-    The object crosses the table at the height that it was lifted to.
-    """
-    release = goal + hand.grasp_noise()[0] + [0.0, 0.0, RELEASE_GAP]
-    above = np.array([release[0], release[1], max(hand.origin(name)[2], release[2] + LOWERING)])
-    yield from hand.travel(_carried(hand, name, above))
-    yield from hand.advance(_carried(hand, name, release))
-    yield from hand.grip(closing=False)
-    yield from hand.retreat(RETREAT_RISE)
-
-
-def _carried(hand: LiberoHand, name: str, goal: np.ndarray) -> np.ndarray:
-    """T_world_ee that brings the grasped object to a world point (3,), the hand keeping its orientation."""
-    T_world_ee = hand.simulator.ee_pose()
-    return transform(T_world_ee[:3, :3], T_world_ee[:3, 3] + goal - hand.origin(name))
-
-
-def _backed(T_world_ee: np.ndarray, distance: float) -> np.ndarray:
-    """The pose that lies `distance` before another along the fingers."""
-    return transform(T_world_ee[:3, :3], T_world_ee[:3, 3] - distance * T_world_ee[:3, 2])
-
-
-def _region(hand: LiberoHand, name: str) -> np.ndarray:
-    """Middle of one of LIBERO's regions in the world, (3,)."""
-    return np.array(hand.simulator.sim.data.get_site_xpos(name))
-
-
 def _open_drawer(name: str, hand: LiberoHand) -> Actions:
     """Take the handle from the front with a level hand, pull along the drawer's axis, let go and back off.
 
@@ -183,7 +120,7 @@ def _open_drawer(name: str, hand: LiberoHand) -> Actions:
     def at(out: float) -> np.ndarray:
         return transform(rotation, in_world(cabinet, handle - [0.0, out, 0.0]))
 
-    yield from _grasp(hand, at(0.0))
+    yield from grasp(hand, at(0.0))
     yield from hand.advance(at(DRAWER_PULL))
     yield from hand.grip(closing=False)
     yield from hand.travel(at(DRAWER_PULL + DRAWER_BACK_OFF))
@@ -194,11 +131,11 @@ def _bowl_in_top_drawer(hand: LiberoHand) -> Actions:
     offset, turn = hand.grasp_noise()
     rotation = yaw_matrix(turn) @ Rotation.from_rotvec([-BOWL_LEAN, 0.0, 0.0]).as_matrix() @ DOWN
     at_rim = transform(rotation, hand.origin("bowl") + BOWL_RIM + offset)
-    yield from _grasp(hand, at_rim)
+    yield from grasp(hand, at_rim)
     aside = transform(rotation, at_rim[:3, 3] + BOWL_ASIDE)
     yield from hand.travel(aside)
     yield from hand.travel(raised(aside, DRAWER_CARRY_RISE - BOWL_ASIDE[2]))
-    yield from _place(hand, "bowl", _region(hand, "wooden_cabinet_1_top_region") + BOWL_IN_DRAWER)
+    yield from place(hand, "bowl", region(hand, "wooden_cabinet_1_top_region") + BOWL_IN_DRAWER)
 
 
 def _turn_on_stove(hand: LiberoHand) -> Actions:
@@ -206,7 +143,7 @@ def _turn_on_stove(hand: LiberoHand) -> Actions:
     stove = hand.frame("stove")
     lean = Rotation.from_rotvec([0.0, KNOB_LEAN, 0.0]).as_matrix()
     at_knob = transform(stove[:3, :3] @ yaw_matrix(turn) @ lean @ DOWN, in_world(stove, KNOB) + offset)
-    yield from _grasp(hand, at_knob)
+    yield from grasp(hand, at_knob)
     yield from hand.advance(transform(yaw_matrix(KNOB_TURN) @ at_knob[:3, :3], at_knob[:3, 3]))
     yield from hand.grip(closing=False)
     yield from hand.retreat(RETREAT_RISE)
@@ -217,7 +154,7 @@ def _push_plate(hand: LiberoHand) -> Actions:
     plate = hand.origin("plate")
     offset, turn = hand.grasp_noise()
     corner = plate + np.array([0.0, PLATE_FIRST_LEG, 0.0])
-    goal = _region(hand, "main_table_stove_front_region") + PLATE_GOAL
+    goal = region(hand, "main_table_stove_front_region") + PLATE_GOAL
     lean = Rotation.from_rotvec([-PLATE_LEAN, 0.0, 0.0]).as_matrix() @ yaw_matrix(math.pi / 2) @ DOWN
 
     def behind(middle: np.ndarray, heading: float, distance: float) -> np.ndarray:
@@ -228,7 +165,7 @@ def _push_plate(hand: LiberoHand) -> Actions:
         return transform(yaw_matrix(turn) @ rotation @ lean, position)
 
     start = behind(plate, 0.0, PLATE_CLEAR)
-    yield from hand.travel(_backed(start, PRE_GRASP))
+    yield from hand.travel(backed(start, PRE_GRASP))
     yield from hand.advance(start)
     yield from hand.advance(behind(corner, 0.0, PLATE_TOUCHING), slowness=0.7)
     heading = math.atan2(corner[0] - goal[0], goal[1] - corner[1])
@@ -239,35 +176,25 @@ def _push_plate(hand: LiberoHand) -> Actions:
     yield from hand.retreat(RETREAT_RISE)
 
 
-def _on(name: str, offset: np.ndarray) -> Callable[[LiberoHand], np.ndarray]:
-    return lambda hand: hand.origin(name) + offset
-
-
-def _on_region(name: str, offset: np.ndarray) -> Callable[[LiberoHand], np.ndarray]:
-    return lambda hand: _region(hand, name) + offset
-
-
 def _on_rack(hand: LiberoHand) -> np.ndarray:
     return in_world(hand.frame("rack"), BOTTLE_ON_RACK)
 
 
 _TOP = "wooden_cabinet_1_top_side"
 _PUTS = {
-    "put_the_bowl_on_the_stove": Put(
-        "bowl", BOWL_RIM, _on_region("flat_stove_1_cook_region", BOWL_ON_BURNER)
-    ),
+    "put_the_bowl_on_the_stove": Put("bowl", BOWL_RIM, on_region("flat_stove_1_cook_region", BOWL_ON_BURNER)),
     "put_the_wine_bottle_on_top_of_the_cabinet": Put(
-        "bottle", BOTTLE_NECK, _on_region(_TOP, BOTTLE_ON_CABINET), CABINET_CARRY_RISE
+        "bottle", BOTTLE_NECK, on_region(_TOP, BOTTLE_ON_CABINET), CABINET_CARRY_RISE
     ),
     "put_the_bowl_on_top_of_the_cabinet": Put(
-        "bowl", BOWL_RIM, _on_region(_TOP, np.zeros(3)), CABINET_CARRY_RISE
+        "bowl", BOWL_RIM, on_region(_TOP, np.zeros(3)), CABINET_CARRY_RISE
     ),
-    "put_the_cream_cheese_in_the_bowl": Put("cheese", CHEESE_MIDDLE, _on("bowl", CHEESE_IN_BOWL)),
-    "put_the_bowl_on_the_plate": Put("bowl", BOWL_RIM, _on("plate", BOWL_ON_PLATE)),
+    "put_the_cream_cheese_in_the_bowl": Put("cheese", CHEESE_MIDDLE, on("bowl", CHEESE_IN_BOWL)),
+    "put_the_bowl_on_the_plate": Put("bowl", BOWL_RIM, on("plate", BOWL_ON_PLATE)),
     "put_the_wine_bottle_on_the_rack": Put("bottle", BOTTLE_NECK, _on_rack, RACK_CARRY_RISE),
 }
 EXPERTS: dict[str, Callable[[LiberoHand], Actions]] = {
-    **{task: partial(_put, put) for task, put in _PUTS.items()},
+    **{task: partial(take_and_put, put) for task, put in {**_PUTS, **SPATIAL, **OBJECT}.items()},
     "open_the_middle_drawer_of_the_cabinet": partial(_open_drawer, "middle"),
     "open_the_top_drawer_and_put_the_bowl_inside": _bowl_in_top_drawer,
     "push_the_plate_to_the_front_of_the_stove": _push_plate,

@@ -1,4 +1,4 @@
-"""LIBERO's suite libero_goal as a suite to record, in the layout of the public LIBERO dataset."""
+"""LIBERO's suites as suites to record, in the layout of the public LIBERO dataset."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from lerobot_openspm.envs.calibration import calibration
-from lerobot_openspm.envs.libero.experts import expert_actions
+from lerobot_openspm.envs.libero.experts import EXPERTS, expert_actions
 from lerobot_openspm.envs.libero.simulator import (
     CAMERA_MOUNTS,
     CAMERAS,
@@ -20,7 +20,7 @@ from lerobot_openspm.envs.recording import OBJECT_POSES, Names, pose_names, pose
 from lerobot_openspm.envs.selection import select
 
 # An expert that takes longer than the policy may is no use as a demonstration.
-MAX_STEPS = 300
+MAX_STEPS = {"libero_goal": 300, "libero_spatial": 280, "libero_object": 280}
 # LIBERO ends an episode when its goal first holds, often in mid-motion. A demonstration that ended there too
 # would teach a policy to stop at the very threshold, so it goes on a little, as people do.
 STEPS_AFTER_SUCCESS = 10
@@ -32,12 +32,13 @@ class LiberoScene:
     def __init__(self, task: str, image_size: int) -> None:
         self._simulator = LiberoSimulator(task, image_size)
         self.instruction = self._simulator.instruction
-        self.status, self._steps_left = "failed", MAX_STEPS
+        self._max_steps = MAX_STEPS[self._simulator.suite]
+        self.status, self._steps_left = "failed", self._max_steps
 
     def reset(self, seed: int) -> None:
         """See `Scene`."""
         self._simulator.reset(seed)
-        self.status, self._steps_left = "failed", MAX_STEPS
+        self.status, self._steps_left = "failed", self._max_steps
 
     def expert(self, rng: np.random.Generator) -> Actions:
         """See `Scene`."""
@@ -49,7 +50,7 @@ class LiberoScene:
 
     def columns(self) -> Mapping[str, np.ndarray]:
         """See `Scene`."""
-        poses = pose_vector(self._simulator.object_poses())
+        poses = pose_vector(self._simulator.object_poses(), list(OBJECTS[self._simulator.suite]))
         return {"observation.state": self._simulator.state(), OBJECT_POSES: poses}
 
     def step(self, action: np.ndarray) -> bool:
@@ -64,11 +65,18 @@ class LiberoScene:
         self._simulator.close()
 
 
-class LiberoGoal:
-    """The suite libero_goal, see `Suite`."""
+class LiberoSuite:
+    """One of LIBERO's suites, see `Suite`.
+
+    Args:
+        suite: LIBERO's name of it.
+    """
 
     robot_type = "panda"
     cameras = tuple(CAMERAS)
+
+    def __init__(self, suite: str = SUITE) -> None:
+        self._suite = suite
 
     @property
     def names(self) -> Mapping[str, Names]:
@@ -77,13 +85,13 @@ class LiberoGoal:
         return {
             "observation.state": {"motors": ["x", "y", "z", "roll", "pitch", "yaw", "gripper", "gripper"]},
             "action": {"motors": ["x", "y", "z", "roll", "pitch", "yaw", "gripper"]},
-            OBJECT_POSES: pose_names(OBJECTS),
+            OBJECT_POSES: pose_names(list(OBJECTS[self._suite])),
         }
 
     def tasks(self, selection: str) -> list[str]:
-        """See `Suite`."""
-        known = list(tasks())
-        return select(selection, known, {"all": known, SUITE: known}, SUITE)
+        """See `Suite`. Of some suites, experts do the first tasks only."""
+        known = [task for task in tasks(self._suite) if task in EXPERTS]
+        return select(selection, known, {"all": known, self._suite: known}, self._suite)
 
     def scene(self, task: str, height: int, width: int) -> LiberoScene:
         """See `Suite`."""
@@ -93,7 +101,7 @@ class LiberoGoal:
 
     def calibration(self, height: int, width: int) -> dict[str, Any]:
         """See `Suite`. LeRobot turns robosuite's images by 180 degrees, which leaves them mirrored."""
-        simulator = LiberoSimulator(next(iter(tasks())))
+        simulator = LiberoSimulator(next(iter(tasks(self._suite))))
         simulator.reset(0)
         model, data, T_world_ee = simulator.sim.model._model, simulator.sim.data._data, simulator.ee_pose()
         size = height, width

@@ -28,15 +28,47 @@ HAND_BODY, GRIP_SITE = "robot0_right_hand", "gripper0_grip_site"
 # LIBERO's cameras, by the names that LeRobot gives their images.
 CAMERAS = {"image": "agentview", "image2": "robot0_eye_in_hand"}
 CAMERA_MOUNTS: dict[str, Literal["world", "ee"]] = {"image": "world", "image2": "ee"}
-# Everything on the table, in the order of the recorded pose vectors.
-OBJECTS = ("bowl", "cheese", "bottle", "plate", "cabinet", "stove", "rack")
+# Everything in a suite's scenes, in the order of its recorded pose vectors: LIBERO's name by one of our own,
+# in the words that instructions have for it. Of two of a kind, the first is what tasks are about.
+OBJECTS = {
+    "libero_goal": {
+        "bowl": "akita_black_bowl_1",
+        "cheese": "cream_cheese_1",
+        "bottle": "wine_bottle_1",
+        "plate": "plate_1",
+        "cabinet": "wooden_cabinet_1",
+        "stove": "flat_stove_1",
+        "rack": "wine_rack_1",
+    },
+    "libero_spatial": {
+        "bowl": "akita_black_bowl_1",
+        "bowl_2": "akita_black_bowl_2",
+        "cookie_box": "cookies_1",
+        "ramekin": "glazed_rim_porcelain_ramekin_1",
+        "plate": "plate_1",
+        "cabinet": "wooden_cabinet_1",
+        "stove": "flat_stove_1",
+    },
+    # Every scene holds seven of these.
+    "libero_object": {
+        name: f"{name}_1"
+        for name in (
+            "alphabet_soup", "cream_cheese", "salad_dressing", "bbq_sauce", "ketchup", "tomato_sauce",
+            "butter", "milk", "chocolate_pudding", "orange_juice", "basket",
+        )
+    },
+}  # fmt: skip
 # Objects float or overlap a little after a reset; LeRobot's environment waits as long.
 SETTLING_STEPS = 10
 DO_NOTHING = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, -1.0)
 
 
-def tasks() -> dict[str, str]:
-    """Names of the suite's tasks with their instructions, in LIBERO's order.
+@functools.cache
+def tasks(suite: str = SUITE) -> dict[str, str]:
+    """Names of a suite's tasks with their instructions, in LIBERO's order.
+
+    Args:
+        suite: One of `OBJECTS`.
 
     Raises:
         ValueError: LIBERO is not installed.
@@ -54,28 +86,40 @@ def tasks() -> dict[str, str]:
             "there is no terminal to answer on; answer for it with: python scripts/libero_assets.py, from a "
             "checkout, or with: echo N | python -c 'import libero.libero'"
         ) from error
-    return {task.name: task.language for task in benchmark.get_benchmark_dict()[SUITE]().tasks}
+    return {task.name: task.language for task in benchmark.get_benchmark_dict()[suite]().tasks}
+
+
+def suite_of(task: str) -> str:
+    """The suite that a task belongs to; no two have a task of the same name.
+
+    Raises:
+        ValueError: It is in none of `OBJECTS`, or LIBERO is not installed.
+    """
+    for suite in OBJECTS:
+        if task in tasks(suite):
+            return suite
+    known = "; ".join(f"{suite}: {', '.join(tasks(suite))}" for suite in OBJECTS)
+    raise ValueError(f"LIBERO has no task {task!r}, expected one of {known}")
 
 
 def task_file(task: str) -> Path:
     """LIBERO's own description of a task in :func:`tasks`."""
     from libero.libero import get_libero_path  # pyright: ignore[reportMissingImports]
 
-    return Path(get_libero_path("bddl_files")) / SUITE / f"{task}.bddl"
+    return Path(get_libero_path("bddl_files")) / suite_of(task) / f"{task}.bddl"
 
 
 class LiberoSimulator:
     """One LIBERO task.
 
     Args:
-        task: A name in :func:`tasks`.
+        task: A name in :func:`tasks` of any suite in `OBJECTS`.
         image_size: Height and width of the images in pixels, which are drawn when asked for; None draws none.
         file: A variant of the task, which says what stands where and what is asked; LIBERO's own by default.
     """
 
     def __init__(self, task: str, image_size: int | None = None, file: Path | None = None) -> None:
-        if task not in tasks():
-            raise ValueError(f"{SUITE} has no task {task!r}, expected one of {', '.join(tasks())}")
+        self.suite = suite_of(task)
         from libero.libero.envs.env_wrapper import ControlEnv  # pyright: ignore[reportMissingImports]
 
         self._image_size = image_size
@@ -86,7 +130,7 @@ class LiberoSimulator:
             has_offscreen_renderer=False,
         )
         self.task = task
-        self.instruction = tasks()[task] if file is None else str(self._env.language_instruction)
+        self.instruction = tasks(self.suite)[task] if file is None else str(self._env.language_instruction)
         self._observation: dict[str, Any] = {}
         # The scene as it was when the last observation was sampled, MuJoCo's data.
         self._sampled: Any = None
@@ -192,14 +236,15 @@ class LiberoSimulator:
         return np.ascontiguousarray(image[::-1, ::-1])
 
     def object_poses(self) -> dict[str, np.ndarray]:
-        """True ``T_world_obj`` (4, 4) of all `OBJECTS`."""
-        return {name: self.body_pose(self.root_body(name)) for name in OBJECTS}
+        """True ``T_world_obj`` (4, 4) of those of the suite's `OBJECTS` that the scene holds."""
+        held = {**self._env.env.objects_dict, **self._env.env.fixtures_dict}
+        names = [name for name, thing in OBJECTS[self.suite].items() if thing in held]
+        return {name: self.body_pose(self.root_body(name)) for name in names}
 
     def root_body(self, name: str) -> str:
-        """MuJoCo's name of the body of one of `OBJECTS`."""
+        """MuJoCo's name of the body of one of the suite's `OBJECTS`."""
         env = self._env.env
-        things = {_short(k): thing for k, thing in {**env.objects_dict, **env.fixtures_dict}.items()}
-        return things[name].root_body
+        return {**env.objects_dict, **env.fixtures_dict}[OBJECTS[self.suite][name]].root_body
 
     def body_pose(self, name: str) -> np.ndarray:
         """``T_world_body`` (4, 4) of any body of the MuJoCo model."""
@@ -219,8 +264,3 @@ class LiberoSimulator:
 
 def _batched(state: Mapping[str, Any]) -> dict[str, Any]:
     return {k: _batched(v) if isinstance(v, Mapping) else np.asarray(v)[None] for k, v in state.items()}
-
-
-def _short(name: str) -> str:
-    """``akita_black_bowl_1`` is the bowl: the last word of LIBERO's category."""
-    return name.rsplit("_", 1)[0].rsplit("_", 1)[-1]

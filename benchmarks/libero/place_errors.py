@@ -1,0 +1,109 @@
+"""Estimates of where things are beside the truth: shares, errors, and what a high confidence is worth."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from benchmarks.harness import Row
+from benchmarks.stages import LIBERO
+from benchmarks.truth import pose_error, true_period, upright
+
+from lerobot_openspm.cli.pipeline import rate
+from lerobot_openspm.geometry.se3 import Array
+from lerobot_openspm.perception.objects.base import KnownObject
+from lerobot_openspm.perception.objects.patches.model import PatchModel
+from lerobot_openspm.perception.oracle import name_simulator_poses
+from lerobot_openspm.types import PoseEstimate
+
+# What counts as right, and from which confidence on estimates should be; metres and radians.
+NEAR_M, NEAR_RAD, SURE = 0.010, np.deg2rad(10), 0.95
+
+
+def judged(
+    name: str,
+    estimate: PoseEstimate,
+    poses: Mapping[str, Array],
+    T_sim_obj: Array,
+    models: Mapping[str, KnownObject],
+) -> Row:
+    """An estimate beside the truth; of several of a kind, beside the one that it is nearest to.
+
+    Args:
+        name: What was sought, by the instructions' name.
+        estimate: What was found.
+        poses: The simulator's poses ``T_world_obj`` of everything in the scene, by its names.
+        T_sim_obj: The learned frame in the simulator's upright one.
+        models: What was learned, by name.
+    """
+    there = [
+        upright(named[name]) @ T_sim_obj
+        for one, T in poses.items()
+        if (named := name_simulator_poses({re.sub(r"_\d+$", "", one): T}, [name], models))
+    ]
+    # Two of a kind explain the pictures equally well, as they should.
+    is_found = estimate.status == "found" or (estimate.status == "ambiguous" and len(there) > 1)
+    row: Row = {"found": is_found, "confidence": round(float(estimate.confidence), 4), "of": len(there)}
+    if not is_found or not there:
+        return row
+    period, model = true_period(name, LIBERO), models[name]
+    shows_yaw = period > 0 and model.yaw_period > 0 and not isinstance(model, PatchModel)
+    errors = [pose_error(T, estimate.T_world_obj, period) for T in there]
+    nearest = int(np.argmin([metres for metres, _ in errors]))
+    metres, radians = errors[nearest]
+    off = estimate.T_world_obj[:3, 3] - there[nearest][:3, 3]
+    apart = [
+        min(pose_error(T, one, 0.0)[0] for one in (estimate.T_world_obj, *estimate.others)) for T in there
+    ]
+    return {
+        **row,
+        "mm": round(1000 * metres, 1),
+        "deg": round(float(np.rad2deg(radians)), 1) if shows_yaw else None,
+        "off_mm": (1000 * off).round(1).tolist(),
+        "near": sum(one < NEAR_M for one in apart),
+    }
+
+
+def is_right(row: Row) -> bool:
+    """Whether an estimate is near the truth, and turned as that is where its yaw is known."""
+    return row.get("mm", np.inf) < 1000 * NEAR_M and (row["deg"] is None or row["deg"] < np.rad2deg(NEAR_RAD))
+
+
+def of_object(rows: Sequence[Row]) -> dict[str, Any]:
+    """What was found of one thing in all scenes. Shares are of the scenes that hold it."""
+    held, absent = [row for row in rows if row["of"]], [row for row in rows if not row["of"]]
+    found, several = [row for row in held if row["found"]], [row for row in held if row["of"] > 1]
+    return {
+        "found": rate(len(found), len(held)),
+        "within_10_mm": rate(sum(row["mm"] < 1000 * NEAR_M for row in found), len(held)),
+        **{f"position_mm_{key}": value for key, value in _spread([row["mm"] for row in found]).items()},
+        **{f"yaw_deg_{key}": value for key, value in _spread([row["deg"] for row in found]).items()},
+        "several": {"n": len(several), "all_within_10_mm": sum(r.get("near") == r["of"] for r in several)},
+        "absent": {"n": len(absent), "reported": sum(row["found"] for row in absent)},
+    }
+
+
+def _spread(values: Sequence[float | None]) -> dict[str, float | None]:
+    known = [value for value in values if value is not None]
+    levels = {"median": 50, "p95": 95}
+    return {key: round(float(np.percentile(known, at)), 1) if known else None for key, at in levels.items()}
+
+
+def summary(rows: Sequence[Row]) -> dict[str, Any]:
+    """Per object, and how many of all estimates that are said to be sure are right."""
+    names = dict.fromkeys(name for row in rows for name in row["objects"])
+    every = [one for row in rows for one in row["objects"].values()]
+    sure = [one for one in every if one["found"] and one["confidence"] > SURE]
+    return {
+        "found": {name: of_object([row["objects"][name] for row in rows]) for name in names},
+        "sure": rate(sum(map(is_right, sure)), len(sure)),
+        "sure_and_wrong": [
+            [name, row["task"], row["seed"], one.get("mm"), one.get("deg")]
+            for row in rows
+            for name, one in row["objects"].items()
+            if one["found"] and one["confidence"] > SURE and not is_right(one)
+        ],
+        "first_look_cpu_ms": _spread([row["look_cpu_ms"] for row in rows]),
+    }

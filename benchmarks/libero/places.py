@@ -1,0 +1,193 @@
+"""Which things of a suite are learned from demonstrations, and how well they are found in scenes never shown.
+
+    python -m benchmarks.libero.places --suite=libero_spatial
+
+Records demonstrations of the tasks that experts know, mines a memory from them, and compares one first look
+at each of many seeded scenes with the simulator's poses. Everything is kept, and a second run does the rest.
+"""
+
+from __future__ import annotations
+
+import functools
+import json
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from benchmarks.episodes import LazyImages
+from benchmarks.harness import Row, measured_folder, resume
+from benchmarks.libero.evaluate import kept_simulator, move_hand
+from benchmarks.libero.place_errors import judged, summary
+from benchmarks.libero.variants import exchanged
+from benchmarks.results import run, write
+from benchmarks.stages import DEMOS, LIBERO, DatasetOption, dataset
+from benchmarks.truth import offsets_in
+from benchmarks.worlds import LiberoWorld
+
+from lerobot_openspm.cli.pipeline import collect_dataset
+from lerobot_openspm.configuration_openspm import OpenSPMConfig
+from lerobot_openspm.envs.collection import SUMMARY_FILE
+from lerobot_openspm.envs.libero.simulator import DO_NOTHING, OBJECTS, SUITE, LiberoSimulator
+from lerobot_openspm.envs.seeds import TUNING_SEED_START
+from lerobot_openspm.envs.suites import find_suite
+from lerobot_openspm.errors import OpenSPMError
+from lerobot_openspm.files import write_json
+from lerobot_openspm.memory.io import read_memory, write_memory
+from lerobot_openspm.memory.memory import Memory
+from lerobot_openspm.mining.dataset import dataset_metadata
+from lerobot_openspm.mining.objects import contact_cues
+from lerobot_openspm.perception.observation import Observation
+from lerobot_openspm.perception.pipeline import Perception
+from lerobot_openspm.training import dataset_processor, memory_of
+from lerobot_openspm.types import Hand, PoseEstimate
+
+FIRST_SEED = TUNING_SEED_START + 600_000
+# LIBERO at times draws two things into each other, and one is thrown off: it still moves after half a second.
+STILL_M, STILL_STEPS, REDRAWN = 0.002, 10, 1000
+LEARNED = "learned.json"
+
+
+@dataclass
+class PlacesConfig:
+    """What to measure.
+
+    Args:
+        suite: libero_goal, libero_spatial or libero_object.
+        exchanged: Whether things change places in the scenes, see `variants`.
+        demos: Demonstrations a task to learn from.
+        scenes: In all, as many of each task.
+        dataset: The demonstrations; recorded if not given.
+        output: Folder for what is measured; outputs/bench/NAME if not given.
+        workers: Scenes at a time, each in a process of its own; a single one stays in this process.
+    """
+
+    suite: str = SUITE
+    exchanged: bool = False
+    demos: int = DEMOS
+    scenes: int = 50
+    dataset: DatasetOption = field(default_factory=DatasetOption)
+    output: str | None = None
+    workers: int = 2
+
+    def __post_init__(self) -> None:
+        if self.suite not in OBJECTS:
+            raise ValueError(f"suite is {self.suite!r}, expected one of {', '.join(OBJECTS)}")
+
+    @property
+    def simulator(self) -> str:
+        """The suite as --env.type takes it."""
+        return LIBERO if self.suite == SUITE else self.suite
+
+    def demonstrations(self) -> Path:
+        """Folder of the demonstrations, recorded if need be."""
+        if self.dataset.root is not None:
+            return Path(self.dataset.root)
+        if self.suite == SUITE:
+            return dataset(LIBERO, self.demos)
+        root = Path(f"outputs/{self.suite}/demos_{self.demos}/dataset")
+        collect_dataset(root, self.demos, self.simulator)
+        return root
+
+
+def learn(root: Path, folder: Path) -> dict[str, Any]:
+    """Mine a memory of all demonstrations; what is learned of each thing that the hand touched."""
+    kept = folder / LEARNED
+    if kept.is_file():
+        return json.loads(kept.read_text())
+    cameras = str(root / "meta/openspm_cameras.json")
+    options = OpenSPMConfig(
+        device="cpu", push_to_hub=False, cameras=cameras, rotation="axis_angle", control_hz=20
+    )
+    processor = dataset_processor(dataset_metadata("local/places", str(root)), options)
+    begin = time.monotonic()
+    mined = processor.mine()
+    memory, seconds = memory_of(mined, options), time.monotonic() - begin
+    write_memory(memory, folder)
+    cues = [(item.episode.index, cue) for item in mined.episodes for cue in contact_cues(item)]
+    frames = offsets_in(memory, processor.demonstrations)
+    told: dict[str, Any] = {}
+    for name in sorted({cue.name for _, cue in cues}):
+        model = memory.objects.get(name)
+        told[name] = {
+            "touched": len({episode for episode, cue in cues if cue.name == name}),
+            "grasped": len({e for e, cue in cues if cue.name == name and cue.kind == "grasp"}),
+            "learned": None if model is None else model.to_record()[0]["kind"],
+            "T_sim_obj": frames[name].tolist() if name in frames else None,
+        }
+    learned = {"episodes": len(mined.episodes), "seconds": round(seconds, 1), "objects": told}
+    write_json(kept, learned)
+    return learned
+
+
+def look_at_scene(config: PlacesConfig, folder: Path, task: str, number: int) -> Row:
+    """Draw a scene, look once for everything that was learned, and compare with the simulator."""
+    memory, frames = _memory(folder)
+    simulator, seed = draw(task, FIRST_SEED + number, config.exchanged)
+    estimates, spent_s = look(memory, simulator)
+    poses = simulator.object_poses()
+    objects = {name: judged(name, estimates[name], poses, T, memory.objects) for name, T in frames.items()}
+    return {"task": task, "seed": seed, "look_cpu_ms": round(1000 * spent_s), "objects": objects}
+
+
+def draw(task: str, seed: int, is_exchanged: bool) -> tuple[LiberoSimulator, int]:
+    """A scene in which nothing moves, the hand somewhere, and the seed that it was drawn from."""
+    while True:
+        simulator = kept_simulator(task, exchanged(task, seed) if is_exchanged else None)
+        simulator.reset(seed)
+        move_hand(simulator, np.random.default_rng(seed))
+        if is_still(simulator):
+            return simulator, seed
+        seed += REDRAWN
+
+
+@functools.lru_cache(1)
+def _memory(folder: Path) -> tuple[Memory, dict[str, np.ndarray]]:
+    """The memory, and the frames ``T_sim_obj`` of what was found in the demonstrations."""
+    learned = json.loads((folder / LEARNED).read_text())["objects"]
+    frames = {name: np.array(told["T_sim_obj"]) for name, told in learned.items() if told["T_sim_obj"]}
+    return read_memory(folder), frames
+
+
+def is_still(simulator: LiberoSimulator) -> bool:
+    """Whether nothing moves; takes half a second of the scene."""
+    before = simulator.object_poses()
+    for _ in range(STILL_STEPS):
+        simulator.step(np.array(DO_NOTHING))
+    after = simulator.object_poses()
+    return all(np.linalg.norm(after[name][:3, 3] - T[:3, 3]) < STILL_M for name, T in before.items())
+
+
+def look(memory: Memory, simulator: LiberoSimulator) -> tuple[Mapping[str, PoseEstimate], float]:
+    """A first look for all objects of a memory, and the processor's seconds that it took."""
+    if memory.layouts is None:
+        raise OpenSPMError("the memory does not say how its robot's state is laid out; mine it again")
+    layout, state = memory.layouts[0], simulator.state().astype(float)
+    hand = Hand(layout.poses(state), float(layout.openings(state)))
+    images = dict(LazyImages(LiberoWorld(simulator), tuple(memory.cameras)))
+    seen = Observation(simulator.instruction, state, hand, images, None)
+    perception, begin = Perception(memory, OpenSPMConfig().hand_radius_m), time.process_time()
+    return perception.detect(seen, list(memory.objects), {}, 0.0).estimates, time.process_time() - begin
+
+
+def main(config: PlacesConfig) -> dict[str, Any]:
+    """Do what is missing, write and return the result."""
+    name = f"places_{config.suite}{'_exchanged' * config.exchanged}"
+    root = config.demonstrations()
+    files = [root / "meta/info.json", root / SUMMARY_FILE]
+    output = Path(config.output or f"outputs/bench/{name}")
+    folder = measured_folder(output, files, [config.suite, str(config.exchanged)], __file__)
+    learned = learn(root, folder)
+    tasks = find_suite(config.simulator).tasks("all")
+    jobs = {f"{i}": (config, folder, tasks[i * len(tasks) // config.scenes], i) for i in range(config.scenes)}
+    rows = resume(folder / "scenes.jsonl", jobs, look_at_scene, config.workers)
+    for told in learned["objects"].values():
+        del told["T_sim_obj"]
+    measured = {"seed": FIRST_SEED, "n": len(rows), "learned": learned, **summary(rows)}
+    return write(name, measured, config.workers)
+
+
+if __name__ == "__main__":
+    run(PlacesConfig, main)

@@ -1,0 +1,113 @@
+"""What the scripted experts for LIBERO are made of: taking something from above, and putting it somewhere.
+
+Positions are in LIBERO's world frame unless a comment says otherwise: x points from the robot over the table,
+y to the robot's left, z up. All lengths are in metres.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from lerobot_openspm.envs.libero.simulator import LiberoSimulator
+from lerobot_openspm.envs.motions import DOWN, Actions, Pace, ScriptedHand, raised, yaw_matrix
+from lerobot_openspm.geometry.se3 import transform
+
+LiberoHand = ScriptedHand[LiberoSimulator]
+
+# Measured: LIBERO's controller covers about a quarter of an action before the next one replaces it.
+PACE = Pace(
+    step_m=0.012, step_rad=0.065, closing_steps=(14, 18), opening_steps=(8, 11), asked_m=0.05, asked_rad=0.5
+)
+
+PRE_GRASP = 0.08
+CARRY_RISE = 0.12
+# The least height above a place from which an object is lowered to it.
+LOWERING = 0.06
+RETREAT_RISE = 0.08
+RELEASE_GAP = 0.004
+
+# Grasp points from the object's origin, along the world's axes.
+# The bowl looks alike from everywhere: always take its rim on the robot's left, which is free in every task.
+BOWL_RIM = np.array([0.0, 0.050, 0.046])
+CHEESE_MIDDLE = np.array([0.0, 0.0, 0.006])
+# Where an object's origin goes, from the origin of what it goes onto.
+BOWL_ON_PLATE = np.array([0.0, 0.0, 0.008])
+
+
+@dataclass(frozen=True)
+class Put:
+    """Something to pick up and put down.
+
+    Attributes:
+        name: What.
+        grasp: Where from its origin to grasp it.
+        goal: Where its origin goes.
+        rise: How high to lift it.
+        lean: By which angle the hand leans towards the robot, radians.
+    """
+
+    name: str
+    grasp: np.ndarray
+    goal: Callable[[LiberoHand], np.ndarray]
+    rise: float = CARRY_RISE
+    lean: float = 0.0
+
+
+def take_and_put(put: Put, hand: LiberoHand) -> Actions:
+    """Grasp from above, fingers opening along the world's y, lift straight up and place."""
+    offset, turn = hand.grasp_noise()
+    lean = Rotation.from_rotvec([0.0, -put.lean, 0.0]).as_matrix()
+    at_grasp = transform(yaw_matrix(turn) @ lean @ DOWN, hand.origin(put.name) + put.grasp + offset)
+    yield from grasp(hand, at_grasp)
+    yield from hand.travel(raised(at_grasp, put.rise))
+    yield from place(hand, put.name, put.goal(hand))
+
+
+def grasp(hand: LiberoHand, at_grasp: np.ndarray) -> Actions:
+    """Go before T_world_ee `at_grasp`, advance along the fingers and close them."""
+    yield from hand.travel(backed(at_grasp, PRE_GRASP))
+    yield from hand.advance(at_grasp)
+    yield from hand.grip(closing=True)
+
+
+def place(hand: LiberoHand, name: str, goal: np.ndarray) -> Actions:
+    """Put the grasped object's origin at a world point (3,), let go and retreat upwards.
+
+    The object crosses the table at the height that it was lifted to.
+    """
+    release = goal + hand.grasp_noise()[0] + [0.0, 0.0, RELEASE_GAP]
+    above = np.array([release[0], release[1], max(hand.origin(name)[2], release[2] + LOWERING)])
+    yield from hand.travel(carried(hand, name, above))
+    yield from hand.advance(carried(hand, name, release))
+    yield from hand.grip(closing=False)
+    yield from hand.retreat(RETREAT_RISE)
+
+
+def carried(hand: LiberoHand, name: str, goal: np.ndarray) -> np.ndarray:
+    """T_world_ee that brings the grasped object to a world point (3,), the hand keeping its orientation."""
+    T_world_ee = hand.simulator.ee_pose()
+    return transform(T_world_ee[:3, :3], T_world_ee[:3, 3] + goal - hand.origin(name))
+
+
+def backed(T_world_ee: np.ndarray, distance: float) -> np.ndarray:
+    """The pose that lies `distance` before another along the fingers."""
+    return transform(T_world_ee[:3, :3], T_world_ee[:3, 3] - distance * T_world_ee[:3, 2])
+
+
+def region(hand: LiberoHand, name: str) -> np.ndarray:
+    """Middle of one of LIBERO's regions in the world, (3,)."""
+    return np.array(hand.simulator.sim.data.get_site_xpos(name))
+
+
+def on(name: str, offset: np.ndarray) -> Callable[[LiberoHand], np.ndarray]:
+    """A place (3,) from an object's origin, along the world's axes."""
+    return lambda hand: hand.origin(name) + offset
+
+
+def on_region(name: str, offset: np.ndarray) -> Callable[[LiberoHand], np.ndarray]:
+    """A place (3,) from the middle of one of LIBERO's regions, along the world's axes."""
+    return lambda hand: region(hand, name) + offset

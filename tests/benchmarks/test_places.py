@@ -1,0 +1,94 @@
+"""What is made of estimates and true places, without a simulator."""
+
+import numpy as np
+import pytest
+from benchmarks.libero.place_errors import is_right, judged, of_object, summary
+from benchmarks.libero.places import PlacesConfig
+
+from lerobot_openspm.geometry import se3
+from lerobot_openspm.types import PoseEstimate
+
+T_SIM_OBJ = se3.from_yaw([0.01, 0.0, -0.02], 0.3)
+
+
+class Known:
+    yaw_period = 2 * np.pi
+
+
+MODELS = {"black bowl": Known(), "milk": Known()}
+
+
+def estimate(T, status="found", confidence=0.99, others=()):
+    return PoseEstimate(status, T, 1e-6 * np.eye(4), confidence, others=tuple(others))
+
+
+def at(x: float, yaw: float = 0.0) -> np.ndarray:
+    return se3.from_yaw([x, 0.0, 0.9], yaw)
+
+
+def row(name, found, poses):
+    return judged(name, found, poses, T_SIM_OBJ, MODELS)
+
+
+def test_errors_are_those_of_the_learned_frame():
+    off = se3.from_yaw([0.003, 0.0, 0.9], 0.1)
+    told = row("milk", estimate(off @ T_SIM_OBJ), {"milk": at(0.0)})
+    expected = np.linalg.norm((off @ T_SIM_OBJ - at(0.0) @ T_SIM_OBJ)[:3, 3])
+    assert told["mm"] == pytest.approx(1000 * expected, abs=0.06)
+    assert told["deg"] == pytest.approx(np.rad2deg(0.1), abs=0.06)
+    assert (told["found"], told["of"], told["near"]) == (True, 1, 1)
+    assert is_right(told)
+
+
+def test_of_two_of_a_kind_the_nearest_counts_and_no_yaw_of_a_round_one():
+    poses = {"bowl": at(0.0), "bowl_2": at(0.3)}
+    one = estimate(at(0.304, 1.0) @ T_SIM_OBJ, "ambiguous")
+    both = estimate(at(0.3) @ T_SIM_OBJ, "ambiguous", others=[at(0.001) @ T_SIM_OBJ])
+    told = row("black bowl", one, poses)
+    assert told["found"]
+    assert told["of"] == 2
+    assert told["deg"] is None
+    assert told["near"] <= 1
+    assert row("black bowl", both, poses)["near"] == 2
+
+
+def test_an_ambiguous_single_thing_is_not_found():
+    told = row("milk", estimate(at(0.0), "ambiguous"), {"milk": at(0.0)})
+    assert told == {"found": False, "confidence": 0.99, "of": 1}
+
+
+def test_what_is_not_there_but_reported_is_wrong():
+    told = row("milk", estimate(at(0.0)), {"bowl": at(0.0)})
+    assert told["of"] == 0
+    assert not is_right(told)
+    assert of_object([told])["absent"] == {"n": 1, "reported": 1}
+
+
+def test_shares_are_of_the_scenes_that_hold_a_thing_and_sure_ones_of_all():
+    def told(mm, deg=1.0, confidence=0.99, found=True, of=1):
+        kept = {"found": found, "confidence": confidence, "of": of}
+        return {**kept, "mm": mm, "deg": deg, "near": int(mm < 10)} if found else kept
+
+    rows = [
+        told(2.0),
+        told(4.0, deg=15.0),
+        told(12.0, confidence=0.5),
+        told(0, found=False),
+        told(0, found=False, of=0),
+    ]
+    object_row = of_object(rows)
+    assert object_row["found"]["success"] == 0.75
+    assert object_row["found"]["n"] == 4
+    assert object_row["within_10_mm"]["success"] == 0.5
+    assert (object_row["position_mm_median"], object_row["yaw_deg_median"]) == (4.0, 1.0)
+    whole = summary(
+        [{"task": "t", "seed": i, "look_cpu_ms": 10, "objects": {"milk": r}} for i, r in enumerate(rows)]
+    )
+    assert (whole["sure"]["success"], whole["sure"]["n"]) == (0.5, 2)
+    assert whole["sure_and_wrong"] == [["milk", "t", 1, 4.0, 15.0]]
+    assert whole["first_look_cpu_ms"] == {"median": 10.0, "p95": 10.0}
+
+
+def test_another_suite_is_refused_by_name():
+    with pytest.raises(ValueError, match="expected one of libero_goal, libero_spatial, libero_object"):
+        PlacesConfig("libero_90")
