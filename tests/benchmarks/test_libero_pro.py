@@ -10,7 +10,7 @@ from benchmarks.libero.variants import OTHER_OBJECTS, PRO_SUITES, exchanged, var
 from benchmarks.libero_pro import ProConfig
 
 from lerobot_openspm.envs.libero.experts import EXPERTS
-from lerobot_openspm.envs.libero.puts import OBJECT, SPATIAL
+from lerobot_openspm.envs.libero.picks import OBJECT, SPATIAL
 from lerobot_openspm.envs.libero.simulator import DO_NOTHING, SUITE, LiberoSimulator, task_file, tasks
 
 TASK = "put_the_bowl_on_the_plate"
