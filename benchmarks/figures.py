@@ -132,7 +132,7 @@ FIGURES: dict[str, Figure] = {
     **{
         name: _figure(
             "tabletop",
-            (*TABLETOP, *_benchmarks("tabletop")),
+            (*TABLETOP, *EPISODES, *_benchmarks("tabletop", "anywhere", "truth")),
             f"--comparison={name}",
         )
         for name in COMPARISONS
