@@ -64,6 +64,10 @@ def _teach(
     (mined,), _ = mine_episodes([episode], partial(find_key_poses, robot=ROBOT), known_names(known))
     cues = reversed(contact_cues(mined))
     layout = {cue.name: se3.transform(np.eye(3), [*cue.point_world[:2], 0.0]) for cue in cues}
+    # What is only let go of in a part of something, as in a caddy's compartment, lies where the hand ended.
+    end = se3.transform(np.eye(3), [*mined.key_poses[-1].T_world_ee[:2, 3], 0.0])
+    for name in (name for sub_task in mined.sub_tasks for name in sub_task.objects):
+        layout.setdefault(name, end)
     ends = carried_to(Demonstration(mined.key_poses, layout), mined.sub_tasks)
     (task,) = compare([mined], [layout], [ends], {})
     found = task_entries(task, "drawn")

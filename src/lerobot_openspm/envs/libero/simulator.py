@@ -237,14 +237,21 @@ class LiberoSimulator:
 
     def object_poses(self) -> dict[str, np.ndarray]:
         """True ``T_world_obj`` (4, 4) of those of the suite's `OBJECTS` that the scene holds."""
-        held = {**self._env.env.objects_dict, **self._env.env.fixtures_dict}
-        names = [name for name, thing in OBJECTS[self.suite].items() if thing in held]
-        return {name: self.body_pose(self.root_body(name)) for name in names}
+        return {name: self.body_pose(one.root_body) for name, one in self._things().items()}
 
     def root_body(self, name: str) -> str:
         """MuJoCo's name of the body of one of the suite's `OBJECTS`."""
-        env = self._env.env
-        return {**env.objects_dict, **env.fixtures_dict}[OBJECTS[self.suite][name]].root_body
+        return self._things()[name].root_body
+
+    def _things(self) -> dict[str, Any]:
+        """Those of the suite's `OBJECTS` that the scene holds; a variant of a task may hold another bowl."""
+        held = {**self._env.env.objects_dict, **self._env.env.fixtures_dict}
+        found = {name: held[thing] for name, thing in OBJECTS[self.suite].items() if thing in held}
+        for name in [name for name in OBJECTS[self.suite] if name not in found]:
+            like = [thing for thing in held if thing.endswith(f"_{name}_1")]
+            if like:
+                found[name] = held[like[0]]
+        return {name: found[name] for name in OBJECTS[self.suite] if name in found}
 
     def body_pose(self, name: str) -> np.ndarray:
         """``T_world_body`` (4, 4) of any body of the MuJoCo model."""
