@@ -113,11 +113,16 @@ def test_relations_go_by_several_names(alias):
 
 
 def costs_are_clear(reference, candidates, landmarks):
-    """Whether rounding cannot decide: a scene that is a little larger or smaller means the same."""
+    """Whether rounding cannot decide: a scene of slightly other size or with slightly other landmarks means
+    the same.
+    """
     answers = set()
-    for scale in (0.999, 1.0, 1.001):
+    shifts = [(0, 0), (1e-6, 0), (-1e-6, 0), (0, 1e-6), (0, -1e-6)]
+    for scale, (x, y) in [(0.999, (0, 0)), (1.001, (0, 0)), *((1.0, shift) for shift in shifts)]:
         sized = [se3.transform(T[:3, :3], scale * T[:3, 3]) for T in candidates]
-        marks = {name: se3.transform(T[:3, :3], scale * T[:3, 3]) for name, T in landmarks.items()}
+        marks = {
+            name: se3.transform(T[:3, :3], scale * T[:3, 3] + [x, y, 0.0]) for name, T in landmarks.items()
+        }
         answers.add(choose(reference, sized, marks))
     return len(answers) == 1
 

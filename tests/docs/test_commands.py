@@ -239,9 +239,9 @@ def shell(line: str, cwd: Path | None = None) -> str:
 
 # What makes a command short; the last of two equal options counts.
 SHORTER = {
-    "openspm collect": " --env.task=push_plate --episodes=2",
+    "openspm collect": " --env.task=bowl_on_plate --episodes=2",
     "lerobot-train": " --steps=2",
-    "lerobot-eval": " --env.task=push_plate --eval.n_episodes=1 --eval.batch_size=1",
+    "lerobot-eval": " --env.task=bowl_on_plate --eval.n_episodes=1 --eval.batch_size=1",
     "openspm inspect": "",
 }
 

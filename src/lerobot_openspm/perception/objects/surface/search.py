@@ -31,6 +31,9 @@ AROUND_SHARE, AROUND_COST = 1.8, 0.5
 # Of all places these, where most looks like the object, are compared in every direction.
 KEPT_PLACES, MIN_PLACES, MAX_PLACES = 0.3, 600, 2000
 STARTS_PER_YAW, CANDIDATES, FINALISTS, MANY = 6, 4, 3, 12
+# All demonstrations show an object turned alike. Turned otherwise by more than this many radians, its agreement
+# counts this share.
+TURNED_RAD, TURNED_SHARE = 0.4, 0.95
 NUDGE_M = 0.006
 # Heights at which something may stand on other things are so far apart, metres.
 RISE_STEP_M = 0.025
@@ -87,18 +90,30 @@ def search(
     apart = max(SAME_PLACE_M, 0.3 * surface.radius)
     likely = _likely(surface, sights, ground)
     starts = np.concatenate([_turned(surface, sights, likely, yaw, apart) for yaw in yaws])
+    starts[:, 4] *= [_likelihood(yaw) for yaw in starts[:, 3]]
     places = [
         refine(surface, sights, pose, freedom, QUICK_POINTS, QUICK_STEPS)
         for pose in _distinct(starts, apart, MANY if several else CANDIDATES)[:, :4]
     ]
-    places.sort(key=lambda place: -place.score)
+    places = _ranked(places)
     finalists = places[:FINALISTS]
     if several:
         for place in places[FINALISTS:]:
             if all(np.linalg.norm(place.pose[:2] - one.pose[:2]) > apart for one in finalists):
                 finalists.append(place)
     finest = [refine(surface, sights, place.pose, freedom, FINE_POINTS, FINE_STEPS) for place in finalists]
-    return sorted(finest, key=lambda place: -place.score)
+    return _ranked(finest)
+
+
+def _ranked(places: Sequence[Place]) -> list[Place]:
+    """Places, the most likely first."""
+    return sorted(places, key=lambda place: -place.score * _likelihood(float(place.pose[3])))
+
+
+def _likelihood(yaw: float) -> float:
+    """What agreement counts for a direction, radians from the demonstrated one."""
+    turn = abs((yaw + np.pi) % (2 * np.pi) - np.pi)
+    return TURNED_SHARE if turn > TURNED_RAD else 1.0
 
 
 def _distinct(scored: Array, metres: float, count: int) -> Array:
