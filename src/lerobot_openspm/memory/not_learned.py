@@ -8,7 +8,7 @@ from typing import Literal
 
 from lerobot_openspm.memory.entry import MemoryEntry
 
-# The longest name and reason that are kept, in characters, and how many records; more are only logged.
+# The longest name and reason that are kept, in characters, and how many records.
 MAX_CHARS, MAX_RECORDS = 1000, 1000
 NEXT_STEP = (
     "two cameras have to show it before the hand hides it, the calibration has to fit, and a segmenter can "

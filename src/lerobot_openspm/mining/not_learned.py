@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 
-from lerobot_openspm.memory.not_learned import NotLearned, not_learned
+from lerobot_openspm.memory.not_learned import MAX_RECORDS, NotLearned, not_learned
 from lerobot_openspm.mining.anchors import Demonstration, contact_roles, roles, suggested_anchor
 from lerobot_openspm.mining.mined import MinedDataset, MinedTask
 
@@ -23,7 +23,10 @@ def missing_objects(demonstration: Demonstration, task: MinedTask) -> frozenset[
 
 
 def list_not_learned(mined: MinedDataset) -> tuple[NotLearned, ...]:
-    """The objects that could not be learned or found, then the instructions that are lost with them."""
+    """The objects that could not be learned or found, then the instructions that are lost with them.
+
+    At most :data:`MAX_RECORDS` of them.
+    """
     handled, lost, instructions = Counter[str](), Counter[str](), list[NotLearned]()
     for task in mined.tasks:
         missing = [missing_objects(one, task) for one in task.aligned]
@@ -46,7 +49,7 @@ def list_not_learned(mined: MinedDataset) -> tuple[NotLearned, ...]:
         elif lost[name]:
             why = f"its first picture does not show it clearly in {lost[name]} of them"
             objects.append(not_learned("object", name, count, why))
-    return (*objects, *instructions)
+    return (*objects, *instructions)[:MAX_RECORDS]
 
 
 def _handled(demonstration: Demonstration, task: MinedTask) -> frozenset[str]:

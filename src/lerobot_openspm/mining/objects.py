@@ -38,8 +38,9 @@ from lerobot_openspm.types import (
 
 logger = logging.getLogger(__name__)
 
-# How many demonstrations of a task are filmed, and from one picture to the next how many frames.
-FILMED_PER_TASK, FILM_STEP = 3, 4
+# How many demonstrations of a task are filmed, and of all tasks as far as there is one of each; from one
+# picture to the next so many frames.
+FILMED_PER_TASK, FILMED, FILM_STEP = 3, 60, 4
 # The hand may touch an object so many frames before the motion to a contact begins.
 FRAMES_BEFORE_CONTACT = 4
 # What the hand takes hold of or pushes has its surface within this distance of the hand, seen from above.
@@ -55,33 +56,41 @@ def learn_scenes(
 ) -> list[DemonstrationScene]:
     """What perception learns from: two frames of every episode, and where the hand touched what."""
     scenes, filmed = [], Counter[str]()
+    n_tasks = len({item.episode.task for item in mined})
+    per_task = int(np.clip(FILMED // max(n_tasks, 1), 1, FILMED_PER_TASK))
     for item in tqdm(mined, desc="Reading images", unit="episode"):
         later = _carried_off(item.key_poses)
         views = demonstrations.views(item.episode, 0, cameras)
         later_views = None if later is None else demonstrations.views(item.episode, later, cameras)
         filmed[item.episode.task] += 1
-        is_filmed = filmed[item.episode.task] <= FILMED_PER_TASK
-        film = partial(read_film, demonstrations, item, cameras) if is_filmed else None
+        is_filmed = filmed[item.episode.task] <= per_task
+        film = partial(read_film, demonstrations, item, views) if is_filmed else None
         scenes.append(DemonstrationScene(views, contact_cues(item), later_views, film))
     return scenes
 
 
 def read_film(
-    demonstrations: Demonstrations, item: MinedEpisode, cameras: Mapping[str, Camera]
+    demonstrations: Demonstrations, item: MinedEpisode, first: Mapping[str, View]
 ) -> tuple[Moment, ...]:
-    """A demonstration as its cameras saw it: those of the hand all the way, the fixed ones at its start."""
+    """A demonstration as its cameras saw it: those of the hand all the way, the fixed ones at its start.
+
+    Args:
+        demonstrations: Where its pictures are.
+        item: The demonstration.
+        first: What every camera shows in its first frame.
+    """
     episode, moved = item.episode, moved_from(item)
-    pictures = {key: demonstrations.images(episode, key) for key in cameras}
-    moments = []
-    for frame in range(0, len(episode), FILM_STEP):
-        views = {}
-        for key, camera in cameras.items():
-            if frame > 0 and camera.mount == "world":
-                continue
-            image = pictures[key][frame].copy()  # a view of it would keep the whole film
-            scaled = camera.scaled(image.shape[1], image.shape[0])
-            views[key] = View(image, scaled, scaled.T_world_cam(episode.T_world_ee[frame]))
-        gone = frozenset(name for name, first in moved.items() if frame >= first)
+    carried = {key: view.camera for key, view in first.items() if view.camera.mount == "ee"}
+    pictures = {key: demonstrations.images(episode, key) for key in carried}
+    moments = [Moment(dict(first), frozenset())]
+    for frame in range(FILM_STEP, len(episode), FILM_STEP):
+        T_world_ee = episode.T_world_ee[frame]
+        # A copy, because a part of the film would keep the whole of it.
+        views = {
+            key: View(pictures[key][frame].copy(), camera, camera.T_world_cam(T_world_ee))
+            for key, camera in carried.items()
+        }
+        gone = frozenset(name for name, first_moved in moved.items() if frame >= first_moved)
         moments.append(Moment(views, gone))
     return tuple(moments)
 

@@ -111,9 +111,9 @@ class Perception:
         known = {name: self.memory.objects[name] for name in names if name in self.memory.objects}
         look = look_at(sound, list(known), self.segmenter, hidden, expected, told_apart)
         estimates = localise_all(known, look)
-        if not self._has_compared and not faults:
+        if not self._has_compared:  # only at the first look, before anything moves
             self._has_compared = True
-            faults = disagreeing_cameras(look, known, estimates)
+            faults = faults or disagreeing_cameras(look, known, estimates)
         return Detections(estimates, faults)
 
     def _simulator_poses(self, observation: Observation, names: Sequence[str]) -> dict[str, PoseEstimate]:
@@ -133,7 +133,7 @@ def disagreeing_cameras(
         known: Objects by name.
         estimates: Where all cameras together show them; each camera looks for them there first.
     """
-    if len(look.views) < 2:
+    if len(look.views) < 2 or len(known) < MIN_COMMON:
         return {}
     expected = {name: one.T_world_obj for name, one in estimates.items() if one.status == "found"}
     # Cameras that disagree much find hardly anything together.

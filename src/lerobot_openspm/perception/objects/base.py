@@ -9,7 +9,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable, Collection, Hashable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any, Protocol
+from typing import Any, ClassVar, Protocol
 
 import numpy as np
 from numpy.random import Generator
@@ -150,13 +150,19 @@ def localise_all(objects: Mapping[str, KnownObject], look: Look) -> dict[str, Po
     for name, one in found.items():
         is_clear = one.status == "found" and one.confidence >= CLEAR and name not in look.told_apart
         supports = [own for other, own in points.items() if other != name and len(own)]
-        if supports and not is_clear and name not in look.expected:
+        if objects[name].on_things and supports and not is_clear and name not in look.expected:
             found[name] = objects[name].localise(replace(look, supports=np.concatenate(supports)))
     return found
 
 
 class KnownObject(Protocol):
-    """An object that was learned. Every kind of object implements this."""
+    """An object that was learned. Every kind of object implements this.
+
+    Attributes:
+        on_things: Whether the kind looks on top of other things and in them too.
+    """
+
+    on_things: ClassVar[bool]
 
     @property
     def name(self) -> str:

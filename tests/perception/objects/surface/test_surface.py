@@ -74,8 +74,8 @@ def test_what_hardly_moves_and_was_filmed_is_known_by_its_surface(models):
     }  # fmt: skip
     # A table of one colour does not tell its height: it is taken to lie right below what was touched.
     assert 0 <= models["cup"].backdrop.table_height < 0.03
-    assert models["cup"].is_round
-    assert not models["block"].is_round
+    assert models["cup"].surface.is_round
+    assert not models["block"].surface.is_round
 
 
 @pytest.mark.parametrize(("name", "height", "radius"), [("block", 0.05, 0.055), ("cup", 0.06, 0.04)])
@@ -109,6 +109,15 @@ def test_it_is_found_elsewhere_and_turned(models, pose):
 def test_what_is_not_there_is_not_found(models):
     scene = {"distractor": se3.from_yaw([-0.1, 0.1, 0.0], 0.0), "block": se3.from_yaw([0.1, -0.1, 0.0], 0.3)}
     assert models["cup"].localise(Look(views_at(scene, looking_down(*HOME)))).status == "not_found"
+
+
+def test_what_lies_on_its_side_is_not_found_and_said_to_have_tipped(models):
+    on_its_side = se3.exp_so3([0.0, np.pi / 2, 0.0])
+    cup = se3.transform(on_its_side, np.array([0.0, 0.12, 0.04]))
+    found = models["cup"].localise(Look(views_at({"cup": cup}, looking_down(*HOME))))
+    assert (found.status, found.tipped) == ("not_found", True)
+    away = models["cup"].localise(Look(views_at(moved(0.12, 0.12, 0.0), looking_down(*HOME))))
+    assert (away.status, away.tipped) == ("not_found", False)
 
 
 def test_what_stands_on_another_is_found_at_its_height(models):

@@ -54,6 +54,7 @@ class BoxModel:
     """
 
     kind: ClassVar[str] = "box"
+    on_things: ClassVar[bool] = False
 
     name: str
     size: Array

@@ -40,6 +40,7 @@ class PatchModel:
     """
 
     kind: ClassVar[str] = "patches"
+    on_things: ClassVar[bool] = False
 
     name: str
     probes: tuple[Probe, ...]

@@ -83,6 +83,7 @@ class ShapeModel:
     """
 
     kind: ClassVar[str] = "shape"
+    on_things: ClassVar[bool] = False
 
     name: str
     log_odds: NDArray[np.float32] | None

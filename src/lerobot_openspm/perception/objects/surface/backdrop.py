@@ -6,8 +6,9 @@ camera looks. What a fixed camera sees beyond the table is taken from the pixels
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Hashable, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 
 import cv2
 import numpy as np
@@ -95,6 +96,12 @@ class Backdrop:
     table_area: Array
     walls: Mapping[str, tuple[Colour, ...]] = field(default_factory=dict[str, tuple[Colour, ...]])
     hand: Mapping[str, Mask] = field(default_factory=dict[str, Mask])
+
+    @cached_property
+    def key(self) -> Hashable:
+        """Equal for backdrops with which a view is prepared alike, wherever they were read from."""
+        hand = tuple((camera, mask.tobytes()) for camera, mask in self.hand.items())
+        return self.table.mean.tobytes(), self.table.precision.tobytes(), hand
 
     @property
     def reach(self) -> Array:

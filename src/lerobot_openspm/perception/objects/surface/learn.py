@@ -18,9 +18,10 @@ from lerobot_openspm.perception.objects.patches.model import PatchModel
 from lerobot_openspm.perception.objects.surface.backdrop import Backdrop, Float32, learn_backdrop
 from lerobot_openspm.perception.objects.surface.carving import Carved, Frame, Frames, carve, silhouette
 from lerobot_openspm.perception.objects.surface.compare import correlation_at, score_at
-from lerobot_openspm.perception.objects.surface.model import SurfaceModel, best_on_table, from_record
+from lerobot_openspm.perception.objects.surface.model import YAWS, SurfaceModel, from_record
 from lerobot_openspm.perception.objects.surface.relief import WEIGHTS, find_relief
-from lerobot_openspm.perception.objects.surface.sight import Surface, sight_of
+from lerobot_openspm.perception.objects.surface.search import Freedom, over_table, search
+from lerobot_openspm.perception.objects.surface.sight import Sight, Surface, sight_of
 from lerobot_openspm.perception.objects.surface.solid import (
     Drawn,
     Solid,
@@ -237,9 +238,15 @@ def _agreements(
                 c: sight_of(view, c, backdrop, _covered(view, world, surface.spacing))
                 for c, view in scene.views.items()
             }
-            rivals.append(best_on_table(surface, without, backdrop, float(T[2, 3])))
+            rivals.append(_best_on_table(surface, without, backdrop, float(T[2, 3])))
     typical = float(np.clip(np.median(own), 0.05, 1.0)) if own else 0.05
     return typical, float(np.clip(max(rivals, default=0.0), 0.0, typical))
+
+
+def _best_on_table(surface: Surface, sights: Mapping[str, Sight], backdrop: Backdrop, height: float) -> float:
+    """How well the best place on the table agrees, for a frame at a world z, turned anyhow."""
+    ground = over_table(surface, backdrop.reach, (height,))
+    return search(surface, sights, ground, YAWS, Freedom(turns=True))[0].score
 
 
 def _covered(view: View, points: Array, spacing: float) -> Mask:

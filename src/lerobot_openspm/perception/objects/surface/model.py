@@ -4,12 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from functools import cached_property, partial
+from functools import partial
 from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import KDTree
 
 from lerobot_openspm.errors import MemoryFormatError
 from lerobot_openspm.geometry import se3
@@ -34,6 +33,7 @@ from lerobot_openspm.perception.objects.surface.search import (
     search,
 )
 from lerobot_openspm.perception.objects.surface.sight import Sight, Surface, sight_of
+from lerobot_openspm.perception.objects.surface.tipped import has_tipped, lying
 from lerobot_openspm.types import PoseEstimate, Symmetry
 
 # What a record may hold: points, coloured ones at least, and the table's length and width in metres, rounded.
@@ -66,10 +66,6 @@ YAWS = tuple(np.linspace(0, 2 * np.pi, 8, endpoint=False))
 # An object that agrees less than this share with its best place on the table may stand on something. That is
 # believed if it agrees this share, and the place on the table less than this share as well.
 CLEAR_SHARE, RAISED_SHARE, BETTER_SHARE = 0.9, 0.85, 0.93
-# Turned about its middle, a round object agrees with itself this well, CIELAB and share.
-ROUND_COLOUR, ROUND_SHARE, ROUND_SPACINGS = 20.0, 0.52, 3.0
-# Turned about its middle, an object has the same shape if this share of its points comes this near to others.
-SAME_SHAPE_SHARE, SAME_SHAPE_SPACINGS = 0.7, 2.0
 
 
 @dataclass(frozen=True)
@@ -87,6 +83,7 @@ class SurfaceModel:
     """
 
     kind: ClassVar[str] = "surface"
+    on_things: ClassVar[bool] = True
 
     name: str
     surface: Surface
@@ -109,32 +106,7 @@ class SurfaceModel:
     @property
     def symmetry(self) -> Symmetry | None:
         """See :class:`lerobot_openspm.perception.objects.base.KnownObject`."""
-        middle = np.append(self.surface.middle, 0.0)
-        points = self.surface.coloured - middle
-        tree, near = KDTree(points), SAME_SHAPE_SPACINGS * self.surface.spacing
-
-        def same(degrees: int) -> bool:
-            R = se3.from_yaw(np.zeros(3), float(np.deg2rad(degrees)))[:3, :3]
-            return float((tree.query(points @ R.T)[0] < near).mean()) > SAME_SHAPE_SHARE
-
-        for turn, others in ((0.0, (60, 90, 150, 180)), (np.pi / 2, (90, 180)), (np.pi, (180,))):
-            if all(map(same, others)):
-                return Symmetry(self.surface.middle, turn)
-        return None
-
-    @cached_property
-    def is_round(self) -> bool:
-        """Whether it looks alike from all sides, so that its direction cannot be seen."""
-        has = np.isfinite(self.surface.colours[:, 1, 0])
-        points, colours = self.surface.points[has], self.surface.colours[has, 1]
-        middle = np.append((points[:, :2].min(0) + points[:, :2].max(0)) / 2, 0.0)
-        tree, shares = KDTree(points - middle), []
-        for turn in np.deg2rad([60, 120, 180, 240, 300]):
-            R = se3.from_yaw(np.zeros(3), float(turn))[:3, :3]
-            away, index = tree.query((points - middle) @ R.T)
-            alike = np.linalg.norm(colours - colours[index], axis=1) < ROUND_COLOUR
-            shares.append(float((alike & (away < ROUND_SPACINGS * self.surface.spacing)).mean()))
-        return min(shares) > ROUND_SHARE
+        return self.surface.symmetry
 
     @property
     def found_share(self) -> float:
@@ -148,7 +120,7 @@ class SurfaceModel:
         if near.status == "found" and expected is not None and _apart_m(near, expected) < FOLLOWED_M:
             return near
         sights = {
-            camera: look.prepared((camera, id(self.backdrop)), partial(self._sight, look, camera))
+            camera: look.prepared((camera, self.backdrop.key), partial(self._sight, look, camera))
             for camera in look.views
         }
         if expected is not None and expected[2, 3] - self.height > LIFTED_M:
@@ -170,8 +142,10 @@ class SurfaceModel:
         if near_score > BETTER_SHARE * places[0].score:  # something may stand on it
             return replace(near, confidence=min(near.confidence, near_score / self.typical_agreement))
         found = self._estimate(look, sights, places)
-        if expected is None or found.status == "found":
+        if found.status == "found":
             return found
+        if expected is None:
+            return replace(found, tipped=found.status == "not_found" and self._has_tipped(sights))
         # Where its patches cannot tell that it is gone, it may be hidden.
         return replace(found, visible=min(found.visible, near.visible))
 
@@ -199,7 +173,7 @@ class SurfaceModel:
 
     def _on_table(self, sights: Mapping[str, Sight], several: bool = False) -> list[Place]:
         ground = over_table(self.surface, self.backdrop.reach, (self.height,))
-        return search(self.surface, sights, ground, self._yaws, Freedom(not self.is_round), several)
+        return search(self.surface, sights, ground, self._yaws, Freedom(not self.surface.is_round), several)
 
     def _on_things(self, supports: Array, sights: Mapping[str, Sight], several: bool = False) -> list[Place]:
         table = self.backdrop.table_height
@@ -209,15 +183,21 @@ class SurfaceModel:
         if len(ground) == 0:
             return []
         return search(
-            self.surface, sights, ground, self._yaws, Freedom(not self.is_round, lifts=True), several
+            self.surface, sights, ground, self._yaws, Freedom(not self.surface.is_round, lifts=True), several
         )
+
+    def _has_tipped(self, sights: Mapping[str, Sight]) -> bool:
+        """Whether it lies on the table; it has to agree as well as what stands on things."""
+        sides, table = lying(self.surface), self.backdrop.table_height
+        needed = max(self.found_share, RAISED_SHARE) * self.typical_agreement
+        return has_tipped(sides, sights, self.backdrop.reach, table, YAWS, needed)
 
     @property
     def _yaws(self) -> tuple[float, ...]:
-        return YAWS[:1] if self.is_round else YAWS
+        return YAWS[:1] if self.surface.is_round else YAWS
 
     def _refined(self, sights: Mapping[str, Sight], T_world_obj: Array) -> Place:
-        freedom = Freedom(not self.is_round)
+        freedom = Freedom(not self.surface.is_round)
         quick = refine(self.surface, sights, _pose(T_world_obj), freedom, QUICK_POINTS, QUICK_STEPS)
         return refine(self.surface, sights, quick.pose, freedom, FINE_POINTS, FINE_STEPS)
 
@@ -231,7 +211,7 @@ class SurfaceModel:
         needed = max(self.found_share, RAISED_SHARE) if is_raised else self.found_share
         status = "not_found" if share < needed else "ambiguous" if is_rivalled else "found"
         T = se3.from_yaw(best.pose[:3], float(best.pose[3]))
-        covariance = covariance_at(self.surface, sights, best.pose, not self.is_round)
+        covariance = covariance_at(self.surface, sights, best.pose, not self.surface.is_round)
         visible = look.seen_share(se3.apply(T, self.surface.coloured))
         others = tuple(
             se3.from_yaw(one.pose[:3], float(one.pose[3]))
@@ -308,12 +288,6 @@ def from_record(fields: Mapping[str, Any], arrays: Mapping[str, NDArray[Any]], w
         numbers["height"],
         numbers["typical_agreement"], numbers["rival_agreement"], patches.from_record(near, own, where),
     )  # fmt: skip
-
-
-def best_on_table(surface: Surface, sights: Mapping[str, Sight], backdrop: Backdrop, height: float) -> float:
-    """How well the best place on the table agrees, for a frame at a world z, turned anyhow."""
-    ground = over_table(surface, backdrop.reach, (height,))
-    return search(surface, sights, ground, YAWS, Freedom(turns=True))[0].score
 
 
 def _followed(seen: PoseEstimate) -> PoseEstimate:

@@ -31,8 +31,8 @@ AROUND_SHARE, AROUND_COST = 1.8, 0.5
 # Of all places these, where most looks like the object, are compared in every direction.
 KEPT_PLACES, MIN_PLACES, MAX_PLACES = 0.3, 600, 2000
 STARTS_PER_YAW, CANDIDATES, FINALISTS, MANY = 6, 4, 3, 12
-# All demonstrations show an object turned alike. Turned otherwise by more than this many radians, its agreement
-# counts this share.
+# All demonstrations show an object turned alike. Turned otherwise by more than this many radians, its
+# agreement counts this share.
 TURNED_RAD, TURNED_SHARE = 0.4, 0.95
 NUDGE_M = 0.006
 # Heights at which something may stand on other things are so far apart, metres.

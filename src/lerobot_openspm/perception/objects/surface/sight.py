@@ -7,14 +7,20 @@ from functools import cached_property
 
 import cv2
 import numpy as np
+from scipy.spatial import KDTree
 
+from lerobot_openspm.geometry import se3
 from lerobot_openspm.geometry.se3 import Array
 from lerobot_openspm.perception.objects.surface.backdrop import Backdrop, Float32, lab
 from lerobot_openspm.perception.objects.surface.relief import WEIGHTS
-from lerobot_openspm.types import Mask, View
+from lerobot_openspm.types import Mask, Symmetry, View
 
 # Pictures are smoothed by a Gaussian of so many pixels at least, if they are 256 wide.
 FINEST = 0.6
+# Turned about its middle, a round object agrees with itself this well, CIELAB and share.
+ROUND_COLOUR, ROUND_SHARE, ROUND_SPACINGS = 20.0, 0.52, 3.0
+# Turned about its middle, an object has the same shape if this share of its points comes this near to others.
+SAME_SHAPE_SHARE, SAME_SHAPE_SPACINGS = 0.7, 2.0
 # Colours this far apart, CIELAB, are alike in the search over the table.
 LIKE_COARSE = 12.0
 
@@ -60,6 +66,36 @@ class Surface:
     def radius(self) -> float:
         """Horizontal distance from the middle within which most coloured points are, metres."""
         return float(np.percentile(np.linalg.norm(self.coloured[:, :2] - self.middle, axis=1), 90))
+
+    @cached_property
+    def symmetry(self) -> Symmetry | None:
+        """How its shape turns into itself, whatever its colours do; None if it does not."""
+        middle = np.append(self.middle, 0.0)
+        points = self.coloured - middle
+        tree, near = KDTree(points), SAME_SHAPE_SPACINGS * self.spacing
+
+        def same(degrees: int) -> bool:
+            R = se3.from_yaw(np.zeros(3), float(np.deg2rad(degrees)))[:3, :3]
+            return float((tree.query(points @ R.T)[0] < near).mean()) > SAME_SHAPE_SHARE
+
+        for turn, others in ((0.0, (60, 90, 150, 180)), (np.pi / 2, (90, 180)), (np.pi, (180,))):
+            if all(map(same, others)):
+                return Symmetry(self.middle, turn)
+        return None
+
+    @cached_property
+    def is_round(self) -> bool:
+        """Whether it looks alike from all sides, so that its direction cannot be seen."""
+        has = np.isfinite(self.colours[:, 1, 0])
+        points, colours = self.points[has], self.colours[has, 1]
+        middle = np.append((points[:, :2].min(0) + points[:, :2].max(0)) / 2, 0.0)
+        tree, shares = KDTree(points - middle), []
+        for turn in np.deg2rad([60, 120, 180, 240, 300]):
+            R = se3.from_yaw(np.zeros(3), float(turn))[:3, :3]
+            away, index = tree.query((points - middle) @ R.T)
+            alike = np.linalg.norm(colours - colours[index], axis=1) < ROUND_COLOUR
+            shares.append(float((alike & (away < ROUND_SPACINGS * self.spacing)).mean()))
+        return min(shares) > ROUND_SHARE
 
 
 @dataclass(frozen=True)
