@@ -93,6 +93,12 @@ CALIBRATION = (
 NOISE = (*ALONG, *_benchmarks("measurement_noise"))
 # As `make libero` types it.
 LIBERO_GOAL = "--demos=10 --states=50 --tasks=0-9"
+# Scenes of each task: 50 of each of three, and 10 of each of ten.
+PLACES = {
+    "libero_spatial": "--suite=libero_spatial",
+    "libero_object": "--suite=libero_object",
+    "libero_goal_exchanged": "--suite=libero_goal --exchanged=true --scenes=10",
+}
 NEW_TASKS = (
     "open_the_middle_drawer_of_the_cabinet",
     "put_the_bowl_on_the_plate",
@@ -155,6 +161,10 @@ FIGURES: dict[str, Figure] = {
             f"--suite={suite} --states=50",
         )
         for suite in ("libero_goal_swap", "libero_goal_lan", "libero_goal_object")
+    },
+    **{
+        f"places_{name}": _libero("places", "libero/place_errors", "truth", "calls", options=options)
+        for name, options in PLACES.items()
     },
     "libero_few_shot_3": _libero("few_shot", options="--demos=3"),
     "libero_few_shot_1": _libero("few_shot", options="--demos=1 --states=10"),

@@ -113,6 +113,24 @@ def test_contacts_that_no_task_asks_for_are_told_beside_success(results):
     assert "| put the bowl | 50.0 % | 15.0 to 85.0 % | 4 | 100.0 | 25.0 % | - |" in text
 
 
+def test_every_thing_that_was_touched_has_a_row_whether_it_was_learned_or_not(results):
+    told = {"found": RATE, "within_10_mm": RATE, "absent": {"n": 3, "reported": 1}}
+    errors = {"position_mm_median": 2.0, "position_mm_p95": 5.0, "yaw_deg_median": None}
+    objects = {"milk": {"grasped": 30, "learned": "shape"}, "basket": {"grasped": 0, "learned": None}}
+    put(
+        results,
+        "places_libero_object",
+        learned={"episodes": 30, "seconds": 200.2, "learn_objects_s": 80.4, "objects": objects},
+        found=dict.fromkeys(objects, {**told, **errors}),
+        sure=RATE,
+        first_look_cpu_ms={"median": 140.0, "p95": 180.0},
+    )
+    text = tables.results_page()
+    assert "| milk | shape | 30 | 50.0 % | 50.0 % | 15.0 to 85.0 % | 4 | 2.0 | 5.0 | - | 1 of 3 |" in text
+    assert "| basket | not learned | 0 |" in text
+    assert "took 80 s of the 200 s of mining" in text
+
+
 def test_the_curve_of_few_demonstrations_ends_with_the_main_result(results):
     for n in (3, 1):
         put(results, f"libero_few_shot_{n}", **RATE, demonstrations=n, mine_and_train_s=9)
