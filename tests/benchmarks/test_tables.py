@@ -121,7 +121,7 @@ def test_every_thing_that_was_touched_has_a_row_whether_it_was_learned_or_not(re
         results,
         "places_libero_object",
         learned={"episodes": 30, "seconds": 200.2, "learn_objects_s": 80.4, "objects": objects},
-        found=dict.fromkeys(objects, {**told, **errors}),
+        found={name: {**told, **errors} for name in objects},
         sure=RATE,
         first_look_cpu_ms={"median": 140.0, "p95": 180.0},
     )
