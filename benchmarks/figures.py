@@ -138,7 +138,7 @@ FIGURES: dict[str, Figure] = {
     **{
         name: _figure(
             "tabletop",
-            (*TABLETOP, *EPISODES, *_benchmarks("tabletop", "anywhere", "truth")),
+            (*TABLETOP, *EPISODES, *_benchmarks("tabletop", "anywhere", "calls", "truth")),
             f"--comparison={name}",
         )
         for name in COMPARISONS

@@ -201,12 +201,12 @@ def _places(result: Quoted) -> str:
     sure, spent = result["sure"], result["first_look_cpu_ms"]
     note = (
         f"All that the hand touched in {learned['episodes']} demonstrations, and in how many it took hold of "
-        "it. Seeded scenes that none of them shows; the hand is somewhere else in each. Shares are of the scenes "
-        "that hold the thing, whether it was learned or not; of several of a kind the nearest counts. "
+        "it. Seeded scenes that none of them shows; the hand is somewhere else in each. Shares are of the "
+        "scenes that hold the thing, whether it was learned or not; of several of a kind the nearest counts. "
         f"{percent(sure)} of {sure['n']} estimates with a confidence above 0.95 are within 10 mm and 10 "
-        f"degrees. Learning the objects took {learned['learn_objects_s']:.0f} s of the {learned['seconds']:.0f} s of "
-        f"mining. A first look at all of them takes {spent['median']:.0f} ms of a processor (95th percentile "
-        f"{spent['p95']:.0f})."
+        f"degrees. Learning the objects took {learned['learn_objects_s']:.0f} s of the "
+        f"{learned['seconds']:.0f} s of mining. A first look at all of them takes {spent['median']:.0f} ms of "
+        f"a processor (95th percentile {spent['p95']:.0f})."
     )
     return f"{grid(rows, PLACES, 'Thing')}\n\n{note}"
 

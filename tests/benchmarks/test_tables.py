@@ -113,6 +113,26 @@ def test_contacts_that_no_task_asks_for_are_told_beside_success(results):
     assert "| put the bowl | 50.0 % | 15.0 to 85.0 % | 4 | 100.0 | 25.0 % | - |" in text
 
 
+def test_first_looks_anywhere_are_told_beside_success_and_so_is_which_layouts_are_left_out(results):
+    poses = {"poses": 70, "unknown": 2, "position_mm_mean": 2.5, "position_mm_p95": 6.0, "yaw_deg_mean": 1.5}
+    looks = {
+        "looks": 7,
+        "layouts": {"drawn": 10, "hidden": 1, "unsolved": 2},
+        "poses": poses,
+        "poses_needed": {**poses, "poses": 20},
+        "false_finds": RATE,
+        "confident_and_right": RATE,
+    }
+    run = {**RATE, "per_task": {"a": 0.5}}
+    put(results, "anywhere", n=4, runs={"anywhere": run}, instructions={"a": "do a"}, first_looks=looks)
+    text = tables.results_page()
+    assert "| all that are known | 70 | 2 | 2.5 | 6.0 | 1.5 |" in text
+    assert "| those that the task needs | 20 |" in text
+    assert "it was reported in 50.0 % of 4 looks" in text
+    assert "3 (30.0 %) not used: 1 do not show" in text
+    assert ("anywhere", "first_looks") in MARK.findall(text)
+
+
 def test_every_thing_that_was_touched_has_a_row_whether_it_was_learned_or_not(results):
     told = {"found": RATE, "within_10_mm": RATE, "absent": {"n": 3, "reported": 1}}
     errors = {"position_mm_median": 2.0, "position_mm_p95": 5.0, "yaw_deg_median": None}

@@ -81,8 +81,12 @@ def test_first_looks_tell_errors_false_finds_and_whether_confidence_holds():
             ["rack", False, True, 0.90, None, None],
         ],
         "gone": [["plate", False], ["box", True]],
+        "drawn": 5,
+        "tried": 2,
     }
     told = summarise([row])
+    # Three do not show which one is meant; of the other two the expert solves the last one.
+    assert told["layouts"] == {"drawn": 5, "hidden": 3, "unsolved": 1}
     assert told["poses"]["position_mm_mean"] == 3.0
     assert told["poses"]["unknown"] == 1
     assert told["poses_needed"]["yaw_deg_mean"] == round(float(np.rad2deg(0.5)), 2)
