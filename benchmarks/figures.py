@@ -65,7 +65,14 @@ LIBERO = (
     *RECORDING["libero"],
     *EPISODES,
     *_package("cli/options.py", "cli/pipeline.py"),
-    *_benchmarks("stages", "libero/contacts", "libero/evaluate", "libero/pro_objects", "libero/variants"),
+    *_benchmarks(
+        "stages",
+        "libero/contacts",
+        "libero/evaluate",
+        "libero/failures",
+        "libero/pro_objects",
+        "libero/variants",
+    ),
     "configs/openspm_libero_train.yaml",
     "configs/cameras/libero.json",
 )
@@ -157,7 +164,7 @@ FIGURES: dict[str, Figure] = {
     **{
         suite: _figure(
             "libero_pro",
-            (*LIBERO, *_benchmarks("libero_pro")),
+            (*LIBERO, *_benchmarks("libero_pro", "libero/accuracy", "truth")),
             f"--suite={suite} --states=50",
         )
         for suite in ("libero_goal_swap", "libero_goal_lan", "libero_goal_object")

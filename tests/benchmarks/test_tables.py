@@ -18,6 +18,7 @@ ORIGIN = {
     "seed": 0,
 }  # fmt: skip
 RATE = {"success": 0.5, "n": 4, "interval": [0.15, 0.85], "mean_steps": 100.0, "touched": 0.25, "moved": 0.0}
+FAILURES = {"words": 0, "perception": 1, "reach": 0, "collision": 0, "grasp": 1, "placing": 0}
 A_NUMBER = re.compile(r"\d[\d.,]* ?(%|ms\b|s\b|min\b|mm\b|minutes?\b|hours?\b|seconds?\b)")
 
 
@@ -35,7 +36,8 @@ def put(results: dict[str, Any], name: str, **content: Any) -> None:
 
 
 def put_main_result(results: dict[str, Any], **content: Any) -> None:
-    put(results, "libero_goal", **RATE, demonstrations=10, mine_and_train_s=200, **content)
+    rest = {"demonstrations": 10, "mine_and_train_s": 200, "failures": FAILURES}
+    put(results, "libero_goal", **RATE, **rest, **content)
 
 
 def test_the_committed_pages_are_made_of_the_committed_results():
@@ -107,10 +109,18 @@ def test_failures_are_told_apart_by_rule(results):
 
 
 def test_contacts_that_no_task_asks_for_are_told_beside_success(results):
-    put(results, "libero_goal_object", **RATE, per_task={"put_the_bowl": {**RATE, "moved": None}})
+    put(
+        results,
+        "libero_goal_object",
+        **RATE,
+        per_task={"put_the_bowl": {**RATE, "moved": None}},
+        failures=FAILURES,
+    )
     text = tables.results_page()
     assert "| all ten tasks | 50.0 % | 15.0 to 85.0 % | 4 | 100.0 | 25.0 % | 0.0 % |" in text
     assert "| put the bowl | 50.0 % | 15.0 to 85.0 % | 4 | 100.0 | 25.0 % | - |" in text
+    assert "| Failed by | words | perception | reach | collision | grasp | placing |" in text
+    assert "| episodes | 0 | 1 | 0 | 0 | 1 | 0 |" in text
 
 
 def test_first_looks_anywhere_are_told_beside_success_and_so_is_which_layouts_are_left_out(results):
