@@ -1,4 +1,4 @@
-"""Why episodes failed: a first sorting, by rule, of what was noted of them. A look at each may say otherwise."""
+"""Why episodes failed: sorted by a rule, from what was noted of them. A look at each may say otherwise."""
 
 from __future__ import annotations
 

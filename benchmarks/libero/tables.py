@@ -50,11 +50,11 @@ TOUCHED = (
 )
 
 SORTED = (
-    f"Failed episodes by a rule; the first that fits counts. Words: the instruction was not understood. "
-    f"Perception: an object was not found or was lost, a camera was not believed, or a pose was more than "
+    "Failed episodes by a rule; the first that fits counts. Words: the instruction was not understood. "
+    "Perception: an object was not found or was lost, a camera was not believed, or a pose was more than "
     f"{FAR_OFF:.0f} mm off at the first look. Reach: no remembered motion passed the checks of reach and "
-    "clearance. Collision: an object that is not of the task was touched. Grasp: the hand did not keep hold of "
-    "all that it was to take hold of. Placing: the rest, gripped or pushed but without reaching the goal."
+    "clearance. Collision: an object that is not of the task was touched. Grasp: the hand did not keep hold "
+    "of all that it was to take hold of. Placing: the rest, gripped or pushed but without reaching the goal."
 )
 PLACES: Columns = {
     "Known by": lambda row: row["learned"] or "not learned",

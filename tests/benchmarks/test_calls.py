@@ -12,7 +12,7 @@ def divide(a: float, b: float) -> float:
 
 def test_every_call_is_noted_and_the_function_is_put_back_whatever_happens():
     module = ModuleType("some")
-    module.divide = divide  # pyright: ignore[reportAttributeAccessIssue]
+    module.divide = divide
     with watched(module, "divide") as spent_s:
         assert module.divide(1, b=2) == 0.5
         with pytest.raises(ZeroDivisionError):

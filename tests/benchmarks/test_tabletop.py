@@ -2,11 +2,12 @@
 
 import json
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
-from benchmarks.anywhere import summarise
+from benchmarks.anywhere import _without, summarise
 from benchmarks.results import PROVENANCE
 from benchmarks.tabletop import TabletopConfig, main
 
@@ -70,6 +71,17 @@ def test_a_comparison_keeps_all_its_runs(name: str, runs: list[str], seed: int, 
 def test_an_unknown_comparison_is_refused():
     with pytest.raises(ValueError, match="comparison is 'weather', expected one of tabletop, execution"):
         TabletopConfig("weather")
+
+
+def test_what_was_taken_away_is_put_back_even_where_the_look_fails():
+    at, put = np.eye(4), []
+    simulator = SimpleNamespace(put=lambda name, T: put.append((name, T[0, 3])))
+    world: Any = SimpleNamespace(
+        env=SimpleNamespace(simulator=simulator), object_poses=lambda: {"bowl": at.copy()}
+    )
+    with pytest.raises(ValueError, match="blind"), _without(world, "bowl"):
+        raise ValueError("blind")
+    assert put == [("bowl", 5.0), ("bowl", 0.0)]
 
 
 def test_first_looks_tell_errors_false_finds_and_whether_confidence_holds():
