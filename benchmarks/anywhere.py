@@ -10,12 +10,13 @@ from typing import Any
 import numpy as np
 import torch
 
+from benchmarks.calls import watched
 from benchmarks.episodes import LazyImages, load
 from benchmarks.harness import Row, checkpoint_files, measured_folder, resume
 from benchmarks.truth import Truth, offsets, pose_error, summary, true_period
 from benchmarks.worlds import TabletopWorld, tabletop
 from lerobot_openspm.cli.pipeline import rate
-from lerobot_openspm.envs.tabletop import scene
+from lerobot_openspm.envs.tabletop import env, scene
 from lerobot_openspm.envs.tabletop.tasks import SELECTIONS
 from lerobot_openspm.modeling_openspm import OpenSPMPolicy
 from lerobot_openspm.perception.observation import Observation
@@ -44,10 +45,19 @@ def looks(checkpoint: Path, root: Path, folder: Path, seed: int) -> dict[str, An
 
 
 def look(checkpoint: Path, root: Path, task: str, seed: int) -> Row:
-    """Errors of the poses that the policy takes at first, and whether what was taken away is found."""
+    """Errors of the poses that the policy takes at first, and whether what was taken away is found.
+
+    Returns:
+        Also how many layouts were ``drawn`` until one could be used, and how many of these the expert
+        ``tried``: the others do not show which object is meant.
+    """
     policy, T_sim_obj = load(str(checkpoint)), offsets(checkpoint, root)
     objects, cameras = policy.require_memory().objects, policy.require_memory().cameras
-    with tabletop(task, seed) as world:
+    with (
+        watched(env, "sample_anywhere") as drawn,
+        watched(env, "expert_solves") as tried,
+        tabletop(task, seed) as world,
+    ):
         observation = observe(policy, world)
         true = Truth(world.object_poses(), T_sim_obj).now(world.object_poses())
         with torch.inference_mode():
@@ -68,7 +78,7 @@ def look(checkpoint: Path, root: Path, task: str, seed: int) -> Row:
             with _without(world, own):
                 views, _ = observe(policy, world).usable_views(cameras)
                 gone.append((name, detect(views, {name: objects[name]})[name].status != "not_found"))
-    return {"found": found, "gone": gone}
+    return {"found": found, "gone": gone, "drawn": len(drawn), "tried": len(tried)}
 
 
 def observe(policy: OpenSPMPolicy, world: TabletopWorld) -> Observation:
@@ -101,8 +111,10 @@ def _without(world: TabletopWorld, name: str) -> Generator[None]:
     away = T_world_obj.copy()
     away[:3, 3] = (5.0, 5.0, -3.0)
     simulator.put(name, away)
-    yield
-    simulator.put(name, T_world_obj)
+    try:
+        yield
+    finally:
+        simulator.put(name, T_world_obj)
 
 
 def summarise(rows: Sequence[Row]) -> dict[str, Any]:
@@ -113,11 +125,18 @@ def summarise(rows: Sequence[Row]) -> dict[str, Any]:
     right = [one for one in sure if one[4] <= RIGHT_M and (not one[2] or one[5] <= RIGHT_RAD)]
     return {
         "looks": len(rows),
+        "layouts": _layouts(rows),
         "poses": _errors(found),
         "poses_needed": _errors([one for one in found if one[1]]),
         "false_finds": rate(sum(gone), len(gone)),
         "confident_and_right": rate(len(right), len(sure)),
     }
+
+
+def _layouts(rows: Sequence[Row]) -> dict[str, Any]:
+    """How many layouts were drawn, and how many of them were not used for which reason."""
+    drawn, tried = (sum(row[key] for row in rows) for key in ("drawn", "tried"))
+    return {"drawn": drawn, "hidden": drawn - tried, "unsolved": tried - len(rows)}
 
 
 def _errors(found: Sequence[Sequence[Any]]) -> dict[str, Any]:

@@ -66,6 +66,7 @@ class Episode:
             "steps": len(self.actions),
             "success": self.success,
             "status": state.status.value,
+            "refusal": state.refusal,
             "key_pose": state.index,
             "phase": targets[state.index].key_pose.phase if targets else None,
             "attempts": state.attempts,

@@ -65,7 +65,14 @@ LIBERO = (
     *RECORDING["libero"],
     *EPISODES,
     *_package("cli/options.py", "cli/pipeline.py"),
-    *_benchmarks("stages", "libero/contacts", "libero/evaluate", "libero/pro_objects", "libero/variants"),
+    *_benchmarks(
+        "stages",
+        "libero/contacts",
+        "libero/evaluate",
+        "libero/failures",
+        "libero/pro_objects",
+        "libero/variants",
+    ),
     "configs/openspm_libero_train.yaml",
     "configs/cameras/libero.json",
 )
@@ -93,6 +100,12 @@ CALIBRATION = (
 NOISE = (*ALONG, *_benchmarks("measurement_noise"))
 # As `make libero` types it.
 LIBERO_GOAL = "--demos=10 --states=50 --tasks=0-9"
+# Scenes of each task: 50 of each of three, and 10 of each of ten.
+PLACES = {
+    "libero_spatial": "--suite=libero_spatial",
+    "libero_object": "--suite=libero_object",
+    "libero_goal_exchanged": "--suite=libero_goal --exchanged=true --scenes=10",
+}
 NEW_TASKS = (
     "open_the_middle_drawer_of_the_cabinet",
     "put_the_bowl_on_the_plate",
@@ -132,7 +145,7 @@ FIGURES: dict[str, Figure] = {
     **{
         name: _figure(
             "tabletop",
-            (*TABLETOP, *EPISODES, *_benchmarks("tabletop", "anywhere", "truth")),
+            (*TABLETOP, *EPISODES, *_benchmarks("tabletop", "anywhere", "calls", "truth")),
             f"--comparison={name}",
         )
         for name in COMPARISONS
@@ -151,10 +164,14 @@ FIGURES: dict[str, Figure] = {
     **{
         suite: _figure(
             "libero_pro",
-            (*LIBERO, *_benchmarks("libero_pro")),
+            (*LIBERO, *_benchmarks("libero_pro", "libero/accuracy", "truth")),
             f"--suite={suite} --states=50",
         )
         for suite in ("libero_goal_swap", "libero_goal_lan", "libero_goal_object")
+    },
+    **{
+        f"places_{name}": _libero("places", "libero/place_errors", "truth", "calls", options=options)
+        for name, options in PLACES.items()
     },
     "libero_few_shot_3": _libero("few_shot", options="--demos=3"),
     "libero_few_shot_1": _libero("few_shot", options="--demos=1 --states=10"),

@@ -13,10 +13,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
+from benchmarks.libero.accuracy import accuracy
 from benchmarks.libero.evaluate import SEED, STATES, EvaluationConfig, evaluate, summary
 from benchmarks.libero.variants import PRO_SUITES
 from benchmarks.results import run, write
-from benchmarks.stages import DEMOS, LIBERO, policy
+from benchmarks.stages import DEMOS, LIBERO, dataset, policy
 from lerobot_openspm.cli.pipeline import THREADS
 
 
@@ -58,12 +59,12 @@ def main(config: ProConfig) -> dict[str, Any]:
             tuning=config.tuning,
         )
     )
-    figures = summary(episodes)
+    figures = summary(episodes, accuracy(checkpoint, dataset(LIBERO), episodes)["found_off_mm"])
     if config.states == STATES and config.task == "all" and not config.tuning:
         write(config.suite, {"seed": SEED, "demonstrations": DEMOS, **figures}, THREADS)
     return {
         key: figures[key]
-        for key in ("success", "interval", "n", "mean_steps", "touched", "moved", "per_task")
+        for key in ("success", "interval", "n", "mean_steps", "touched", "moved", "failures", "per_task")
     }
 
 

@@ -71,8 +71,9 @@ def _cost(result: Quoted) -> str:
     found, one, twenty = cost["perception"], cost["filter_us_1_object"], cost["filter_us_20_objects"]
     first, followed = found["first_ms"], found["followed_ms"]
     return (
-        f"{result['episodes']} episodes. Finding {found['objects']} objects in {found['views']} views of 256 "
-        f"pixels takes {first['median']:.1f} ms (median; p99 {first['p99']:.1f}) at the first look and "
+        f"{result['episodes']} episodes. A look for {found['objects']} objects in {found['views']} views of "
+        f"256 pixels takes {first['median']:.1f} ms (median; p99 {first['p99']:.1f}) at the start of an "
+        f"episode, where {found['found']} of them are found and the cameras are compared, and "
         f"{followed['median']:.1f} ms ({followed['p99']:.1f}) when they are followed; a step of the filter "
         f"takes {one['median']:.0f} us for one object and {twenty['median']:.0f} us for twenty; one thread."
     )

@@ -21,16 +21,16 @@ def accuracy(checkpoint: Path, dataset: Path, episodes: Sequence[Row]) -> dict[s
     """Position and yaw errors, over all objects that an episode's task touches, per object and per task.
 
     ``off_mm`` holds the largest position error of every episode, in their order; None if an object was not
-    found.
+    found. ``found_off_mm`` holds that of the objects that were found.
     """
     models, T_sim_obj = read_memory(checkpoint).objects, offsets(checkpoint, dataset)
     by_object, by_task = defaultdict[str, list[Error]](list), defaultdict[str, list[Error]](list)
-    off_mm: list[float | None] = []
+    off_mm, found_off_mm = list[float | None](), list[float]()
     for episode in episodes:
         found: list[Error] = []
         for name, true in episode["true"].items():
             error: Error = (None, None)
-            if name in episode["seen"]:
+            if name in episode["seen"] and name in T_sim_obj:
                 period = true_period(name, LIBERO)
                 T_true, T = (se3.from_yaw(place[:3], place[3]) for place in (true, episode["seen"][name]))
                 metres, radians = pose_error(T_true @ T_sim_obj[name], T, period)
@@ -42,11 +42,13 @@ def accuracy(checkpoint: Path, dataset: Path, episodes: Sequence[Row]) -> dict[s
         by_task[episode["task"]] += found
         metres = [metres for metres, _ in found if metres is not None]
         is_complete = len(metres) == len(found)
-        off_mm.append(round(1000 * max(metres, default=0.0), 1) if is_complete else None)
+        found_off_mm.append(round(1000 * max(metres, default=0.0), 1))
+        off_mm.append(found_off_mm[-1] if is_complete else None)
     overall = summary([error for errors in by_object.values() for error in errors])
     return {
         **{key: overall[key] for key in ("position_mm_mean", "position_mm_p95")},
         "objects": {name: summary(errors) for name, errors in by_object.items()},
         "off_mm": off_mm,
+        "found_off_mm": found_off_mm,
         "tasks": {task: summary(by_task[task]) for task in tasks() if task in by_task},
     }

@@ -22,7 +22,7 @@ def task_objects(instruction: str, file: Path) -> set[str]:
     """Those of `THINGS` that an instruction names, or the goal of LIBERO's description of the task."""
     words = re.findall(r"\w+", instruction.lower())
     goal = file.read_text().partition("(:goal")[2]
-    return {name for name in THINGS if name in words or re.search(rf"_{name}_\d", goal)}
+    return {name for name in THINGS if name in words or re.search(rf"(?<![a-z]){name}_\d", goal)}
 
 
 def shares(found: Sequence[Mapping[str, float]]) -> dict[str, float | None]:

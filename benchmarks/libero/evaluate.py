@@ -18,8 +18,9 @@ from typing import Any
 import numpy as np
 from benchmarks.episodes import load, run_episode
 from benchmarks.harness import Row, checkpoint_files, measured_folder, resume
-from benchmarks.libero import contacts, pro_objects, variants
+from benchmarks.libero import contacts, failures, pro_objects, variants
 from benchmarks.libero.contacts import Contacts, shares, task_objects
+from benchmarks.libero.failures import Grips, counts, failure_kind
 from benchmarks.libero.variants import exchanged, variant_file, variant_states
 from benchmarks.results import run
 from benchmarks.worlds import LIBERO_IMAGE_SIZE, LiberoWorld
@@ -83,7 +84,7 @@ def evaluate(config: EvaluationConfig) -> list[Row]:
     if unknown := [task for task in wanted if task not in tasks()]:
         raise ValueError(f"libero_goal has no tasks {unknown}, expected some of {', '.join(tasks())}")
     settings = [f"{key}={getattr(config, key)}" for key in ("suite", "tuning", "tuning_seed", "execution")]
-    code = [Path(str(module.__file__)) for module in (contacts, pro_objects, variants)]
+    code = [Path(str(module.__file__)) for module in (contacts, failures, pro_objects, variants)]
     files = [*checkpoint_files(Path(config.checkpoint)), *code]
     folder = measured_folder(Path(config.output), files, settings, __file__)
     jobs = {f"{task} {i}": (config, task, i) for task in wanted for i in range(config.episodes)}
@@ -104,20 +105,32 @@ def evaluate_states(
     )
 
 
-def summary(episodes: list[Row]) -> dict[str, Any]:
-    """Rates over all episodes and per task, and which of them failed."""
+def summary(episodes: list[Row], off_mm: Sequence[float] | None = None) -> dict[str, Any]:
+    """Rates over all episodes and per task, which of them failed, and by what as `failures` sorts them.
+
+    Args:
+        episodes: What was evaluated.
+        off_mm: For each the largest error among the poses that were found at first, where that is known.
+    """
     names = dict.fromkeys(e["task"] for e in episodes)
     own = {
         task: [e for e in episodes if e["task"] == task] for task in sorted(names, key=list(tasks()).index)
     }
+    errors = [None] * len(episodes) if off_mm is None else off_mm
+    failed = [
+        {
+            **{key: e[key] for key in ("task", "state", "seed", "attempts")},
+            "reason": reason(e),
+            "kind": failure_kind(e, off),
+        }
+        for e, off in zip(episodes, errors, strict=True)
+        if not e["success"]
+    ]
     return {
         **_rate(episodes),
         "per_task": {task: _rate(es) for task, es in own.items()},
-        "failed": [
-            {**{key: e[key] for key in ("task", "state", "seed", "attempts")}, "reason": reason(e)}
-            for e in episodes
-            if not e["success"]
-        ],
+        "failures": counts([one["kind"] for one in failed]),
+        "failed": failed,
     }
 
 
@@ -139,7 +152,8 @@ def reason(episode: Row) -> str:
         case Status.NO_PROGRESS:
             return f"gave up at {episode['phase']}"
         case status:
-            return status.replace("_", " ")
+            refusal = episode.get("refusal")
+            return status.replace("_", " ") + (f": {refusal}" if refusal else "")
 
 
 def evaluate_one(config: EvaluationConfig, task: str, state: int) -> Row:
@@ -147,7 +161,8 @@ def evaluate_one(config: EvaluationConfig, task: str, state: int) -> Row:
 
     Returns:
         What is kept of it. ``seen`` are the poses that the policy found when it planned, ``true`` the
-        simulator's poses of the objects that the instruction names, ``contacts`` as `Contacts` tells them.
+        simulator's poses of the objects that the instruction names, ``contacts`` as `Contacts` tells them,
+        ``gripped`` as `Grips` does.
     """
     seed = (config.tuning_seed if config.tuning else SEED) + state
     is_exchanged = config.tuning and config.suite != SUITE
@@ -161,10 +176,12 @@ def evaluate_one(config: EvaluationConfig, task: str, state: int) -> Row:
     sub_tasks = parse_instruction(simulator.instruction)
     named = list(dict.fromkeys(name for sub_task in sub_tasks for name in sub_task.objects))
     watch = Contacts(simulator, task_objects(simulator.instruction, file or task_file(task)))
-    places: dict[str, Any] = {}
+    grips, places = Grips(), dict[str, Any]()
 
     def note(step: int, observation: Observation, controller: EpisodeController) -> None:
         watch.note()
+        state, targets = controller.state, controller.executor.targets
+        grips.note(state.part, [target.key_pose.phase for target in targets], state.index)
         if step == 0:
             true = name_simulator_poses(simulator.object_poses(), named, policy.require_memory().objects)
             seen = controller.scene.tracker.poses(observation.hand.T_world_ee)
@@ -173,7 +190,7 @@ def evaluate_one(config: EvaluationConfig, task: str, state: int) -> Row:
 
     episode = run_episode(policy, LiberoWorld(simulator), note=note)
     watch.note()
-    found = {"contacts": watch.told(), **places}
+    found = {"contacts": watch.told(), "gripped": grips.told(), **places}
     return {"task": task, "state": state, "seed": seed, **episode.told(), **found}
 
 

@@ -38,11 +38,7 @@ def judged(
         T_sim_obj: The learned frame in the simulator's upright one.
         models: What was learned, by name.
     """
-    there = [
-        upright(named[name]) @ T_sim_obj
-        for one, T in poses.items()
-        if (named := name_simulator_poses({re.sub(r"_\d+$", "", one): T}, [name], models))
-    ]
+    there = [upright(T) @ T_sim_obj for T in _of_kind(name, poses, models)]
     # Two of a kind explain the pictures equally well, as they should.
     is_found = estimate.status == "found" or (estimate.status == "ambiguous" and len(there) > 1)
     row: Row = {"found": is_found, "confidence": round(float(estimate.confidence), 4), "of": len(there)}
@@ -64,6 +60,17 @@ def judged(
         "off_mm": (1000 * off).round(1).tolist(),
         "near": sum(one < NEAR_M for one in apart),
     }
+
+
+def not_known(name: str, poses: Mapping[str, Array], models: Mapping[str, KnownObject]) -> Row:
+    """The row of a thing that was not learned: wherever there is one, it is not found."""
+    return {"found": False, "confidence": 0.0, "of": len(_of_kind(name, poses, models))}
+
+
+def _of_kind(name: str, poses: Mapping[str, Array], models: Mapping[str, KnownObject]) -> list[Array]:
+    """The simulator's poses ``T_world_obj`` of all that an instruction's name fits."""
+    named = [name_simulator_poses({re.sub(r"_\d+$", "", one): T}, [name], models) for one, T in poses.items()]
+    return [one[name] for one in named if one]
 
 
 def is_right(row: Row) -> bool:

@@ -17,10 +17,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from benchmarks.calls import watched
 from benchmarks.episodes import LazyImages
 from benchmarks.harness import Row, measured_folder, resume
 from benchmarks.libero.evaluate import kept_simulator, move_hand
-from benchmarks.libero.place_errors import judged, summary
+from benchmarks.libero.place_errors import judged, not_known, summary
 from benchmarks.libero.variants import exchanged
 from benchmarks.results import run, write
 from benchmarks.stages import DEMOS, LIBERO, DatasetOption, dataset
@@ -37,6 +38,7 @@ from lerobot_openspm.errors import OpenSPMError
 from lerobot_openspm.files import write_json
 from lerobot_openspm.memory.io import read_memory, write_memory
 from lerobot_openspm.memory.memory import Memory
+from lerobot_openspm.mining import objects as mining_objects
 from lerobot_openspm.mining.dataset import dataset_metadata
 from lerobot_openspm.mining.objects import contact_cues
 from lerobot_openspm.perception.observation import Observation
@@ -58,7 +60,7 @@ class PlacesConfig:
         suite: libero_goal, libero_spatial or libero_object.
         exchanged: Whether things change places in the scenes, see `variants`.
         demos: Demonstrations a task to learn from.
-        scenes: In all, as many of each task.
+        scenes: Of each task, all from the same seeds.
         dataset: The demonstrations; recorded if not given.
         output: Folder for what is measured; outputs/bench/NAME if not given.
         workers: Scenes at a time, each in a process of its own; a single one stays in this process.
@@ -93,7 +95,12 @@ class PlacesConfig:
 
 
 def learn(root: Path, folder: Path) -> dict[str, Any]:
-    """Mine a memory of all demonstrations; what is learned of each thing that the hand touched."""
+    """Mine a memory of all demonstrations; what is learned of each thing that the hand touched.
+
+    Returns:
+        ``objects`` by name; ``seconds`` that all of mining took, and ``learn_objects_s``, the part of it in
+        which perception learned the objects.
+    """
     kept = folder / LEARNED
     if kept.is_file():
         return json.loads(kept.read_text())
@@ -103,7 +110,8 @@ def learn(root: Path, folder: Path) -> dict[str, Any]:
     )
     processor = dataset_processor(dataset_metadata("local/places", str(root)), options)
     begin = time.monotonic()
-    mined = processor.mine()
+    with watched(mining_objects, "learn_objects") as learning_s:
+        mined = processor.mine()
     memory, seconds = memory_of(mined, options), time.monotonic() - begin
     write_memory(memory, folder)
     cues = [(item.episode.index, cue) for item in mined.episodes for cue in contact_cues(item)]
@@ -117,19 +125,25 @@ def learn(root: Path, folder: Path) -> dict[str, Any]:
             "learned": None if model is None else model.to_record()[0]["kind"],
             "T_sim_obj": frames[name].tolist() if name in frames else None,
         }
-    learned = {"episodes": len(mined.episodes), "seconds": round(seconds, 1), "objects": told}
+    spent = {"seconds": round(seconds, 1), "learn_objects_s": round(sum(learning_s), 1)}
+    learned = {"episodes": len(mined.episodes), **spent, "objects": told}
     write_json(kept, learned)
     return learned
 
 
 def look_at_scene(config: PlacesConfig, folder: Path, task: str, number: int) -> Row:
-    """Draw a scene, look once for everything that was learned, and compare with the simulator."""
+    """Draw a scene, look once for everything that the hand touched, and compare with the simulator."""
     memory, frames = _memory(folder)
     simulator, seed = draw(task, FIRST_SEED + number, config.exchanged)
     estimates, spent_s = look(memory, simulator)
     poses = simulator.object_poses()
-    objects = {name: judged(name, estimates[name], poses, T, memory.objects) for name, T in frames.items()}
-    return {"task": task, "seed": seed, "look_cpu_ms": round(1000 * spent_s), "objects": objects}
+    found = {
+        name: not_known(name, poses, memory.objects)
+        if T is None or name not in estimates
+        else judged(name, estimates[name], poses, T, memory.objects)
+        for name, T in frames.items()
+    }
+    return {"task": task, "seed": seed, "look_cpu_ms": round(1000 * spent_s), "objects": found}
 
 
 def draw(task: str, seed: int, is_exchanged: bool) -> tuple[LiberoSimulator, int]:
@@ -144,11 +158,11 @@ def draw(task: str, seed: int, is_exchanged: bool) -> tuple[LiberoSimulator, int
 
 
 @functools.lru_cache(1)
-def _memory(folder: Path) -> tuple[Memory, dict[str, np.ndarray]]:
-    """The memory, and the frames ``T_sim_obj`` of what was found in the demonstrations."""
-    learned = json.loads((folder / LEARNED).read_text())["objects"]
-    frames = {name: np.array(told["T_sim_obj"]) for name, told in learned.items() if told["T_sim_obj"]}
-    return read_memory(folder), frames
+def _memory(folder: Path) -> tuple[Memory, dict[str, np.ndarray | None]]:
+    """The memory, and the frames ``T_sim_obj`` of what the hand touched; None of what was not learned."""
+    touched = json.loads((folder / LEARNED).read_text())["objects"]
+    frames = {name: told["T_sim_obj"] for name, told in touched.items()}
+    return read_memory(folder), {name: T and np.array(T) for name, T in frames.items()}
 
 
 def is_still(simulator: LiberoSimulator) -> bool:
@@ -181,7 +195,7 @@ def main(config: PlacesConfig) -> dict[str, Any]:
     folder = measured_folder(output, files, [config.suite, str(config.exchanged)], __file__)
     learned = learn(root, folder)
     tasks = find_suite(config.simulator).tasks("all")
-    jobs = {f"{i}": (config, folder, tasks[i * len(tasks) // config.scenes], i) for i in range(config.scenes)}
+    jobs = {f"{task} {i}": (config, folder, task, i) for task in tasks for i in range(config.scenes)}
     rows = resume(folder / "scenes.jsonl", jobs, look_at_scene, config.workers)
     for told in learned["objects"].values():
         del told["T_sim_obj"]

@@ -52,7 +52,8 @@ def main(config: RunConfig) -> dict[str, Any]:
     folder = root.with_name("evaluation")
     logger.info("evaluating %d tasks from %d initial states", len(selected), config.states)
     episodes = evaluate_states(checkpoint, folder, config.states, selected)
-    figures, errors = summary(episodes), accuracy(checkpoint, root, episodes)
+    errors = accuracy(checkpoint, root, episodes)
+    figures = summary(episodes, errors.pop("found_off_mm"))
     worst = {(e["task"], e["state"]): off for e, off in zip(episodes, errors.pop("off_mm"), strict=True)}
     for failed in figures["failed"]:
         failed["off_mm"] = worst[failed["task"], failed["state"]]

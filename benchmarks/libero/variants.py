@@ -76,9 +76,11 @@ def exchanged(task: str, seed: int) -> Path:
     """A task file of our own in which some of a suite's objects change places, drawn from a seed.
 
     In libero_goal a few do. In the other suites, whose scenes hardly differ, all small things do, and they
-    stand less exactly there.
+    stand less exactly there. The goal stays as it is, and so do the places that it names. The file is gone
+    when this process ends.
     """
-    rng, text = np.random.default_rng(seed), task_file(task).read_text()
+    rng = np.random.default_rng(seed)
+    text, *goal = task_file(task).read_text().partition("(:goal")
     place = dict(re.findall(r"\(On (\w+_\d) (?:main_table|floor)_(\w+)\)", text))
     if suite_of(task) == SUITE:
         new = _some_exchanged(place, rng)
@@ -88,9 +90,15 @@ def exchanged(task: str, seed: int) -> Path:
         text = re.sub(r"\(((?:-?[\d.]+ ){3}-?[\d.]+)\s*\)", _widened, text)
     for name, region in place.items():
         text = re.sub(rf"\(On {name} (main_table|floor)_{region}\)", rf"(On {name} \1_{new[name]})", text)
-    file = Path(tempfile.mkdtemp(prefix="exchanged_")) / f"{task}.bddl"
-    file.write_text(text)
+    file = Path(_folder().name) / f"{task}_{seed}.bddl"
+    file.write_text("".join([text, *goal]))
     return file
+
+
+@functools.cache
+def _folder() -> tempfile.TemporaryDirectory[str]:
+    """Where this process keeps its task files."""
+    return tempfile.TemporaryDirectory(prefix="exchanged_")
 
 
 def _some_exchanged(place: dict[str, str], rng: np.random.Generator) -> dict[str, str]:

@@ -85,6 +85,7 @@ def test_objects_of_the_task_may_be_touched():
         ("Put the bowl on the plate", "(On akita_black_bowl_1 plate_1)", {"bowl", "plate"}),
         ("open the middle layer", "(Open yellow_cabinet_1_middle_region)", {"cabinet"}),
         ("push the plate to the stove's front", "(On plate_1 main_table_front_region)", {"plate", "stove"}),
+        ("move it over there", "(On plate_1 main_table_front_region)", {"plate"}),
         ("put the cheese, gently", "(On red_cream_cheese_1 main_table_rack_region)", {"cheese"}),
     ],
 )

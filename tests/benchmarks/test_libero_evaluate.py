@@ -99,6 +99,10 @@ def test_the_summary_counts_and_says_why(config, ran):
         (task, 1, harness.SEED + 1) for task in TASKS
     }
     assert "goal does not hold" in figures["failed"][0]["reason"]
+    assert {one["task"]: one["kind"] for one in figures["failed"]} == {
+        task: "collision" if task == "put_the_bowl" else "placing" for task in TASKS
+    }
+    assert (figures["failures"]["collision"], figures["failures"]["placing"]) == (1, 2)
 
 
 @pytest.mark.parametrize(
@@ -107,6 +111,11 @@ def test_the_summary_counts_and_says_why(config, ran):
 )
 def test_reasons(status, words):
     assert reason({"status": status, "phase": "lift"}) == words
+
+
+def test_what_a_refusal_is_about_is_told_with_it():
+    refused = {"status": "object_not_found", "phase": None, "refusal": "no bowl is seen"}
+    assert reason(refused) == "object not found: no bowl is seen"
 
 
 @pytest.mark.parametrize(

@@ -110,13 +110,29 @@ def test_missing_files_are_told_with_how_to_get_them(tmp_path, monkeypatch, suit
         variant_file(suite, TASK)
 
 
+def _placed(text: str) -> dict[str, str]:
+    """Where a task's file places what, at the start."""
+    return dict(PLACED.findall(text.partition("(:goal")[0]))
+
+
 @pytest.mark.libero
-def test_an_exchange_of_our_own_is_drawn_from_its_seed_and_moves_objects_to_each_others_places():
-    usual = dict(PLACED.findall(task_file(TASK).read_text()))
-    drawn = [dict(PLACED.findall(exchanged(TASK, seed).read_text())) for seed in range(8)]
+@pytest.mark.parametrize("task", GOAL_TASKS)
+def test_an_exchange_of_our_own_is_drawn_from_its_seed_and_moves_objects_to_each_others_places(task):
+    own = task_file(task).read_text()
+    usual, goal = _placed(own), own.partition("(:goal")[2]
+    files = [exchanged(task, seed) for seed in range(8)]
+    drawn = [_placed(file.read_text()) for file in files]
     assert all(sorted(places.values()) == sorted(usual.values()) for places in drawn)
     assert all(places != usual for places in drawn[:3])
-    assert dict(PLACED.findall(exchanged(TASK, 3).read_text())) == drawn[3]
+    assert all(file.read_text().partition("(:goal")[2] == goal for file in files)
+    assert _placed(exchanged(task, 3).read_text()) == drawn[3]
+
+
+@pytest.mark.libero
+def test_the_files_of_exchanges_lie_in_one_folder_of_the_process():
+    one, again, other = exchanged(TASK, 1), exchanged(TASK, 1), exchanged(TASK, 2)
+    assert one == again != other
+    assert one.parent == other.parent
 
 
 @pytest.mark.libero

@@ -1,9 +1,14 @@
 """What is made of estimates and true places, without a simulator."""
 
+import json
+from pathlib import Path
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
-from benchmarks.libero.place_errors import is_right, judged, of_object, summary
-from benchmarks.libero.places import PlacesConfig
+from benchmarks.libero import places
+from benchmarks.libero.place_errors import is_right, judged, not_known, of_object, summary
+from benchmarks.libero.places import LEARNED, PlacesConfig, look_at_scene
 
 from lerobot_openspm.geometry import se3
 from lerobot_openspm.types import PoseEstimate
@@ -87,6 +92,30 @@ def test_shares_are_of_the_scenes_that_hold_a_thing_and_sure_ones_of_all():
     assert (whole["sure"]["success"], whole["sure"]["n"]) == (0.5, 2)
     assert whole["sure_and_wrong"] == [["milk", "t", 1, 4.0, 15.0]]
     assert whole["first_look_cpu_ms"] == {"median": 10.0, "p95": 10.0}
+
+
+def test_what_was_not_learned_is_not_found_in_the_scenes_that_hold_it():
+    told = not_known("black bowl", {"bowl": at(0.0), "bowl_2": at(0.3), "milk": at(0.1)}, {})
+    assert told == {"found": False, "confidence": 0.0, "of": 2}
+    absent = not_known("black bowl", {"milk": at(0.1)}, {})
+    row = of_object([told, absent])
+    assert (row["found"]["success"], row["found"]["n"]) == (0.0, 1)
+    assert row["within_10_mm"]["success"] == 0.0
+    assert row["absent"] == {"n": 1, "reported": 0}
+
+
+def test_every_thing_that_the_hand_touched_is_in_a_scenes_row(tmp_path: Path, monkeypatch):
+    touched = {"milk": {"T_sim_obj": T_SIM_OBJ.tolist()}, "black bowl": {"T_sim_obj": None}}
+    (tmp_path / LEARNED).write_text(json.dumps({"objects": touched}))
+    poses = {"milk": at(0.0), "bowl": at(0.3)}
+    simulator = SimpleNamespace(object_poses=lambda: poses)
+    monkeypatch.setattr(places, "read_memory", lambda _: SimpleNamespace(objects={"milk": Known()}))
+    monkeypatch.setattr(places, "draw", lambda *_: (simulator, 7))
+    monkeypatch.setattr(places, "look", lambda *_: ({"milk": estimate(poses["milk"] @ T_SIM_OBJ)}, 0.1))
+    row = look_at_scene(PlacesConfig("libero_object"), tmp_path, "a task", 3)
+    assert (row["seed"], row["look_cpu_ms"]) == (7, 100)
+    assert row["objects"]["milk"]["mm"] == 0.0
+    assert row["objects"]["black bowl"] == {"found": False, "confidence": 0.0, "of": 1}
 
 
 def test_another_suite_is_refused_by_name():

@@ -18,6 +18,7 @@ ORIGIN = {
     "seed": 0,
 }  # fmt: skip
 RATE = {"success": 0.5, "n": 4, "interval": [0.15, 0.85], "mean_steps": 100.0, "touched": 0.25, "moved": 0.0}
+FAILURES = {"words": 0, "perception": 1, "reach": 0, "collision": 0, "grasp": 1, "placing": 0}
 A_NUMBER = re.compile(r"\d[\d.,]* ?(%|ms\b|s\b|min\b|mm\b|minutes?\b|hours?\b|seconds?\b)")
 
 
@@ -35,7 +36,8 @@ def put(results: dict[str, Any], name: str, **content: Any) -> None:
 
 
 def put_main_result(results: dict[str, Any], **content: Any) -> None:
-    put(results, "libero_goal", **RATE, demonstrations=10, mine_and_train_s=200, **content)
+    rest = {"demonstrations": 10, "mine_and_train_s": 200, "failures": FAILURES}
+    put(results, "libero_goal", **RATE, **rest, **content)
 
 
 def test_the_committed_pages_are_made_of_the_committed_results():
@@ -107,10 +109,56 @@ def test_failures_are_told_apart_by_rule(results):
 
 
 def test_contacts_that_no_task_asks_for_are_told_beside_success(results):
-    put(results, "libero_goal_object", **RATE, per_task={"put_the_bowl": {**RATE, "moved": None}})
+    put(
+        results,
+        "libero_goal_object",
+        **RATE,
+        per_task={"put_the_bowl": {**RATE, "moved": None}},
+        failures=FAILURES,
+    )
     text = tables.results_page()
     assert "| all ten tasks | 50.0 % | 15.0 to 85.0 % | 4 | 100.0 | 25.0 % | 0.0 % |" in text
     assert "| put the bowl | 50.0 % | 15.0 to 85.0 % | 4 | 100.0 | 25.0 % | - |" in text
+    assert "| Failed by | words | perception | reach | collision | grasp | placing |" in text
+    assert "| episodes | 0 | 1 | 0 | 0 | 1 | 0 |" in text
+
+
+def test_first_looks_anywhere_are_told_beside_success_and_so_is_which_layouts_are_left_out(results):
+    poses = {"poses": 70, "unknown": 2, "position_mm_mean": 2.5, "position_mm_p95": 6.0, "yaw_deg_mean": 1.5}
+    looks = {
+        "looks": 7,
+        "layouts": {"drawn": 10, "hidden": 1, "unsolved": 2},
+        "poses": poses,
+        "poses_needed": {**poses, "poses": 20},
+        "false_finds": RATE,
+        "confident_and_right": RATE,
+    }
+    run = {**RATE, "per_task": {"a": 0.5}}
+    put(results, "anywhere", n=4, runs={"anywhere": run}, instructions={"a": "do a"}, first_looks=looks)
+    text = tables.results_page()
+    assert "| all that are known | 70 | 2 | 2.5 | 6.0 | 1.5 |" in text
+    assert "| those that the task needs | 20 |" in text
+    assert "it was reported in 50.0 % of 4 looks" in text
+    assert "3 (30.0 %) not used: 1 do not show" in text
+    assert ("anywhere", "first_looks") in MARK.findall(text)
+
+
+def test_every_thing_that_was_touched_has_a_row_whether_it_was_learned_or_not(results):
+    told = {"found": RATE, "within_10_mm": RATE, "absent": {"n": 3, "reported": 1}}
+    errors = {"position_mm_median": 2.0, "position_mm_p95": 5.0, "yaw_deg_median": None}
+    objects = {"milk": {"grasped": 30, "learned": "shape"}, "basket": {"grasped": 0, "learned": None}}
+    put(
+        results,
+        "places_libero_object",
+        learned={"episodes": 30, "seconds": 200.2, "learn_objects_s": 80.4, "objects": objects},
+        found={name: {**told, **errors} for name in objects},
+        sure=RATE,
+        first_look_cpu_ms={"median": 140.0, "p95": 180.0},
+    )
+    text = tables.results_page()
+    assert "| milk | shape | 30 | 50.0 % | 50.0 % | 15.0 to 85.0 % | 4 | 2.0 | 5.0 | - | 1 of 3 |" in text
+    assert "| basket | not learned | 0 |" in text
+    assert "took 80 s of the 200 s of mining" in text
 
 
 def test_the_curve_of_few_demonstrations_ends_with_the_main_result(results):

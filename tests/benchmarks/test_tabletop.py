@@ -2,11 +2,12 @@
 
 import json
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
-from benchmarks.anywhere import summarise
+from benchmarks.anywhere import _without, summarise
 from benchmarks.results import PROVENANCE
 from benchmarks.tabletop import TabletopConfig, main
 
@@ -72,6 +73,17 @@ def test_an_unknown_comparison_is_refused():
         TabletopConfig("weather")
 
 
+def test_what_was_taken_away_is_put_back_even_where_the_look_fails():
+    at, put = np.eye(4), []
+    simulator = SimpleNamespace(put=lambda name, T: put.append((name, T[0, 3])))
+    world: Any = SimpleNamespace(
+        env=SimpleNamespace(simulator=simulator), object_poses=lambda: {"bowl": at.copy()}
+    )
+    with pytest.raises(ValueError, match="blind"), _without(world, "bowl"):
+        raise ValueError("blind")
+    assert put == [("bowl", 5.0), ("bowl", 0.0)]
+
+
 def test_first_looks_tell_errors_false_finds_and_whether_confidence_holds():
     row = {
         # Object, needed, its yaw shows, confidence, metres, radians.
@@ -81,8 +93,12 @@ def test_first_looks_tell_errors_false_finds_and_whether_confidence_holds():
             ["rack", False, True, 0.90, None, None],
         ],
         "gone": [["plate", False], ["box", True]],
+        "drawn": 5,
+        "tried": 2,
     }
     told = summarise([row])
+    # Three do not show which one is meant; of the other two the expert solves the last one.
+    assert told["layouts"] == {"drawn": 5, "hidden": 3, "unsolved": 1}
     assert told["poses"]["position_mm_mean"] == 3.0
     assert told["poses"]["unknown"] == 1
     assert told["poses_needed"]["yaw_deg_mean"] == round(float(np.rad2deg(0.5)), 2)

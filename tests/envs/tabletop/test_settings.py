@@ -91,8 +91,9 @@ def test_an_episode_anywhere_begins_as_it_was_drawn_and_the_same_from_the_same_s
 
 
 def test_what_stands_behind_the_cabinet_is_not_shown(make_env):
-    simulator = make_env().simulator
-    make_env().reset(seed=0)
+    env = make_env()
+    env.reset(seed=0)
+    simulator = env.simulator
     at = layouts.Placement(0.0, 0.0, 0.0)
     spread = {name: layouts.Placement(0.3, 0.3 - 0.1 * i, 0) for i, name in enumerate(scene.OBJECT_NAMES)}
     simulator.reset({**spread, "cabinet": at})
