@@ -132,8 +132,8 @@ class Arm:
                 before = costs
             uphill = (slopes @ off[..., None])[..., 0] + (angles - rest) / SCALE_REST_RAD**2
             free = ~((angles <= low) & (uphill > 0) | (angles >= high) & (uphill < 0))
-            turns = _downhill(slopes * free[..., None], uphill * free, damping)
-            tried = np.clip(angles + turns, low, high)
+            change = _downhill(slopes * free[..., None], uphill * free, damping)
+            tried = np.clip(angles + change, low, high)
             tried_off, tried_slopes = self._errors(tried, T_world_ee)
             tried_costs = _costs(tried_off, tried - rest)
             is_better = tried_costs < costs
@@ -149,7 +149,8 @@ class Arm:
         """How far the hand is off at angles ``(s, n)``, scaled ``(s, 6)``, and its slopes ``(s, n, 6)``."""
         frames, hands = self._frames(angles)
         off = np.concatenate(
-            [hands[:, :3, 3] - T_world_ee[:3, 3], _turns(hands[:, :3, :3] @ T_world_ee[:3, :3].T)], 1
+            [hands[:, :3, 3] - T_world_ee[:3, 3], _rotation_vectors(hands[:, :3, :3] @ T_world_ee[:3, :3].T)],
+            1,
         )
         axes = (frames[..., :3, :3] @ self._axes[..., None])[..., 0]
         arms = hands[:, None, :3, 3] - frames[..., :3, 3]
@@ -206,10 +207,10 @@ def _downhill(slopes: Array, uphill: Array, damping: Array) -> Array:
     curvature = slopes @ slopes.swapaxes(1, 2)
     steepest = curvature.diagonal(axis1=1, axis2=2).max(1)
     added = (damping * steepest + 1 / SCALE_REST_RAD**2)[:, None, None] * np.eye(uphill.shape[1])
-    return -np.linalg.solve(curvature + added, uphill[..., None])[..., 0]
+    return np.asarray(-np.linalg.solve(curvature + added, uphill[..., None])[..., 0], float)
 
 
-def _turns(R: Array) -> Array:
+def _rotation_vectors(R: Array) -> Array:
     """Rotation vectors ``(s, 3)`` of rotation matrices, as :func:`se3.log_so3` but in a tenth of its time."""
     cosines = (R.trace(axis1=1, axis2=2) - 1) / 2
     if cosines.min() < -0.99:  # near half a turn the axis is not told by the difference
