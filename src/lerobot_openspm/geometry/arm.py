@@ -30,10 +30,10 @@ SCALES = np.repeat([SCALE_M, SCALE_RAD], 3)
 # A squared error of that scale below which a pose is met: a hundredth of it.
 MET = 1e-4
 # The search ends after so many steps, or where so many did not bring the cost below such a share of it.
-MAX_STEPS, SETTLE_STEPS, SETTLED = 40, 5, 0.9
+MAX_STEPS, SETTLE_STEPS, SETTLED = 40, 5, 0.8
 # Damping as a share of the steepest joint's slope, and what it is multiplied by after a step for the better
 # or the worse.
-DAMPING, LESS_DAMPING, MORE_DAMPING = 1e-3, 0.2, 4.0
+DAMPING, LESS_DAMPING, MORE_DAMPING = 0.01, 0.2, 4.0
 # Where joints are not found from where the arm stands, they are sought from so many other places.
 MORE_STARTS = 10
 
