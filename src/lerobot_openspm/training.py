@@ -15,10 +15,10 @@ import numpy as np
 from lerobot.utils.constants import HF_LEROBOT_HOME
 
 from lerobot_openspm.configuration_openspm import OpenSPMConfig
-from lerobot_openspm.errors import PerceptionError
+from lerobot_openspm.errors import CalibrationError, PerceptionError
 from lerobot_openspm.flow.samples import perturbed, segment_frames
 from lerobot_openspm.flow.training_set import TrainingSet
-from lerobot_openspm.geometry.arm import load_arm
+from lerobot_openspm.geometry.arm import OUT_OF_REACH_M, OUT_OF_REACH_RAD, Arm, load_arm
 from lerobot_openspm.geometry.camera import Camera, load_cameras
 from lerobot_openspm.language.lexicon import read_lexicon
 from lerobot_openspm.memory.indexed_entries import known_names
@@ -42,6 +42,8 @@ LABELS = HF_LEROBOT_HOME / "openspm" / "phase_labels"
 # hand's error on the way: somewhat more than the tolerance at a contact key pose.
 PERTURBED_COPIES = 3
 PERTURBATION_M, PERTURBATION_RAD = 0.006, 0.04
+# Whether an arm fits is tested on at most so many of the key poses that were shown.
+REACHED_SAMPLE = 20
 
 
 def learn(
@@ -120,8 +122,11 @@ def memory_of(mined: MinedDataset, config: OpenSPMConfig) -> Memory:
 
     Raises:
         DatasetError: No demonstration's objects were found.
-        CalibrationError: The arm's URDF cannot be read.
+        CalibrationError: The arm's URDF cannot be read, or the arm cannot have moved as was shown.
     """
+    robot = (
+        mined.robot if config.arm is None else replace(mined.robot, arm=fitting_arm(mined, Path(config.arm)))
+    )
     entries = build_entries(mined)
     logger.info(
         "mined %d entries from %d episodes (%d skipped); objects: %s",
@@ -133,12 +138,35 @@ def memory_of(mined: MinedDataset, config: OpenSPMConfig) -> Memory:
     perception, segmentation = "demonstrations", config.perception
     if config.perception == "oracle":
         perception, segmentation = "oracle", "demonstrations"
-    robot = mined.robot if config.arm is None else replace(mined.robot, arm=load_arm(Path(config.arm)))
     return Memory(
         entries, dict(mined.objects), robot, dict(mined.cameras), perception,
         mined.simulator_objects, segmentation, config.segmenter.shape, config.layouts(),
         not_learned=not_learned,
     )  # fmt: skip
+
+
+def fitting_arm(mined: MinedKeyPoses, path: Path) -> Arm:
+    """The arm of a URDF, which reaches most of a sample of the key poses that were shown.
+
+    Raises:
+        CalibrationError: It cannot be read, or it misses most of them: it is of another robot, or stands
+            elsewhere.
+    """
+    arm = load_arm(path)
+    shown = [pose.T_world_ee for item in mined.episodes for pose in item.key_poses]
+    sample = shown[:: max(1, -(-len(shown) // REACHED_SAMPLE))]
+    misses = np.array([arm.miss(T, arm.stance(T)) for T in sample]).reshape(-1, 2)
+    is_missed = (misses > [OUT_OF_REACH_M, OUT_OF_REACH_RAD]).any(1)
+    if 2 * is_missed.sum() > len(sample):
+        metres, radians = misses.max(0)
+        raise CalibrationError(
+            f"{path}: this arm cannot have moved as was shown: of {len(sample)} demonstrated key poses its "
+            f"joints miss {is_missed.sum()}, by up to {metres:.2f} m and {radians:.1f} rad, expected at most "
+            f"{OUT_OF_REACH_M} m and {OUT_OF_REACH_RAD} rad; pass as --policy.arm=FILE the URDF of this "
+            "robot, with its base where it stands in the world of the states and its link 'ee' where they "
+            "have the hand (see docs/libero.md), or leave the option out"
+        )
+    return arm
 
 
 def training_set(mined: MinedKeyPoses, robot: RobotModel, config: OpenSPMConfig) -> TrainingSet:

@@ -5,16 +5,18 @@ import pytest
 from numpy.testing import assert_allclose
 from tests.control.test_controller import HAND, Perception, controller, observe, planning_context
 from tests.geometry.test_arm import LIBERO
-from tests.memory.builders import entry, hand_pose, robot
+from tests.memory.builders import entry, hand_pose, pick_and_place, robot
 
+from lerobot_openspm.control import feasibility
 from lerobot_openspm.control.clearance import BESIDE, CLEARANCE_M, Way, lifted
-from lerobot_openspm.control.controller import MOST_IN_A_SCENE
-from lerobot_openspm.control.planning import Plan
+from lerobot_openspm.control.feasibility import TransferLimits, find_stance
+from lerobot_openspm.control.planning import MOST_IN_A_SCENE, Plan
 from lerobot_openspm.control.state import Status
-from lerobot_openspm.control.transfer import transfer
+from lerobot_openspm.control.transfer import Turn, transfer
 from lerobot_openspm.geometry import se3
 from lerobot_openspm.geometry.arm import load_arm
 from lerobot_openspm.memory.compose import Candidate
+from lerobot_openspm.memory.entry import Anchor
 from lerobot_openspm.perception.objects.box.model import BoxModel
 from lerobot_openspm.types import Symmetry
 
@@ -59,7 +61,8 @@ def carried_over(*posts):
     poses = {"bowl": se3.from_yaw([-0.2, 0.0, 0.0], 0.0), "plate": se3.from_yaw([0.2, 0.0, 0.0], 0.0)}
     points = {f"post {i}": post for i, post in enumerate(posts)} | {"bowl": pillar(-0.2, 0.0, 0.05)}
     plain = transfer(shown, poses, {}, HOME)
-    higher = lifted(shown, plain, HOME, points, RADIUS)
+    higher, crossed = lifted(shown, plain, HOME, points, RADIUS)
+    assert bool(crossed) == (len(higher.key_poses) > len(shown.key_poses))
     return plain, transfer(higher, poses, {}, HOME)
 
 
@@ -90,6 +93,44 @@ def test_an_empty_hand_comes_down_beyond_a_post_on_its_first_way():
     assert targets[0].key_pose.phase == "approach"
     assert_allclose(targets[0].T_world_ee[:2, 3], plain[0].T_world_ee[:2, 3])
     assert_allclose(targets[0].T_world_ee[2, 3], 0.25 + CLEARANCE_M)
+
+
+PLACES = {"bowl": (-0.2, 0.2), "plate": (0.2, 0.0), "cup": (-0.2, -0.2), "tray": (0.2, 0.3)}
+
+
+def two_sub_tasks():
+    """Key poses that put a bowl on a plate and then a cup on a tray, and where these are."""
+    poses = {name: se3.from_yaw([*place, 0.0], 0.0) for name, place in PLACES.items()}
+    shown = entry("put the bowl on the plate and put the cup on the tray", object_poses=poses)
+    later = (replace(pose, sub_task=1) for pose in pick_and_place("cup", "tray"))
+    return replace(shown, key_poses=(*pick_and_place("bowl", "plate"), *later)), poses
+
+
+@pytest.mark.parametrize("sub_task", [0, 1])
+def test_the_hand_rises_where_it_leaves_one_sub_task_however_a_grasp_is_turned(sub_task):
+    shown, poses = two_sub_tasks()
+    turns = {sub_task: Turn(poses[("bowl", "cup")[sub_task]], np.zeros(2), np.deg2rad(90))}
+    plain = transfer(shown, poses, {}, HOME, turns=turns)
+    higher, crossed = lifted(shown, plain, HOME, {"post": pillar(0.0, -0.1, 0.4)}, RADIUS)
+    assert crossed == ["post"]
+    targets = transfer(higher, poses, {}, HOME, turns=turns)
+    first = next(i for i, one in enumerate(targets) if one.key_pose.phase == "retreat")
+    leaves, rise, over = targets[first : first + 3]
+    assert_allclose(rise.T_world_ee[:2, 3], leaves.T_world_ee[:2, 3])
+    assert_allclose(rise.T_world_ee[:3, :3], leaves.T_world_ee[:3, :3])
+    assert_allclose([rise.T_world_ee[2, 3], over.T_world_ee[2, 3]], 0.4 + CLEARANCE_M)
+    assert rise.key_pose.sub_task == 0
+    assert over.key_pose.sub_task == 1
+
+
+def test_what_was_put_down_stands_there_and_no_longer_where_it_was():
+    shown, poses = two_sub_tasks()
+    tall = {"bowl": pillar(*PLACES["bowl"], 0.4)}
+    for tray, crossed in ((0.3, []), (0.2, ["bowl"])):
+        # The cup goes from the left over where the bowl was, or to the right over the plate.
+        cup, goal = ((-0.2, 0.0), (-0.2, 0.4)) if not crossed else ((0.2, -0.2), (0.2, tray))
+        now = poses | {"cup": se3.from_yaw([*cup, 0.0], 0.0), "tray": se3.from_yaw([*goal, 0.0], 0.0)}
+        assert lifted(shown, transfer(shown, now, {}, HOME), HOME, tall, RADIUS)[1] == crossed
 
 
 def test_a_box_is_in_the_way_of_what_runs_through_the_middle_of_its_side():
@@ -145,11 +186,11 @@ def test_a_grasp_that_the_joints_cannot_reach_is_turned_about_a_round_object(pan
     context, poses, home = scene(stiff, np.deg2rad(90))
     plan = Plan(context.entries[0], poses, home)
     assert not plan.problems(context)
-    (problem,) = plan.problems(context, with_arm=True)
+    (problem,) = replace(plan, stance=find_stance(context.robot, home)).problems(context)
     assert "beyond what the arm's joints reach" in problem
-    plan = chosen(context, poses, home)
+    plan, problems = chosen(context, poses, home)
     assert plan.turned != 0
-    assert not plan.problems(context, with_arm=True)
+    assert problems == plan.problems(context) == []
 
 
 @pytest.mark.parametrize(
@@ -163,9 +204,61 @@ def test_grasps_are_turned_by_what_the_shape_allows(panda, turn, expected):
 
 
 def test_a_grasp_within_reach_stays_as_shown(panda):
-    assert chosen(*scene(panda, 0.0)).turned == 0
+    assert chosen(*scene(panda, 0.0))[0].turned == 0
 
 
 def test_what_is_out_of_reach_from_all_sides_is_refused(panda):
     context, poses, home = scene(panda, 0.0, x=0.9)
-    assert chosen(context, poses, home).problems(context, with_arm=True)
+    assert chosen(context, poses, home)[1]
+
+
+def test_an_arm_that_does_not_fit_the_scene_is_named_once_and_refuses_nothing(panda, caplog):
+    # LIBERO's other suites have the robot on the floor.
+    first, *others = panda.joints
+    lower = replace(first, T_before_joint=se3.transform(np.eye(3), [0, 0, -0.912]) @ first.T_before_joint)
+    context, poses, home = scene(replace(panda, joints=(lower, *others)), 0.0)
+    for _ in range(2):
+        assert chosen(context, poses, home)[1] == []
+    (record,) = caplog.records
+    assert record.getMessage().startswith("the arm does not fit: its joints miss even where the hand is now")
+    assert "--policy.arm=FILE" in record.getMessage()
+
+
+def test_a_way_that_cannot_be_lifted_is_gone_straight_and_that_is_said(caplog):
+    context, poses, home = scene(None, 0.0)
+    high = np.array([[-2.0, -2.0, 0.0], [2.0, 2.0, 1.2]])
+    # The post is higher than the hand was ever shown.
+    between = (poses["bowl"][:3, 3] + poses["plate"][:3, 3]) / 2
+    post = {"post": pillar(0.0, 0.0, 0.6)}
+    context = replace(context, robot=replace(context.robot, workspace=high), points=post, hand_radius_m=0.03)
+    plan, problems = chosen(context, poses | {"post": se3.from_yaw(between, 0.0)}, home)
+    assert problems == []
+    assert context.clear(plan) is plan
+    (record,) = caplog.records
+    assert "the post may be in the way" in record.getMessage()
+    assert "outside the demonstrated workspace" in record.getMessage()
+
+
+def test_a_key_pose_that_no_turn_moves_ends_the_search(panda, monkeypatch):
+    context, poses, home = scene(panda, 0.0)
+    shown = context.entries[0]
+    # The second sub-task grasps nothing that turns into itself, and is out of reach.
+    poses |= {"cup": se3.from_yaw([0.9, 0.0, 0.9], 0.0)}
+    reach = replace(shown.key_poses[0], sub_task=1, anchor=Anchor("cup", "cup"))
+    far = replace(shown, key_poses=(*shown.key_poses, reach), object_poses=poses)
+    asked = []
+    monkeypatch.setattr(type(panda), "misses", counted(type(panda).misses, asked))
+    context = replace(context, limits=TransferLimits(), entries=(far,))
+    monkeypatch.setattr(feasibility, "MAX_JUMP_M", 2.0)
+    plan, (problem,) = chosen(context, poses, home)
+    assert plan.entry is far
+    assert "at cup" in problem
+    assert len(asked) == 3  # either way round, and to say what is wrong
+
+
+def counted(function, calls):
+    def call(*args):
+        calls.append(args)
+        return function(*args)
+
+    return call

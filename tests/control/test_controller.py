@@ -1,4 +1,5 @@
 import re
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -11,6 +12,7 @@ from lerobot_openspm.control.planning import MOVED_M, PlanningContext
 from lerobot_openspm.control.scene import LOOK_AGAIN_S
 from lerobot_openspm.control.state import Status
 from lerobot_openspm.geometry import se3
+from lerobot_openspm.geometry.arm import load_arm
 from lerobot_openspm.perception.tracking.tracker import TrackStatus
 from lerobot_openspm.types import Detections, Fault, Hand, PoseEstimate
 
@@ -97,6 +99,44 @@ def test_key_poses_out_of_reach_are_infeasible():
     observe(one, HAND, Perception(far))
     assert one.state.status is Status.INFEASIBLE
     assert one.executor.next_action(HAND).tolist() == [0.0] * 6 + [-1.0]
+
+
+def test_what_was_infeasible_is_not_planned_again_before_something_moves(monkeypatch):
+    far = {name: T + np.array([[0, 0, 0, 3.0], *[[0] * 4] * 3]) for name, T in entry().object_poses.items()}
+    one, perception, planned = controller(), Perception(far), []
+    choose = PlanningContext.choose
+    monkeypatch.setattr(PlanningContext, "choose", lambda *given: planned.append(given) or choose(*given))
+    for _ in range(3 * LOOK_AGAIN_STEPS):
+        observe(one, HAND, perception)
+    assert len(planned) == 1
+    assert one.state.status is Status.INFEASIBLE
+    perception.object_poses = entry().object_poses
+    for _ in range(8 * LOOK_AGAIN_STEPS):
+        observe(one, HAND, perception)
+    assert len(planned) > 1
+    assert one.state.status is Status.RUNNING
+    assert one.state.refusal == ""
+
+
+def test_an_object_that_moves_beyond_the_arms_reach_is_not_followed(request, caplog):
+    arm = load_arm(request.config.rootpath / "configs/arms/libero_panda.urdf")
+    # As if the table were LIBERO's.
+    first, *others = arm.joints
+    T = se3.transform(np.eye(3), [0.0, 0.0, -0.912]) @ first.T_before_joint
+    arm = replace(arm, joints=(replace(first, T_before_joint=T), *others))
+    wide = robot(workspace=np.array([[-1.0, -1.0, 0.0], [1.0, 1.0, 1.0]]), arm=arm)
+    one = EpisodeController(replace(planning_context(), robot=wide), INSTRUCTION, 7, 0)
+    perception = Perception(entry().object_poses)
+    observe(one, HAND, perception)
+    assert one.state.status is Status.RUNNING
+    caplog.set_level("INFO")
+    moved = entry().object_poses["plate"].copy()
+    moved[:2, 3] = [0.6, 0.3]
+    perception.object_poses["plate"] = moved
+    watch(one, perception, HAND, 8 * LOOK_AGAIN_STEPS)
+    assert_allclose(one.state.plan.object_poses["plate"], entry().object_poses["plate"])
+    assert "not believed: key pose" in caplog.text
+    assert "beyond what the arm's joints reach" in caplog.text
 
 
 def test_a_feasible_entry_is_preferred_to_a_better_one_that_is_not():

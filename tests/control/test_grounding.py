@@ -10,7 +10,7 @@ from lerobot_openspm.control.state import Status
 from lerobot_openspm.geometry import se3
 from lerobot_openspm.memory.compose import Candidate
 from lerobot_openspm.memory.entry import MemoryEntry, RetrievalKey
-from lerobot_openspm.types import PoseEstimate, Reference, SubTask
+from lerobot_openspm.types import Detections, PoseEstimate, Reference, SubTask
 
 NEXT_TO_RACK = Reference("next to", ("rack",))
 
@@ -203,3 +203,63 @@ def test_an_instruction_with_an_unknown_landmark_is_acted_by_on_the_one_that_was
     observe(one, HAND, perception)
     assert one.state.status is Status.RUNNING
     np.testing.assert_allclose(one.state.plan.object_poses["bowl"], meant)
+
+
+# The only one of its kind.
+
+
+@pytest.mark.parametrize(
+    ("where", "place", "status"),
+    [
+        (NEXT_TO_RACK, (0.3, 0.1), "found"),
+        (NEXT_TO_RACK, (-0.8, 0.3), "not_found"),
+        (Reference("on", ("rack",)), (0.3, -0.4), "not_found"),
+        (
+            Reference("left of", ("rack",)),
+            (0.3, 0.35),
+            "found",
+        ),  # a little to the right, as seen from opposite
+        (Reference("left of", ("rack",)), (0.3, 0.15), "found"),
+        (Reference("left of", ("rack",)), (0.3, 0.45), "not_found"),
+        (Reference("next to", ("shelf",)), (-0.8, 0.3), "found"),  # nobody sees the shelf
+        (Reference("left"), (-0.8, 0.3), "found"),
+    ],
+)
+def test_the_only_one_is_meant_unless_it_plainly_is_elsewhere(where, place, status):
+    grounding = Grounding({"bowl": where})
+    assert look(grounding, seen(at(*place))).status == status
+    assert grounding.elsewhere == ({"bowl": where} if status == "not_found" else {})
+
+
+def test_the_only_one_between_two_is_not_far_behind_both():
+    grounding = Grounding({"bowl": Reference("between", ("rack", "cup"))})
+    marks = {"cup": at(0.0, 0.0)}
+    assert look(grounding, seen(at(0.9, 0.9)), marks).status == "not_found"
+    assert look(grounding, seen(at(0.1, 0.2)), marks).status == "found"
+
+
+def test_once_it_is_told_it_may_be_carried_away():
+    grounding = Grounding({"bowl": NEXT_TO_RACK})
+    assert look(grounding, seen(NEAR)).status == "found"
+    assert look(grounding, seen(at(-0.8, 0.3))).status == "found"
+
+
+def test_nothing_is_far_from_the_table():
+    grounding = Grounding({"bowl": Reference("on", ("table",))}, surfaces=frozenset(CONTEXT.surfaces))
+    assert look(grounding, seen(at(2.0, 0.0)), CONTEXT.surfaces).status == "found"
+
+
+def test_an_episode_says_that_the_only_one_is_not_the_one_that_is_meant():
+    one = controller(instruction="put the bowl next to the plate on the plate")
+    observe(one, HAND, Perception({"bowl": at(-0.9, 0.0), "plate": at(0.2, 0.0)}))
+    assert one.state.status is Status.OBJECT_NOT_FOUND
+    assert one.state.refusal.startswith("the only bowl that was found is not next to the plate")
+
+
+def test_an_episode_says_that_the_words_do_not_tell_like_objects_apart():
+    one, poses = controller(), entry().object_poses
+    look = one.advance(HAND)
+    estimates = {"bowl": seen(poses["bowl"], FAR, status="found"), "plate": seen(poses["plate"])}
+    one.take_in(look, Detections(estimates, {}), HAND)
+    assert one.state.status is Status.OBJECT_NOT_FOUND
+    assert one.state.refusal.startswith("cannot tell which bowl is meant")

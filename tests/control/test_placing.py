@@ -48,8 +48,9 @@ def test_a_hand_that_cannot_turn_so_far_goes_the_other_way_round(yaw, is_half_tu
     context = PlanningContext((), {"bowl": 2 * np.pi, "plate": 2 * np.pi}, robot())
     memory, now = entry(), SHOWN | {"bowl": se3.from_yaw([0.2, 0.1, 0.0], yaw)}
     now["plate"] = se3.from_yaw([0.0, -0.2, 0.0], yaw)
-    plan = context.choose([Scored(memory, 1.0, 1.0, 1.0, 1.0)], now, HOME)
+    plan, problems = context.choose([Scored(memory, 1.0, 1.0, 1.0, 1.0)], now, HOME)
     assert plan.is_half_turned is is_half_turned
+    assert not problems
     assert not plan.problems(context)
     usual = Plan(memory, now, HOME).targets(context)
     turn = HALF_TURN if is_half_turned else np.eye(4)

@@ -10,9 +10,10 @@ from tests.control.test_controller import HAND, Perception, controller, observe,
 from tests.memory.builders import entry, hand_pose, key_pose, robot
 
 from lerobot_openspm.control.executor import MAX_ATTEMPTS, Executor
+from lerobot_openspm.control.pushes import push_paths
 from lerobot_openspm.control.scene import LEFT_BEHIND_M, OUTRUN_M
 from lerobot_openspm.control.state import EpisodeState, Status
-from lerobot_openspm.control.transfer import Target, push_paths, transfer
+from lerobot_openspm.control.transfer import Target, transfer
 from lerobot_openspm.geometry import se3
 from lerobot_openspm.memory.entry import Anchor, Outcome
 from lerobot_openspm.perception.tracking.tracker import TrackStatus

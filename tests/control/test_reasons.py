@@ -16,12 +16,13 @@ from lerobot_openspm.types import Hand, PoseEstimate
 )
 def test_each_missing_object_is_named_with_what_is_known_of_it(status, tipped, words):
     estimate = PoseEstimate(status, np.eye(4), np.eye(4), 0.0, tipped=tipped)
-    told = why_missing(["bowl", "plate"], {"bowl": estimate}, Hand(hand_pose(0, 0, 0.3), OPEN_WIDTH), robot())
+    hand = Hand(hand_pose(0, 0, 0.3), OPEN_WIDTH)
+    told = why_missing(["bowl", "plate"], {"bowl": estimate}, {}, hand, robot())
     assert told.startswith(words)
     assert "cannot find the plate" in told
     assert "fingers" not in told
 
 
 def test_what_is_missing_may_be_in_the_hand():
-    told = why_missing(["bowl"], {}, Hand(hand_pose(0, 0, 0.3), OPEN_WIDTH / 3), robot())
+    told = why_missing(["bowl"], {}, {}, Hand(hand_pose(0, 0, 0.3), OPEN_WIDTH / 3), robot())
     assert told.endswith("the fingers are around something, which may be it")

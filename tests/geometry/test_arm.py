@@ -57,6 +57,19 @@ def test_what_joints_within_their_limits_reach_is_reached(panda, seed):
     assert_allclose(panda.ee_pose(found), T, atol=1e-4)
 
 
+def test_nearly_all_that_joints_reach_is_found_from_wherever_it_is_sought(panda):
+    low, high = np.stack([joint.limits for joint in panda.joints]).T
+    poses = [panda.ee_pose(angles) for angles in np.random.default_rng(5).uniform(low, high, (200, 7))]
+    misses = np.array([panda.miss(T, panda.angles_for(T, panda.middle, panda.middle)) for T in poses])
+    assert (misses < [0.001, 0.01]).all(1).mean() >= 0.99
+
+
+def test_a_hand_that_is_half_a_turn_off_is_turned_round(panda):
+    T = panda.ee_pose(HOME) @ se3.from_yaw(np.zeros(3), np.pi)
+    assert_allclose(panda.miss(T, HOME), [0.0, np.pi], atol=1e-6)
+    assert_allclose(panda.ee_pose(panda.angles_for(T, HOME, HOME)), T, atol=1e-4)
+
+
 def test_what_is_too_far_away_is_missed_by_so_much(tmp_path):
     arm = load_arm(planar(tmp_path))
     start = arm.ee_pose(np.array([0.1, 0.5]))

@@ -1,5 +1,7 @@
 from collections import Counter
 from collections.abc import Callable
+from dataclasses import replace
+from itertools import cycle
 from pathlib import Path
 from typing import Any
 
@@ -10,16 +12,20 @@ from lerobot.configs import FeatureType
 from lerobot.datasets import LeRobotDataset, LeRobotDatasetMetadata
 from lerobot.utils.feature_utils import dataset_to_policy_features
 from tests.policy.conftest import Frame, act
-from tests.policy.lerobot_commands import CALIBRATION
+from tests.policy.lerobot_commands import ARM, CALIBRATION
 
 from lerobot_openspm import training
 from lerobot_openspm.configuration_openspm import OpenSPMConfig
-from lerobot_openspm.errors import DatasetError, MemoryFormatError
+from lerobot_openspm.errors import CalibrationError, DatasetError, MemoryFormatError
 from lerobot_openspm.flow.training_set import TrainingSet
+from lerobot_openspm.geometry import se3
+from lerobot_openspm.geometry.arm import load_arm
+from lerobot_openspm.geometry.se3 import Array
 from lerobot_openspm.mining import processor
 from lerobot_openspm.mining.dataset import Demonstrations
+from lerobot_openspm.mining.mined import MinedDataset, MinedKeyPoses
 from lerobot_openspm.modeling_openspm import OpenSPMPolicy
-from lerobot_openspm.training import dataset_processor, training_set
+from lerobot_openspm.training import dataset_processor, fitting_arm, training_set
 
 BOWL, STOVE = "put the bowl on the plate", "turn on the stove"
 PUSH = "push the plate to the front of the stove"
@@ -259,3 +265,33 @@ def test_the_perceptions_are_not_mixed(load: Callable[..., OpenSPMPolicy]):
 def test_a_loaded_policy_cannot_be_trained_without_a_dataset(policy: OpenSPMPolicy):
     with pytest.raises(DatasetError, match="dataset_meta"):
         policy.forward(batch(0))
+
+
+def of_hand_poses(mined: MinedKeyPoses, poses: list[Array]) -> MinedKeyPoses:
+    """The same demonstrations, as if the hand had been at these poses in turn."""
+    turn = cycle(poses)
+    episodes = [
+        replace(item, key_poses=tuple(replace(pose, T_world_ee=next(turn)) for pose in item.key_poses))
+        for item in mined.episodes
+    ]
+    return replace(mined, episodes=tuple(episodes))
+
+
+def test_an_arm_that_cannot_have_moved_as_was_shown_is_refused_by_its_option(
+    tiny_meta: LeRobotDatasetMetadata,
+):
+    config = new_config(tiny_meta, arm=str(ARM))
+    mined, arm = dataset_processor(tiny_meta, config).key_poses(), load_arm(ARM)
+    reached = [arm.ee_pose(arm.middle + change) for change in np.linspace(-0.5, 0.5, 5)]
+    assert fitting_arm(of_hand_poses(mined, reached), ARM).joints
+    # As in scenes where the robot stands on the floor.
+    lower = [se3.transform(np.eye(3), [0.06, 0.0, -0.912]) @ T for T in reached]
+    assert fitting_arm(of_hand_poses(mined, [*reached, *lower[:2]]), ARM).joints
+    wrong = MinedDataset(
+        **vars(of_hand_poses(mined, lower)), cameras={}, objects={}, object_poses=(), tasks=()
+    )
+    with pytest.raises(
+        CalibrationError, match=r"libero_panda\.urdf: .* miss \d+, by up to 0\.\d+ m"
+    ) as error:
+        training.memory_of(wrong, config)
+    assert "--policy.arm=FILE" in str(error.value)

@@ -46,6 +46,20 @@ class Way:
     goal: Array
     below: float
 
+    @property
+    def length(self) -> float:
+        """How far it goes, horizontally, metres."""
+        return float(np.linalg.norm((self.goal - self.start)[:2]))
+
+    def crossing(self, points: Mapping[str, Array], radius: float) -> tuple[float, list[str]]:
+        """How high the fingertips have to cross what stands about, world z, and what of it is in the way.
+
+        The height is minus infinity where nothing is. See :meth:`height_over`.
+        """
+        names = [name for name, own in points.items() if self.height_over(own, radius) is not None]
+        height = self.height_over(np.concatenate(list(points.values())), radius) if names else None
+        return (-np.inf if height is None else height), names
+
     def height_over(self, points: Array, radius: float) -> float | None:
         """How high the fingertips have to cross points ``(n, 3)``, world z; None if the way is clear.
 
@@ -69,8 +83,8 @@ def lifted(
     T_world_ee: Array,
     points: Mapping[str, Array],
     radius: float,
-) -> MemoryEntry:
-    """An entry with further key poses where its ways run into what stands about.
+) -> tuple[MemoryEntry, list[str]]:
+    """An entry with further key poses where its ways run into what stands about, and what that is.
 
     Args:
         entry: What is to be executed.
@@ -80,34 +94,55 @@ def lifted(
         radius: Of the hand, metres.
     """
     poses: list[MemoryKeyPose] = []
-    before, held, below = T_world_ee, "", 0.0
+    crossed: dict[str, None] = {}
+    # What was grasped last; the hand is right beside it, also when it has let go of it.
+    grasped, is_held, T_world_grasp = "", False, np.eye(4)
+    before, points = T_world_ee, dict(points)
     for i, (pose, target) in enumerate(zip(entry.key_poses, targets, strict=False)):
-        way = Way(before[:3, 3], target.T_world_ee[:3, 3], below)
-        is_upright = -target.T_world_ee[2, 2] > UPRIGHT
-        if is_upright and pose.phase in CROSSING and np.linalg.norm((way.goal - way.start)[:2]) > SHORTEST_M:
-            near = {held, *pose.anchor.objects, *(entry.key_poses[i - 1].anchor.objects if i else ())}
-            others = [own for name, own in points.items() if name not in near]
-            height = way.height_over(np.concatenate(others), BESIDE * radius) if others else None
-            if height is not None:
-                over = (
-                    [(pose, way.goal)] if i == 0 else [(entry.key_poses[i - 1], way.start), (pose, way.goal)]
-                )
-                poses += [_raised(one, height - place[2], pose) for one, place in over if height > place[2]]
+        T = target.T_world_ee
+        below = _below(T_world_grasp, points.get(grasped)) if is_held else 0.0
+        way = Way(before[:3, 3], T[:3, 3], below)
+        if -T[2, 2] > UPRIGHT and pose.phase in CROSSING and way.length > SHORTEST_M:
+            previous = entry.key_poses[i - 1] if i else None
+            near = {grasped, *pose.anchor.objects, *(previous.anchor.objects if previous else ())}
+            others = {name: own for name, own in points.items() if name not in near}
+            height, names = way.crossing(others, BESIDE * radius)
+            if previous and height > way.start[2]:
+                poses.append(_above(previous, height - way.start[2], pose))
+            if height > way.goal[2]:
+                poses.append(_raised(pose, height - way.goal[2]))
+            crossed |= dict.fromkeys(names)
         poses.append(pose)
         if pose.phase == "grasp":
-            held = pose.anchor.place
-            below = _below(target.T_world_ee, points.get(held))
-        elif pose.phase == "release":
-            held, below = "", 0.0
-        before = target.T_world_ee
-    return replace(entry, key_poses=tuple(poses))
+            grasped, is_held, T_world_grasp = pose.anchor.place, True, T
+        elif pose.phase == "release" and is_held:
+            is_held = False
+            if grasped in points:  # it stands where the hand let go of it
+                points[grasped] = se3.apply(T @ se3.inverse(T_world_grasp), points[grasped])
+        elif pose.phase == "push":  # where it ends is not known by its points
+            points.pop(entry.key.sub_tasks[pose.sub_task].target, None)
+        before = T
+    return replace(entry, key_poses=tuple(poses)), list(crossed)
 
 
-def _raised(pose: MemoryKeyPose, rise: float, towards: MemoryKeyPose) -> MemoryKeyPose:
-    """A key pose that is passed by, above another one, on the way to a third."""
+def _raised(pose: MemoryKeyPose, rise: float) -> MemoryKeyPose:
+    """A key pose that is passed by, above another one."""
     T = se3.transform(pose.T_obj_ee[:3, :3], pose.T_obj_ee[:3, 3] + [0.0, 0.0, rise])
+    return replace(pose, T_obj_ee=T, n_steps=1, dwell=False, axis=None, covariance=None)
+
+
+def _above(previous: MemoryKeyPose, rise: float, towards: MemoryKeyPose) -> MemoryKeyPose:
+    """A key pose above one that the hand leaves for another.
+
+    It goes where that one goes, by its sub-task and its object. A hand that is done there retreats.
+    """
+    is_done = previous.sub_task != towards.sub_task or previous.phase == "retreat"
     return replace(
-        towards, anchor=pose.anchor, T_obj_ee=T, n_steps=1, dwell=False, axis=None, covariance=None
+        _raised(previous, rise),
+        phase="retreat" if is_done else towards.phase,
+        closed=towards.closed,
+        opening=towards.opening,
+        confidence=towards.confidence,
     )
 
 

@@ -15,10 +15,9 @@ import numpy as np
 
 from lerobot_openspm.control.executor import Executor
 from lerobot_openspm.control.planning import PlanningContext
-from lerobot_openspm.control.reasons import why_missing
 from lerobot_openspm.control.scene import GIVE_UP_S, LOOK_AGAIN_S, SECOND_LOOK_S, LookRequest, SceneState
 from lerobot_openspm.control.state import LOOKS_AT_OUTCOME, EpisodeState, Status
-from lerobot_openspm.control.transfer import Target, pushed_by_landmark, rise
+from lerobot_openspm.control.transfer import Target, rise
 from lerobot_openspm.errors import InstructionError
 from lerobot_openspm.geometry.se3 import Array
 from lerobot_openspm.memory.compose import plan_parts
@@ -28,9 +27,6 @@ from lerobot_openspm.perception.tracking.tracker import TrackStatus
 from lerobot_openspm.types import Detections, Hand
 
 logger = logging.getLogger(__name__)
-
-# A memory that knows more objects than this knows several scenes, and not all objects are looked for.
-MOST_IN_A_SCENE = 20
 
 
 class EpisodeController:
@@ -134,25 +130,24 @@ class EpisodeController:
                 return self._refuse(error)
             state.start_height = float(hand.T_world_ee[2, 3])
             scene.ground(state.parts[0])
-        entries = [one.entry for part in state.parts[state.part :] for one in part]
-        needed = [name for entry in entries for name in (*entry.objects, *pushed_by_landmark(entry).values())]
-        # What else is known may stand in the way; what is known of many scenes is mostly elsewhere.
-        others = context.points if len(context.points) <= MOST_IN_A_SCENE else ()
-        names = dict.fromkeys([*needed, *scene.grounding.landmarks, *others])
+        ahead = [one.entry for part in state.parts[state.part :] for one in part]
+        names = dict.fromkeys([*context.objects_of_interest(ahead), *scene.grounding.landmarks])
         return scene.look([name for name in names if name not in scene.altered], hand)
 
     def _plan(self, hand: Hand) -> None:
         """Plan the present part, once its objects are found."""
         state, candidates = self.state, self.state.parts[self.state.part]
         poses = self.scene.tracker.poses(hand.T_world_ee)
+        if state.status is Status.INFEASIBLE and state.refused.is_same_scene(poses, hand.T_world_ee):
+            return  # nor is it now
         state.ranked = self._context.rank(candidates, poses, hand.T_world_ee)
-        plan = self._context.choose(state.ranked, poses, hand.T_world_ee)
+        plan, problems = self._context.choose(state.ranked, poses, hand.T_world_ee)
         if missing := [name for name in plan.entry.objects if name not in poses]:
-            seen = self.scene.detections.estimates
-            state.refusal = why_missing(missing, seen, hand, self._context.robot)
+            state.refusal = self.scene.why_missing(missing, hand)
             logger.info("%r: %s", self.instruction, state.refusal)
             state.go(Status.OBJECT_NOT_FOUND)
-        elif problems := plan.problems(self._context, with_arm=True):
+        elif problems:
+            state.refused = plan
             state.refusal = "; ".join(problems)
             logger.warning("%r: %s", self.instruction, state.refusal)
             state.go(Status.INFEASIBLE)
@@ -214,20 +209,15 @@ class EpisodeController:
 
     def _look_around(self, hand: Hand) -> LookRequest:
         """Look for what the remaining key poses need, and for what is in the hand."""
-        return self.scene.look([*self._untouched(), *self.scene.tracker.held], hand)
+        untouched = self.scene.untouched(self.state.plan, self.executor.targets, self.state.index)
+        return self.scene.look([*untouched, *self.scene.tracker.held], hand)
 
     def _go_on(self, look: LookRequest, moved: frozenset[str], hand: Hand) -> None:
         """Act on what has moved: what was in the hand and is seen elsewhere was dropped, so fetch it."""
         scene, executor, plan = self.scene, self.executor, self.state.plan
         target, index = executor.target, self.state.index
-        dropped = {
-            name
-            for name in moved & look.held
-            if target is None or scene.is_left_behind(name, plan, executor.targets, index, hand)
-        }
-        for name in (moved & look.held) - dropped:  # it goes along from where it is
-            scene.tracker.hold(name, hand.T_world_ee)
-        if dropped:
+        approached = () if target is None else executor.targets
+        if dropped := scene.dropped(moved & look.held, plan, approached, index, hand):
             logger.info("%r: dropped: %s", self.instruction, ", ".join(sorted(dropped)))
             # What slips out of the hand is no fault of the plan; a push that loses its object may be.
             is_pushing = target is not None and target.key_pose.phase == "push"
@@ -274,15 +264,9 @@ class EpisodeController:
         is_paused = scene.is_blind or scene.those(TrackStatus.STALE, needed)
         state.go(Status.PAUSED if is_paused else Status.RUNNING)
 
-    def _untouched(self) -> list[str]:
-        """Objects of the key poses to come that still are where they were seen."""
-        plan, index = self.state.plan, self.state.index
-        touched = plan.touched(self.executor.targets[:index]) | self.scene.tracker.held
-        return [name for name in plan.objects(index, self.scene.altered) if name not in touched]
-
     def _now_needed(self) -> list[str]:
         """Objects that the present key pose is relative to, unless the hand has touched them."""
-        untouched = self._untouched()
+        untouched = self.scene.untouched(self.state.plan, self.executor.targets, self.state.index)
         anchor = self.executor.present.key_pose.anchor
         return [name for name in anchor.objects if name in untouched]
 

@@ -2,22 +2,25 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cache
 
 import numpy as np
 
 from lerobot_openspm.control.transfer import Target, half_turned, transfer
 from lerobot_openspm.geometry import se3
+from lerobot_openspm.geometry.arm import OUT_OF_REACH_M, OUT_OF_REACH_RAD, Arm
 from lerobot_openspm.geometry.se3 import Array
 from lerobot_openspm.memory.entry import CONSTRAINED_PHASES, MemoryEntry
 from lerobot_openspm.memory.robot import RobotModel
 
+logger = logging.getLogger(__name__)
+
 # Longest way and largest turn between consecutive key poses: the reach of a table-top arm, and just short of
 # half a turn, whose direction is open.
 MAX_JUMP_M, MAX_JUMP_RAD = 0.8, 2.8
-# A key pose that the joints miss by more than this is out of reach.
-OUT_OF_REACH_M, OUT_OF_REACH_RAD = 0.005, 0.05
 # How much a different motion through free space counts beside one in contact.
 FREE_SPACE_SHARE = 0.2
 # An entry whose motions differ by this much scores 1/e.
@@ -69,19 +72,68 @@ def check_transfer(
     return problems
 
 
-def check_reach(targets: Sequence[Target], T_world_ee: Array, robot: RobotModel) -> list[str]:
-    """The first key pose that the arm's joints cannot reach on their way through all of them, in words.
+@dataclass(frozen=True)
+class Miss:
+    """A key pose that the arm's joints cannot reach.
 
-    Nothing is wrong where the arm's kinematics are not known.
+    Attributes:
+        index: Which one.
+        target: The key pose in the scene.
+        metres: How far from it the hand stays ...
+        radians: ... and by how much it is turned away.
+    """
+
+    index: int
+    target: Target
+    metres: float
+    radians: float
+
+    def __str__(self) -> str:
+        pose = self.target.key_pose
+        return (
+            f"key pose {self.index} ({pose.phase} at {pose.anchor.place}) is {self.metres:.3f} m and "
+            f"{self.radians:.2f} rad beyond what the arm's joints reach"
+        )
+
+
+def find_stance(robot: RobotModel, T_world_ee: Array) -> Array | None:
+    """The arm's joint angles ``(n,)`` where the hand is ``(4, 4)``.
+
+    None where its kinematics are not known, or do not fit the scene: then nothing is refused by them.
     """
     if robot.arm is None:
-        return []
-    misses = robot.arm.misses((target.T_world_ee for target in targets), T_world_ee)
+        return None
+    stance = robot.arm.stance(T_world_ee)
+    metres, radians = robot.arm.miss(T_world_ee, stance)
+    if metres <= OUT_OF_REACH_M and radians <= OUT_OF_REACH_RAD:
+        return stance
+    _warn_once(
+        f"the arm does not fit: its joints miss even where the hand is now by {metres:.2f} m and "
+        f"{radians:.1f} rad; reach is not checked by them. Pass the URDF of this robot, where it stands in "
+        "this scene, as --policy.arm=FILE"
+    )
+    return None
+
+
+@cache
+def _warn_once(message: str) -> None:
+    logger.warning("%s", message)
+
+
+def check_reach(targets: Sequence[Target], T_world_ee: Array, arm: Arm, stance: Array) -> Miss | None:
+    """The first key pose that the arm's joints cannot reach on their way through all of them.
+
+    Args:
+        targets: The key poses.
+        T_world_ee: Where the hand is ``(4, 4)``.
+        arm: The arm.
+        stance: Its joint angles ``(n,)`` there.
+    """
+    misses = arm.misses((target.T_world_ee for target in targets), T_world_ee, stance)
     for i, (target, (metres, radians)) in enumerate(zip(targets, misses, strict=True)):
         if metres > OUT_OF_REACH_M or radians > OUT_OF_REACH_RAD:
-            where = f"key pose {i} ({target.key_pose.phase} at {target.key_pose.anchor.place})"
-            return [f"{where} is {metres:.3f} m and {radians:.2f} rad beyond what the arm's joints reach"]
-    return []
+            return Miss(i, target, metres, radians)
+    return None
 
 
 def geometric_score(

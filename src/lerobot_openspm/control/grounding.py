@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from lerobot_openspm.control.spatial_relations import choose, choose_as_shown
+from lerobot_openspm.control.spatial_relations import choose, choose_as_shown, contradicts
 from lerobot_openspm.geometry.se3 import Array
 from lerobot_openspm.memory.compose import Candidate
 from lerobot_openspm.types import PoseEstimate, Reference
@@ -64,12 +64,17 @@ class Grounding:
     Attributes:
         said: By name, where the instruction says that the object is.
         shown: By name, where demonstrations show what stood; for objects that their landmark cannot tell.
+        surfaces: Landmarks that are as wide as the scene: nothing is far from them.
+        elsewhere: By name, where the only one that the last look brought should be, but plainly is not.
     """
 
     said: Mapping[str, Reference] = field(default_factory=dict[str, Reference])
     shown: Mapping[str, Sequence[Mapping[str, Array]]] = field(
         default_factory=dict[str, Sequence[Mapping[str, Array]]]
     )
+    surfaces: frozenset[str] = frozenset()
+    elsewhere: dict[str, Reference] = field(default_factory=dict[str, Reference])
+    _told: set[str] = field(default_factory=set[str])
     _not_meant: dict[str, tuple[Array, ...]] = field(default_factory=dict[str, tuple[Array, ...]])
 
     @property
@@ -92,6 +97,7 @@ class Grounding:
         kept = {name: one for name, one in self.shown.items() if name not in said}
         self.shown = {**kept, **(shown or {})}
         self._not_meant = {name: T for name, T in self._not_meant.items() if name not in changed}
+        self._told -= changed
         return changed
 
     def sort_out(
@@ -100,8 +106,10 @@ class Grounding:
         """What was seen of the objects that are meant, given the poses of objects seen before.
 
         An object is told from its like once, when several are first seen; from then on those that are not
-        meant are known by their places. One that cannot be told is ambiguous.
+        meant are known by their places. One that cannot be told is ambiguous. The only one of its kind is
+        the one that is meant, unless it plainly is not where that is said to be.
         """
+        self.elsewhere = {}
         places = {name: one.T_world_obj for name, one in estimates.items() if one.status == "found"}
         known = {**places, **object_poses}
         return {name: self._meant(name, one, known) for name, one in estimates.items()}
@@ -110,7 +118,7 @@ class Grounding:
         if name in self._not_meant:
             return self._unless_another(name, estimate)
         if estimate.status == "not_found" or not estimate.others:
-            return estimate
+            return self._unless_elsewhere(name, estimate, object_poses)
         candidates = (estimate.T_world_obj, *estimate.others)
         landmarks = {mark: T for mark, T in object_poses.items() if mark != name}
         index = choose(self.said[name], candidates, landmarks) if name in self.said else None
@@ -123,6 +131,19 @@ class Grounding:
             return replace(estimate, status="ambiguous")
         self._not_meant[name] = candidates[:index] + candidates[index + 1 :]
         return replace(estimate, status="found", T_world_obj=candidates[index], others=())
+
+    def _unless_elsewhere(
+        self, name: str, estimate: PoseEstimate, object_poses: Mapping[str, Array]
+    ) -> PoseEstimate:
+        """The estimate of the only one, unless it is of another than is said, when it is first seen."""
+        if estimate.status != "found" or name not in self.said or name in self._told:
+            return estimate
+        landmarks = {k: T for k, T in object_poses.items() if k != name and k not in self.surfaces}
+        if contradicts(self.said[name], estimate.T_world_obj, landmarks):
+            self.elsewhere[name] = self.said[name]
+            return replace(estimate, status="not_found")
+        self._told.add(name)
+        return estimate
 
     def _unless_another(self, name: str, estimate: PoseEstimate) -> PoseEstimate:
         """The estimate, unless it is of one that is not meant; then that of the place that is left."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import itertools
+import logging
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
@@ -10,17 +10,19 @@ import numpy as np
 
 from lerobot_openspm.control.clearance import lifted
 from lerobot_openspm.control.feasibility import (
+    Miss,
     TransferLimits,
     check_reach,
     check_transfer,
+    find_stance,
     geometric_score,
 )
+from lerobot_openspm.control.pushes import pushed_by_landmark
 from lerobot_openspm.control.transfer import (
     HALF_TURN,
     Target,
     Turn,
     half_turned,
-    pushed_by_landmark,
     transfer,
 )
 from lerobot_openspm.geometry import se3
@@ -32,6 +34,8 @@ from lerobot_openspm.memory.retrieval import Scored, retrieve
 from lerobot_openspm.memory.robot import RobotModel
 from lerobot_openspm.types import Execution, SubTask, Symmetry
 
+logger = logging.getLogger(__name__)
+
 # An object this far from where the key poses took it to be takes them along; less is noise.
 MOVED_M, MOVED_RAD = 0.002, 0.05
 # Of the entries so many are tried, and grasps of objects that turn into themselves are turned by so much or
@@ -40,6 +44,8 @@ MAX_TRIED = 3
 TURNS = tuple(
     np.deg2rad([0, *(sign * turn for turn in range(30, 180, 30) for sign in (1, -1)), 180]).tolist()
 )
+# A memory that knows more objects than this knows several scenes, and not all objects are looked for.
+MOST_IN_A_SCENE = 20
 # Where an object is that was never seen.
 NOWHERE = se3.transform(np.eye(3), np.full(3, np.inf))
 
@@ -84,6 +90,14 @@ class PlanningContext:
         best = max(alike, key=lambda known: alike[known], default=name)
         return best if alike.get(best, 0.0) > 0 else name
 
+    def objects_of_interest(self, entries: Sequence[MemoryEntry]) -> list[str]:
+        """The objects that entries need, and what else is known, which may stand in the way.
+
+        What is known of many scenes is mostly elsewhere, and left out.
+        """
+        needed = [name for one in entries for name in (*one.objects, *pushed_by_landmark(one).values())]
+        return [*needed, *(self.points if len(self.points) <= MOST_IN_A_SCENE else ())]
+
     @property
     def surfaces(self) -> dict[str, Array]:
         """The table under its names, at the middle of where the hand was in the demonstrations."""
@@ -103,34 +117,64 @@ class PlanningContext:
         semantic = [(one.entry, one.semantic) for one in candidates]
         return tuple(retrieve(semantic, lambda entry: geometric[id(entry)], self.names))
 
-    def choose(self, ranked: Sequence[Scored], object_poses: Mapping[str, Array], T_world_ee: Array) -> Plan:
+    def choose(
+        self, ranked: Sequence[Scored], object_poses: Mapping[str, Array], T_world_ee: Array
+    ) -> tuple[Plan, list[str]]:
         """The best entry that the arm can follow, its grasps turned by an object's symmetry if need be.
 
         The hand goes the other way round, by half a turn about its approach axis, where nothing else does.
 
-        Where none of the first can be followed, the best one as it is.
+        Returns:
+            The plan, and what keeps the hand from following it, in words. Where none of the first entries
+            can be followed, or objects of the best one were not found, the best one as it is.
         """
         first = Plan(ranked[0].entry, object_poses, T_world_ee)
         if any(name not in object_poses for name in first.entry.objects):
-            return first
+            return first, []
+        first = replace(first, stance=find_stance(self.robot, T_world_ee))
         for entry in (one.entry for one in ranked[:MAX_TRIED] if one.geometric > 0):
-            plan = replace(first, entry=entry)
-            for is_half_turned, radians in itertools.product((False, True), plan.turns(self)):
-                turned = replace(plan, turned=radians, is_half_turned=is_half_turned)
-                if not turned.problems(self, with_arm=True):
-                    return turned
-        return first
+            for is_half_turned in (False, True):
+                plan = self._turned(replace(first, entry=entry, is_half_turned=is_half_turned))
+                if plan is not None:
+                    return plan, []
+        return first, first.problems(self)
+
+    def _turned(self, plan: Plan) -> Plan | None:
+        """A plan with its grasps turned by the least with which the arm can follow it; None where none is."""
+        turning = plan.symmetric_grasps(self)
+        for radians in plan.turns(self):
+            turned = replace(plan, turned=radians)
+            targets = turned.targets(self)
+            if check_transfer(targets, plan.T_world_ee, self.robot, self.limits):
+                continue
+            miss = turned.miss(self, targets)
+            if miss is None:
+                return turned
+            if miss.target.key_pose.sub_task not in turning:
+                return None  # turning the grasps leaves it where it is
+        return None
 
     def clear(self, plan: Plan) -> Plan:
-        """A plan whose ways are lifted over what stands about, as far as the arm can follow them."""
+        """A plan whose ways are lifted over what stands about.
+
+        Where the arm cannot follow the lifted ways, the plan stays as it is, and that is said.
+        """
         points = {
             name: se3.apply(plan.object_poses[name], own)
             for name, own in self.points.items()
             if name in plan.object_poses
         }
-        entry = lifted(plan.entry, plan.targets(self), plan.T_world_ee, points, self.hand_radius_m)
+        entry, crossed = lifted(plan.entry, plan.targets(self), plan.T_world_ee, points, self.hand_radius_m)
+        if not crossed:
+            return plan
         higher = replace(plan, entry=entry)
-        return plan if higher.problems(self, with_arm=True) else higher
+        if problems := higher.problems(self):
+            logger.warning(
+                "%r: goes straight although the %s may be in the way: lifted over it, %s",
+                plan.entry.language, " and the ".join(crossed), "; ".join(problems),
+            )  # fmt: skip
+            return plan
+        return higher
 
 
 @dataclass(frozen=True)
@@ -145,6 +189,8 @@ class Plan:
         turned: How far the hand is turned about the axis of objects that it grasps, which turn into
             themselves by that, radians.
         is_half_turned: Whether the hand is turned by half a turn about its approach axis.
+        stance: The arm's joint angles ``(n,)`` where the plan begins; None where they are not known, and
+            reach is not checked by them.
     """
 
     entry: MemoryEntry
@@ -152,6 +198,7 @@ class Plan:
     T_world_ee: Array
     turned: float = 0.0
     is_half_turned: bool = False
+    stance: Array | None = None
 
     def targets(
         self,
@@ -185,13 +232,26 @@ class Plan:
             if radians == 0 or (least and all(turn == 0 or _is_multiple(radians, turn) for turn in least))
         ]
 
-    def problems(self, context: PlanningContext, with_arm: bool = False) -> list[str]:
-        """What keeps the hand from following the plan, in words; with what the arm's joints say, if asked."""
+    def problems(self, context: PlanningContext) -> list[str]:
+        """What keeps the hand from following the plan, in words."""
         targets = self.targets(context)
         problems = check_transfer(targets, self.T_world_ee, context.robot, context.limits)
-        if problems or not with_arm:
-            return problems
-        return check_reach(targets, self.T_world_ee, context.robot)
+        if not problems and (miss := self.miss(context, targets)):
+            return [str(miss)]
+        return problems
+
+    def miss(self, context: PlanningContext, targets: Sequence[Target]) -> Miss | None:
+        """The first of its key poses in the scene that the arm's joints do not reach, as far as is known."""
+        arm = context.robot.arm
+        if arm is None or self.stance is None:
+            return None
+        return check_reach(targets, self.T_world_ee, arm, self.stance)
+
+    def is_same_scene(self, object_poses: Mapping[str, Array], T_world_ee: Array) -> bool:
+        """Whether the same objects, and the hand, are where the plan was made for."""
+        is_still = float(se3.distance(self.T_world_ee, T_world_ee)) < MOVED_M
+        is_known = object_poses.keys() == self.object_poses.keys()
+        return is_still and is_known and not self.moved(list(object_poses), object_poses)
 
     def moved(self, names: Sequence[str], object_poses: Mapping[str, Array]) -> dict[str, Array]:
         """The poses of those objects that are elsewhere now than where the plan takes them to be."""

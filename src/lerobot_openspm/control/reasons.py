@@ -5,20 +5,25 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 
 from lerobot_openspm.memory.robot import RobotModel
-from lerobot_openspm.types import Hand, PoseEstimate
+from lerobot_openspm.types import Hand, PoseEstimate, Reference
 
 # Fingers that are open by such a share are around something, as far as can be felt.
 FINGERS_AROUND = (0.03, 0.9)
 
 
 def why_missing(
-    missing: Sequence[str], estimates: Mapping[str, PoseEstimate], hand: Hand, robot: RobotModel
+    missing: Sequence[str],
+    estimates: Mapping[str, PoseEstimate],
+    elsewhere: Mapping[str, Reference],
+    hand: Hand,
+    robot: RobotModel,
 ) -> str:
     """What is known of objects that were not found.
 
     Args:
         missing: Their names, at least one.
-        estimates: What the last look brought, by name.
+        estimates: What the last look brought of the objects that are meant, by name.
+        elsewhere: By name, where the only one found should be, but is not.
         hand: The hand, which may hold one of them.
         robot: The robot.
     """
@@ -26,6 +31,10 @@ def why_missing(
     for name in missing:
         if name in estimates and estimates[name].tipped:
             reasons.append(f"the {name} has tipped over")
+        elif name in elsewhere:
+            where = elsewhere[name]
+            marks = " and the ".join(where.landmarks)
+            reasons.append(f"the only {name} that was found is not {where.relation} the {marks}")
         elif name in estimates and estimates[name].status == "ambiguous":
             reasons.append(f"cannot tell which {name} is meant, or where it stands")
         else:

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence, Set
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from lerobot_openspm.control.grounding import Grounding, demonstrations, references
 from lerobot_openspm.control.planning import Plan, PlanningContext
+from lerobot_openspm.control.reasons import why_missing
 from lerobot_openspm.control.transfer import Target
 from lerobot_openspm.geometry.se3 import Array
 from lerobot_openspm.memory.compose import Candidate
@@ -53,14 +54,14 @@ class SceneState:
     Attributes:
         tracker: Follows every object that was looked for.
         grounding: Which of several like objects is meant.
-        detections: What the last look brought.
+        detections: What the last look brought of the objects that are meant.
         altered: Objects that were opened or turned: they look different now, and stand still.
     """
 
     def __init__(self, context: PlanningContext):
         self._context = context
         self.tracker = Tracker(context.yaw_periods, TrackerSettings())
-        self.grounding = Grounding()
+        self.grounding = Grounding(surfaces=frozenset(context.surfaces))
         self.detections = Detections({}, {})
         self.altered: set[str] = set()
         self._step = -1
@@ -102,6 +103,7 @@ class SceneState:
         self._looked_at_step = self._step
         known = {**self._context.surfaces, **self.tracker.poses(hand.T_world_ee)}
         meant = self.grounding.sort_out(detections.estimates, known)
+        self.detections = replace(detections, estimates=meant)
         return self.tracker.look(meant, hand.T_world_ee, waited_s)
 
     @property
@@ -131,6 +133,12 @@ class SceneState:
         """Those of some objects that have a status."""
         return [name for name in names if self.tracker.status(name) is status]
 
+    def why_missing(self, names: Sequence[str], hand: Hand) -> str:
+        """What is known of objects that the last look did not find, in words."""
+        return why_missing(
+            names, self.detections.estimates, self.grounding.elsewhere, hand, self._context.robot
+        )
+
     # What goes along with the hand.
 
     def pass_key_pose(self, plan: Plan, passed: Target, after: Target, hand: Hand) -> None:
@@ -154,6 +162,25 @@ class SceneState:
         """What is pushed on the way to a key pose goes along once the hand has met it."""
         if target.push and self._beyond(target, hand) >= 0:
             self.tracker.hold(target.push.target, hand.T_world_ee)
+
+    def untouched(self, plan: Plan, targets: Sequence[Target], index: int) -> list[str]:
+        """Objects of the key poses from one on that still are where they were seen."""
+        touched = plan.touched(targets[:index]) | self.tracker.held
+        return [name for name in plan.objects(index, self.altered) if name not in touched]
+
+    def dropped(
+        self, names: Set[str], plan: Plan, targets: Sequence[Target], index: int, hand: Hand
+    ) -> set[str]:
+        """Those of some objects, seen elsewhere than in the hand, that it dropped; the others go along.
+
+        All of them where no target is approached.
+        """
+        dropped = {
+            name for name in names if not targets or self.is_left_behind(name, plan, targets, index, hand)
+        }
+        for name in names - dropped:  # it goes along from where it is
+            self.tracker.hold(name, hand.T_world_ee)
+        return dropped
 
     def is_left_behind(
         self, name: str, plan: Plan, targets: Sequence[Target], index: int, hand: Hand

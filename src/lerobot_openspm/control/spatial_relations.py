@@ -25,6 +25,11 @@ HEIGHT_ERROR_M = 0.01
 # How much a metre to the side counts beside a metre of distance, beyond half a right angle.
 SIDEWAYS_SHARE = 3.0
 
+# What is said to be next to, on, in, under or between things is nearer than this to them, ...
+FAR_M = 0.5
+# ... and what is said to be on one side of something is not this far on the other.
+OPPOSITE_M = 0.1
+
 _SIDES = {"right": (0.0, 1.0), "left": (0.0, -1.0), "back": (-1.0, 0.0), "front": (1.0, 0.0)}
 _ALIASES = {
     "left of": "left", "right of": "right", "front of": "front", "in front of": "front", "behind": "back",
@@ -68,6 +73,23 @@ def choose(reference: Reference, candidates: Sequence[Array], landmarks: Mapping
     others = np.delete(cost(places, marks, MARGIN_M), best)
     is_clear = np.isfinite(costs[best]) and others.min() - costs[best] >= MARGIN_M
     return best if is_clear else None
+
+
+def contradicts(reference: Reference, T_world_obj: Array, landmarks: Mapping[str, Array]) -> bool:
+    """Whether an object plainly is not where it is said to be; not where its landmarks were not found.
+
+    The arguments are those of :func:`choose`, for one object.
+    """
+    relation = _ALIASES.get(reference.relation, reference.relation)
+    if not reference.landmarks or any(name not in landmarks for name in reference.landmarks):
+        return False
+    place = T_world_obj[None, :3, 3]
+    marks = np.array([landmarks[name][:3, 3] for name in reference.landmarks])
+    if relation in _SIDES:
+        return float((place - marks)[0, :2] @ np.array(_SIDES[relation])) < -OPPOSITE_M
+    if relation == "between" and len(marks) == 2:
+        return float(_between(place, marks, 0.0)[0]) > FAR_M
+    return relation in ("next to", "on", "in", "under") and float(_near_middle(place, marks, 0.0)[0]) > FAR_M
 
 
 def choose_as_shown(

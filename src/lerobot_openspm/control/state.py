@@ -69,6 +69,7 @@ class EpisodeState:
         start_height: Height of the hand when the instruction was read, metres.
         ranked: The entries of the last retrieval with their scores, best first.
         plan: What is acted by, and where.
+        refused: The plan that was last found to be infeasible.
         used: For each part that was begun, the entry of the memory that it was carried out by.
         verdicts: For each part that was ended, whether it is seen to be done; None where that is not known.
         index: The key pose that is approached.
@@ -88,6 +89,7 @@ class EpisodeState:
     start_height: float = np.inf
     ranked: tuple[Scored, ...] = ()
     plan: Plan = NO_PLAN
+    refused: Plan = NO_PLAN
     used: tuple[MemoryEntry, ...] = ()
     verdicts: tuple[bool | None, ...] = ()
     index: int = 0

@@ -8,67 +8,17 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from lerobot_openspm.control.placing import carried_outcomes, placing_position
+from lerobot_openspm.control.pushes import PushPath, push_paths
 from lerobot_openspm.geometry import se3
 from lerobot_openspm.geometry.se3 import Array
-from lerobot_openspm.memory.entry import CONTACT_PHASES, Axis, MemoryEntry, MemoryKeyPose, Outcome
+from lerobot_openspm.memory.entry import CONTACT_PHASES, Axis, MemoryEntry, MemoryKeyPose
 
 # How far the hand backs off at the end.
 RETREAT_M = 0.06
 # A hand that is at most this much too low need not rise.
 LEVEL_M = 0.02
-# The direction of a push shorter than this is within the noise of the object's position.
-MIN_PUSH_M = 0.005
 # Of the hand about its approach axis, the z axis of its frame.
 HALF_TURN = se3.from_yaw(np.zeros(3), np.pi)
-
-
-@dataclass(frozen=True)
-class PushPath:
-    """A push in the demonstration and here, each from where the target is to where it should end.
-
-    The object moves in the direction of the hand, and ends before the hand. So the hand's position is kept
-    relative to the path: beside the target at its start, and beside the outcome at its end.
-
-    Attributes:
-        target: The object that is pushed.
-        shown: Start and end ``(2, 3)`` of the target in the demonstration, in the world.
-        now: Start and end ``(2, 3)`` of the target here.
-        is_by_landmark: Whether none of its key poses belongs to the target.
-    """
-
-    target: str
-    shown: Array
-    now: Array
-    is_by_landmark: bool = False
-
-    def position(self, pose: MemoryKeyPose, poses_shown: Mapping[str, Array]) -> Array:
-        """Where the hand goes ``(3,)`` for a key pose of the push."""
-        is_at_start = pose.anchor.place == self.target or (self.is_by_landmark and pose.phase == "approach")
-        place = 0 if is_at_start else 1
-        T_world_ee = pose.anchor.frame(poses_shown) @ pose.T_obj_ee
-        turn = _heading(self.now) - _heading(self.shown)
-        if min(_length(self.shown), _length(self.now)) < MIN_PUSH_M:
-            turn = 0.0
-        offset = T_world_ee[:3, 3] - self.shown[place]
-        position = self.now[place] + se3.apply(se3.from_yaw(np.zeros(3), turn), offset[None])[0]
-        # The path lies at one height. That of its end is known best, because the landmark stands still.
-        position[2] = self.now[1, 2] + T_world_ee[2, 3] - self.shown[1, 2]
-        return position
-
-    def beyond(self, T_world_ee: Array, T_world_end: Array, target: Array) -> float:
-        """Metres along the path by which the hand has passed the point where it meets its target.
-
-        There the hand is as far ahead of the target as at the end of the push.
-
-        Args:
-            T_world_ee: The hand ``(4, 4)``.
-            T_world_end: Where the push ends ``(4, 4)``.
-            target: Where the target is ``(3,)``.
-        """
-        path = (self.now[1] - self.now[0])[:2]
-        meeting = T_world_end[:3, 3] + target - self.now[1]
-        gone = float((T_world_ee[:3, 3] - meeting)[:2] @ path)
-        return gone / max(_length(self.now), MIN_PUSH_M)
 
 
 @dataclass(frozen=True)
@@ -137,11 +87,7 @@ def transfer(
     before = T_world_ee
     paths, carried = push_paths(entry, object_poses), carried_outcomes(entry)
     for i, pose in enumerate(entry.key_poses):
-        for name in pose.anchor.objects:
-            if name not in chosen:
-                chosen[name] = _nearest_equivalent(
-                    name, pose, {**object_poses, **chosen}, yaw_periods, before
-                )
+        chosen |= _equivalents(pose, object_poses, chosen, yaw_periods, before)
         T_world_anchor = pose.anchor.frame(chosen)
         before = transfer_pose(T_world_anchor, pose.T_obj_ee)
         path = paths.get(pose.sub_task)
@@ -194,44 +140,6 @@ def half_turned(targets: Sequence[Target]) -> tuple[Target, ...]:
     Two fingers that close on one another take hold either way round.
     """
     return tuple(replace(one, T_world_ee=one.T_world_ee @ HALF_TURN) for one in targets)
-
-
-def push_paths(entry: MemoryEntry, object_poses: Mapping[str, Array]) -> dict[int, PushPath]:
-    """The paths of an entry's pushes by sub-task, of those whose outcome is known."""
-    by_landmark = pushed_by_landmark(entry)
-    paths: dict[int, PushPath] = {}
-    for outcome in _push_outcomes(entry):
-        if any(name not in poses for name in outcome.objects for poses in (entry.object_poses, object_poses)):
-            continue
-        shown = np.stack([entry.object_poses[outcome.target][:3, 3], outcome.place_shown(entry.object_poses)])
-        now = np.stack([object_poses[outcome.target][:3, 3], outcome.place(object_poses)])
-        is_by_landmark = outcome.sub_task in by_landmark
-        paths[outcome.sub_task] = PushPath(outcome.target, shown, now, is_by_landmark)
-    return paths
-
-
-def pushed_by_landmark(entry: MemoryEntry) -> dict[int, str]:
-    """By sub-task, the targets of an entry's pushes that none of the push's key poses belongs to."""
-    return {
-        outcome.sub_task: outcome.target
-        for outcome in _push_outcomes(entry)
-        if not any(
-            outcome.target in pose.anchor.objects
-            for pose in entry.key_poses
-            if pose.sub_task == outcome.sub_task
-        )
-    }
-
-
-def _push_outcomes(entry: MemoryEntry) -> list[Outcome]:
-    """The outcomes of an entry's pushes.
-
-    A sub-task that also grasps its target is no push: the target goes where the hand carries it.
-    """
-    pushing, grasping = (
-        {pose.sub_task for pose in entry.key_poses if pose.phase == phase} for phase in ("push", "grasp")
-    )
-    return [one for one in entry.outcomes if one.sub_task in pushing - grasping]
 
 
 def rise(last: Target, height: float) -> tuple[Target, ...]:
@@ -322,6 +230,22 @@ def _retreat(targets: Sequence[Target]) -> tuple[Target, ...]:
     return (Target(contact.T_world_ee @ step, key_pose, precise=False),)
 
 
+def _equivalents(
+    pose: MemoryKeyPose,
+    object_poses: Mapping[str, Array],
+    chosen: Mapping[str, Array],
+    yaw_periods: Mapping[str, float],
+    before: Array,
+) -> dict[str, Array]:
+    """Which poses of a key pose's symmetric objects are meant, of those for which that is not chosen yet."""
+    new: dict[str, Array] = {}
+    for name in pose.anchor.objects:
+        if name not in chosen:
+            known = {**object_poses, **chosen, **new}
+            new[name] = _nearest_equivalent(name, pose, known, yaw_periods, before)
+    return new
+
+
 def _nearest_equivalent(
     name: str,
     pose: MemoryKeyPose,
@@ -334,11 +258,3 @@ def _nearest_equivalent(
     after = [transfer_pose(pose.anchor.frame({**object_poses, name: T}), pose.T_obj_ee) for T in choices]
     turns = [float(se3.distances(before, T)[1]) for T in after]
     return choices[int(np.argmin(turns))]
-
-
-def _heading(path: Array) -> float:
-    return float(np.arctan2(path[1, 1] - path[0, 1], path[1, 0] - path[0, 0]))
-
-
-def _length(path: Array) -> float:
-    return float(np.linalg.norm(path[1, :2] - path[0, :2]))

@@ -12,10 +12,8 @@ from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any, cast
 
 import numpy as np
-from scipy import optimize  # pyright: ignore[reportMissingTypeStubs]
 
 from lerobot_openspm.errors import CalibrationError
 from lerobot_openspm.geometry import se3
@@ -23,11 +21,21 @@ from lerobot_openspm.geometry.se3 import Array
 
 MAX_FILE_BYTES, MAX_JOINTS = 2**22, 32
 EE_LINK = "ee"
+# A pose that the joints miss by more than this is out of reach.
+OUT_OF_REACH_M, OUT_OF_REACH_RAD = 0.005, 0.05
 # Errors that count as much as one another when joints are sought, and as joints this far from where they
 # rest, which decides only where several positions put the hand there.
 SCALE_M, SCALE_RAD, SCALE_REST_RAD = 0.001, 0.01, 10.0
-# Steps of the search for joints.
-MAX_EVALUATIONS = 60
+SCALES = np.repeat([SCALE_M, SCALE_RAD], 3)
+# A squared error of that scale below which a pose is met: a hundredth of it.
+MET = 1e-4
+# The search ends after so many steps, or where so many did not bring the cost below such a share of it.
+MAX_STEPS, SETTLE_STEPS, SETTLED = 40, 5, 0.8
+# Damping as a share of the steepest joint's slope, and what it is multiplied by after a step for the better
+# or the worse.
+DAMPING, LESS_DAMPING, MORE_DAMPING = 0.01, 0.2, 4.0
+# Where joints are not found from where the arm stands, they are sought from so many other places.
+MORE_STARTS = 10
 
 
 @dataclass(frozen=True)
@@ -43,17 +51,6 @@ class Joint:
     T_before_joint: Array
     axis: Array
     limits: Array
-
-    def turned(self, angle: float) -> Array:
-        """The joint's frame ``(4, 4)`` at an angle, in that at angle 0: Rodrigues' formula."""
-        turn = np.eye(3) + np.sin(angle) * self._cross + (1 - np.cos(angle)) * self._cross @ self._cross
-        return se3.transform(turn, np.zeros(3))
-
-    @cached_property
-    def _cross(self) -> Array:
-        """The matrix ``(3, 3)`` of the cross product with the axis."""
-        x, y, z = self.axis
-        return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
 
 
 @dataclass(frozen=True)
@@ -73,63 +70,155 @@ class Arm:
         """The middle ``(n,)`` of every joint's range, radians."""
         return self._limits.mean(1)
 
-    @property
-    def _limits(self) -> Array:
-        return np.stack([joint.limits for joint in self.joints])
-
     def ee_pose(self, angles: Array) -> Array:
         """``T_world_ee`` ``(4, 4)`` at joint angles ``(n,)``, radians."""
-        return self._frames(angles)[-1]
+        return self._frames(np.asarray(angles, float)[None])[1][0]
 
-    def _frames(self, angles: Array) -> list[Array]:
-        """World poses of every joint at its angle, and of the hand."""
-        frames = [np.eye(4)]
-        for joint, angle in zip(self.joints, angles, strict=True):
-            frames.append(frames[-1] @ joint.T_before_joint @ joint.turned(angle))
-        return [*frames[1:], frames[-1] @ self.T_last_ee]
+    def stance(self, T_world_ee: Array) -> Array:
+        """Joint angles ``(n,)`` with which the hand is at a pose; others may do so too."""
+        return self.angles_for(T_world_ee, self.middle, self.middle)
 
     def angles_for(self, T_world_ee: Array, start: Array, rest: Array) -> Array:
         """Joint angles ``(n,)`` within the limits that bring the hand as near to a pose as they can.
+
+        They are sought from elsewhere too where they are not found from the start.
 
         Args:
             T_world_ee: Where the hand is to be ``(4, 4)``.
             start: Angles ``(n,)`` to begin from.
             rest: Angles ``(n,)`` that a redundant arm keeps near to.
         """
-        low, high = self._limits.T
-        weights = np.repeat([1 / SCALE_M, 1 / SCALE_RAD], 3)
+        found, is_met = self._sought(T_world_ee, np.stack([start, rest]), rest)
+        return found if is_met else self._sought(T_world_ee, np.stack([found, *self._elsewhere]), rest)[0]
 
-        def errors(angles: Array) -> Array:
-            T = self.ee_pose(angles)
-            turn = se3.log_so3(T[:3, :3] @ T_world_ee[:3, :3].T)
-            off = np.concatenate([T[:3, 3] - T_world_ee[:3, 3], turn])
-            return np.concatenate([weights * off, (angles - rest) / SCALE_REST_RAD])
-
-        def slopes(angles: Array) -> Array:
-            *frames, hand = self._frames(angles)
-            axes = np.stack([T[:3, :3] @ joint.axis for T, joint in zip(frames, self.joints, strict=True)])
-            arms = hand[:3, 3] - np.stack([T[:3, 3] for T in frames])
-            moves = np.concatenate([np.cross(axes, arms), axes], 1).T
-            kept = np.eye(len(angles)) / SCALE_REST_RAD
-            return np.asarray(np.concatenate([weights[:, None] * moves, kept]), float)
-
-        begin = np.clip(start, low, high)
-        solve = cast(Any, optimize).least_squares  # it has no stubs
-        found = solve(errors, begin, slopes, bounds=(low, high), max_nfev=MAX_EVALUATIONS)
-        return np.asarray(found.x, float)
-
-    def misses(self, poses: Iterable[Array], T_world_ee: Array) -> Iterator[tuple[float, float]]:
+    def misses(
+        self, poses: Iterable[Array], T_world_ee: Array, stance: Array | None = None
+    ) -> Iterator[tuple[float, float]]:
         """How far, metres and radians, the arm stays from each of some hand poses that it goes to in turn.
+
+        It goes on from how it stands, and is not bent the other way on its way.
 
         Args:
             poses: Where the hand is to be, ``(4, 4)`` each.
             T_world_ee: Where the hand is ``(4, 4)``; how the arm stands there is how it rests.
+            stance: Its joint angles ``(n,)`` there, if they were sought before.
         """
-        rest = angles = self.angles_for(T_world_ee, self.middle, self.middle)
+        rest = angles = self.stance(T_world_ee) if stance is None else stance
         for pose in poses:
-            angles = self.angles_for(pose, angles, rest)
-            metres, radians = se3.distances(self.ee_pose(angles), pose)
-            yield float(metres), float(radians)
+            angles, _ = self._sought(pose, np.stack([angles, rest]), rest)
+            yield self.miss(pose, angles)
+
+    def miss(self, T_world_ee: Array, angles: Array) -> tuple[float, float]:
+        """How far, metres and radians, the hand is from a pose ``(4, 4)`` at joint angles ``(n,)``."""
+        metres, radians = se3.distances(self.ee_pose(angles), T_world_ee)
+        return float(metres), float(radians)
+
+    def _sought(self, T_world_ee: Array, starts: Array, rest: Array) -> tuple[Array, bool]:
+        """The best joint angles ``(n,)`` found from any of some starts ``(s, n)``, and whether they do.
+
+        Levenberg and Marquardt's method, for all starts at once. A joint at its limit that would be turned
+        beyond it is held.
+        """
+        low, high = self._limits.T
+        angles, damping = np.clip(starts, low, high), np.full(len(starts), DAMPING)
+        off, slopes = self._errors(angles, T_world_ee)
+        costs = before = _costs(off, angles - rest)
+        for step in range(MAX_STEPS):
+            if (off**2).sum(1).min() < MET:
+                break
+            if step and step % SETTLE_STEPS == 0:
+                if (costs > SETTLED * before).all():
+                    break
+                before = costs
+            uphill = (slopes @ off[..., None])[..., 0] + (angles - rest) / SCALE_REST_RAD**2
+            free = ~((angles <= low) & (uphill > 0) | (angles >= high) & (uphill < 0))
+            change = _downhill(slopes * free[..., None], uphill * free, damping)
+            tried = np.clip(angles + change, low, high)
+            tried_off, tried_slopes = self._errors(tried, T_world_ee)
+            tried_costs = _costs(tried_off, tried - rest)
+            is_better = tried_costs < costs
+            damping = damping * np.where(is_better, LESS_DAMPING, MORE_DAMPING)
+            angles = np.where(is_better[:, None], tried, angles)
+            off = np.where(is_better[:, None], tried_off, off)
+            slopes = np.where(is_better[:, None, None], tried_slopes, slopes)
+            costs = np.where(is_better, tried_costs, costs)
+        best = int(np.argmin(costs))
+        return angles[best], bool((off[best] ** 2).sum() < MET)
+
+    def _errors(self, angles: Array, T_world_ee: Array) -> tuple[Array, Array]:
+        """How far the hand is off at angles ``(s, n)``, scaled ``(s, 6)``, and its slopes ``(s, n, 6)``."""
+        frames, hands = self._frames(angles)
+        off = np.concatenate(
+            [hands[:, :3, 3] - T_world_ee[:3, 3], _rotation_vectors(hands[:, :3, :3] @ T_world_ee[:3, :3].T)],
+            1,
+        )
+        axes = (frames[..., :3, :3] @ self._axes[..., None])[..., 0]
+        arms = hands[:, None, :3, 3] - frames[..., :3, 3]
+        moves = np.stack([
+            axes[..., 1] * arms[..., 2] - axes[..., 2] * arms[..., 1],
+            axes[..., 2] * arms[..., 0] - axes[..., 0] * arms[..., 2],
+            axes[..., 0] * arms[..., 1] - axes[..., 1] * arms[..., 0],
+        ], -1)  # fmt: skip
+        return off / SCALES, np.concatenate([moves, axes], -1) / SCALES
+
+    def _frames(self, angles: Array) -> tuple[Array, Array]:
+        """World poses ``(s, n, 4, 4)`` of the joints at angles ``(s, n)``, and of the hand ``(s, 4, 4)``."""
+        still, sine, versine = self._turning
+        turned = (
+            still + np.sin(angles)[..., None, None] * sine + (1 - np.cos(angles))[..., None, None] * versine
+        )
+        frames = [turned[:, 0]]
+        for i in range(1, len(self.joints)):
+            frames.append(frames[-1] @ turned[:, i])
+        return np.stack(frames, 1), frames[-1] @ self.T_last_ee
+
+    @cached_property
+    def _turning(self) -> tuple[Array, Array, Array]:
+        """Rodrigues' formula of every joint: its pose is ``A + sin(q) B + (1 - cos(q)) C``, ``(n, 4, 4)``."""
+        before = np.stack([joint.T_before_joint for joint in self.joints])
+        cross = np.zeros_like(before)
+        x, y, z = self._axes.T
+        cross[:, 2, 1], cross[:, 0, 2], cross[:, 1, 0] = x, y, z
+        cross -= cross.swapaxes(1, 2)
+        return before, before @ cross, before @ cross @ cross
+
+    @cached_property
+    def _axes(self) -> Array:
+        return np.stack([joint.axis for joint in self.joints])
+
+    @cached_property
+    def _limits(self) -> Array:
+        return np.stack([joint.limits for joint in self.joints])
+
+    @cached_property
+    def _elsewhere(self) -> Array:
+        """Joint angles ``(s, n)`` spread over the joints' ranges, always the same."""
+        low, high = self._limits.T
+        return np.random.default_rng(0).uniform(low, high, (MORE_STARTS, len(low)))
+
+
+def _costs(off: Array, from_rest: Array) -> Array:
+    """What is to be least ``(s,)``: scaled errors ``(s, 6)``, and a little the way ``(s, n)`` from rest."""
+    return (off**2).sum(1) + (from_rest**2).sum(1) / SCALE_REST_RAD**2
+
+
+def _downhill(slopes: Array, uphill: Array, damping: Array) -> Array:
+    """Steps of the joints ``(s, n)`` by slopes ``(s, n, 6)`` and gradients ``(s, n)`` of the cost."""
+    curvature = slopes @ slopes.swapaxes(1, 2)
+    steepest = curvature.diagonal(axis1=1, axis2=2).max(1)
+    added = (damping * steepest + 1 / SCALE_REST_RAD**2)[:, None, None] * np.eye(uphill.shape[1])
+    return np.asarray(-np.linalg.solve(curvature + added, uphill[..., None])[..., 0], float)
+
+
+def _rotation_vectors(R: Array) -> Array:
+    """Rotation vectors ``(s, 3)`` of rotation matrices, as :func:`se3.log_so3` but in a tenth of its time."""
+    cosines = (R.trace(axis1=1, axis2=2) - 1) / 2
+    if cosines.min() < -0.99:  # near half a turn the axis is not told by the difference
+        return se3.log_so3(R)
+    twice = R - R.swapaxes(1, 2)
+    axes = np.stack([twice[:, 2, 1], twice[:, 0, 2], twice[:, 1, 0]], 1) / 2
+    sines = np.sqrt((axes**2).sum(1))
+    return axes * (np.arctan2(sines, cosines) / np.maximum(sines, 1e-12))[:, None]
 
 
 def load_arm(path: Path) -> Arm:
