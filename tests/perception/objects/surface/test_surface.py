@@ -277,4 +277,4 @@ def test_a_record_that_lacks_an_array_is_refused(models, name):
 def test_the_shape_tells_by_what_an_object_turns_into_itself(models):
     assert models["cup"].symmetry.turn == 0
     assert models["block"].symmetry.turn == pytest.approx(np.pi)
-    assert models["block"].symmetry.middle == pytest.approx(models["block"].surface.middle)
+    assert models["block"].symmetry.middle == pytest.approx(models["block"].surface.middle, abs=0.004)

@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from lerobot_openspm.geometry.se3 import Array
 from lerobot_openspm.perception.objects.surface.compare import (
@@ -30,11 +31,13 @@ CORE_SHARE = 0.7
 AROUND_SHARE, AROUND_COST = 1.8, 0.5
 # Of all places these, where most looks like the object, are compared in every direction.
 KEPT_PLACES, MIN_PLACES, MAX_PLACES = 0.3, 600, 2000
-STARTS_PER_YAW, CANDIDATES, FINALISTS, MANY = 6, 4, 3, 12
+STARTS_PER_YAW, CANDIDATES, BEST_PER_YAW, FINALISTS, MANY = 6, 4, 2, 3, 12
 # All demonstrations show an object turned alike. Turned otherwise by more than this many radians, its
 # agreement counts this share.
 TURNED_RAD, TURNED_SHARE = 0.4, 0.95
 NUDGE_M = 0.006
+# Of an object with this radius a camera sees other sides in each area of this width, metres.
+LARGE_M, SEEN_ALIKE_M = 0.10, 0.25
 # Heights at which something may stand on other things are so far apart, metres.
 RISE_STEP_M = 0.025
 # Two candidates nearer than this are one, metres.
@@ -89,11 +92,11 @@ def search(
     """
     apart = max(SAME_PLACE_M, 0.3 * surface.radius)
     likely = _likely(surface, sights, ground)
-    starts = np.concatenate([_turned(surface, sights, likely, yaw, apart) for yaw in yaws])
-    starts[:, 4] *= [_likelihood(yaw) for yaw in starts[:, 3]]
+    # Few points tell directions badly, so that the best places for each of them are looked at more closely.
+    count = MANY if several else max(CANDIDATES // len(yaws), BEST_PER_YAW)
+    starts = [_distinct(_turned(surface, sights, likely, yaw, apart), apart, count)[:, :4] for yaw in yaws]
     places = [
-        refine(surface, sights, pose, freedom, QUICK_POINTS, QUICK_STEPS)
-        for pose in _distinct(starts, apart, MANY if several else CANDIDATES)[:, :4]
+        refine(surface, sights, pose, freedom, QUICK_POINTS, QUICK_STEPS) for pose in np.concatenate(starts)
     ]
     places = _ranked(places)
     finalists = places[:FINALISTS]
@@ -181,29 +184,44 @@ def _likely(surface: Surface, sights: Mapping[str, Sight], places: Array) -> Arr
 
 
 def _turned(surface: Surface, sights: Mapping[str, Sight], places: Array, yaw: float, apart: float) -> Array:
-    """The best poses and their agreement ``(k, 5)`` at places ``(q, 3)``, for one direction.
-
-    They are compared by the points that cameras see of the object in the middle of the places.
-    """
+    """The best poses and their agreement ``(k, 5)`` at places ``(q, 3)``, for one direction."""
     # The places are of the object's middle, which is not its frame's origin.
     offset = np.append(rotations(np.array([yaw]))[0][:2, :2] @ surface.middle, 0.0)
     poses = np.column_stack([places - offset, np.full(len(places), yaw)])
-    height, low, high = float(np.median(places[:, 2])), places[:, :2].min(0), places[:, :2].max(0)
-    coarse, quick = dict[str, Sample](), dict[str, Sample]()
+    areas = _areas(surface, places)
+    samples = [_seen_in(surface, sights, poses[areas == i]) for i in range(areas.max() + 1)]
+    scores = np.zeros(len(poses))
+    for i, seen in enumerate(samples):
+        coarse = {camera: sample.thinned(2) for camera, sample in seen.items()}
+        scores[areas == i] = agreement(coarse, sights, poses[areas == i], is_coarse=True)
+    around = np.stack([[a * NUDGE_M, b * NUDGE_M, 0, 0] for a in (-1, 0, 1) for b in (-1, 0, 1)])
+    found: list[Array] = []
+    for row in _distinct(np.column_stack([poses, scores, areas.astype(float)]), apart, STARTS_PER_YAW):
+        nudged = row[:4] + around
+        found.append(np.column_stack([nudged, agreement(samples[int(row[5])], sights, nudged)]))
+    return np.concatenate(found)
+
+
+def _areas(surface: Surface, places: Array) -> NDArray[np.int64]:
+    """Numbers ``(q,)`` of the areas of places ``(q, 3)`` in which a camera sees an object from one side."""
+    if surface.radius < LARGE_M:
+        return np.zeros(len(places), np.int64)
+    cells = np.floor(places[:, :2] / SEEN_ALIKE_M)
+    return np.asarray(np.unique(cells, axis=0, return_inverse=True)[1], np.int64).ravel()
+
+
+def _seen_in(surface: Surface, sights: Mapping[str, Sight], poses: Array) -> dict[str, Sample]:
+    """The points that each camera sees of an object at poses ``(q, 4)``, where it sees best."""
+    height, yaw = float(np.median(poses[:, 2])), float(poses[0, 3])
+    seen: dict[str, Sample] = {}
     for camera, sight in sights.items():
         T = sight.view.T_world_cam
         middle = T[:2, 3] + (height - T[2, 3]) / min(T[2, 2], -0.1) * T[:2, 2]
-        middle = np.clip(middle, low, high) - offset[:2]
+        middle = np.clip(middle, poses[:, :2].min(0), poses[:, :2].max(0))
         sample = take_sample(surface, sight, np.array([*middle, height, yaw]), QUICK_POINTS)
         if sample is not None:
-            coarse[camera], quick[camera] = sample.thinned(2), sample
-    if not coarse:
-        return np.column_stack([poses[:1], [0.0]])
-    scores = agreement(coarse, sights, poses, is_coarse=True)
-    best = _distinct(np.column_stack([poses, scores]), apart, STARTS_PER_YAW)[:, :4]
-    around = np.stack([[a * NUDGE_M, b * NUDGE_M, 0, 0] for a in (-1, 0, 1) for b in (-1, 0, 1)])
-    nudged = (best[:, None] + around).reshape(-1, 4)
-    return np.column_stack([nudged, agreement(quick, sights, nudged)])
+            seen[camera] = sample
+    return seen
 
 
 def _apart(pose: Array, other: Array, metres: float) -> bool:

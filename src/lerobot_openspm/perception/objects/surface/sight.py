@@ -18,7 +18,7 @@ from lerobot_openspm.types import Mask, Symmetry, View
 # Pictures are smoothed by a Gaussian of so many pixels at least, if they are 256 wide.
 FINEST = 0.6
 # Turned about its middle, a round object agrees with itself this well, CIELAB and share.
-ROUND_COLOUR, ROUND_SHARE, ROUND_SPACINGS = 20.0, 0.52, 3.0
+ROUND_COLOUR, ROUND_SHARE, ROUND_SPACINGS = 20.0, 0.7, 3.0
 # Turned about its middle, an object has the same shape if this share of its points comes this near to others.
 SAME_SHAPE_SHARE, SAME_SHAPE_SPACINGS = 0.7, 2.0
 # Colours this far apart, CIELAB, are alike in the search over the table.
@@ -70,18 +70,25 @@ class Surface:
     @cached_property
     def symmetry(self) -> Symmetry | None:
         """How its shape turns into itself, whatever its colours do; None if it does not."""
-        middle = np.append(self.middle, 0.0)
-        points = self.coloured - middle
-        tree, near = KDTree(points), SAME_SHAPE_SPACINGS * self.spacing
-
-        def same(degrees: int) -> bool:
-            R = se3.from_yaw(np.zeros(3), float(np.deg2rad(degrees)))[:3, :3]
-            return float((tree.query(points @ R.T)[0] < near).mean()) > SAME_SHAPE_SHARE
-
         for turn, others in ((0.0, (60, 90, 150, 180)), (np.pi / 2, (90, 180)), (np.pi, (180,))):
-            if all(map(same, others)):
-                return Symmetry(self.middle, turn)
+            shares, middles = zip(*(self._turned(degrees) for degrees in others), strict=True)
+            if min(shares) > SAME_SHAPE_SHARE:
+                return Symmetry(np.mean(middles, axis=0), turn)
         return None
+
+    def _turned(self, degrees: int) -> tuple[float, Array]:
+        """The share of the points that come near to others if turned, and about which middle ``(2,)``."""
+        points, at, share = self.coloured, np.append(self.middle, 0.0), 0.0
+        R = se3.from_yaw(np.zeros(3), float(np.deg2rad(degrees)))[:3, :3]
+        tree, near = KDTree(points), SAME_SHAPE_SPACINGS * self.spacing
+        for _ in range(3):
+            turned = (points - at) @ R.T + at
+            away, index = tree.query(turned)
+            share = float((away < near).mean())
+            # The middle that leaves the least distance between them.
+            shift = np.mean(points[index] - turned, axis=0)[:2]
+            at = at + np.append(np.linalg.solve(np.eye(2) - R[:2, :2], shift), 0.0)
+        return share, at[:2]
 
     @cached_property
     def is_round(self) -> bool:
