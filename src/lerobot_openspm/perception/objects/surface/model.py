@@ -66,6 +66,8 @@ YAWS = tuple(np.linspace(0, 2 * np.pi, 8, endpoint=False))
 # An object that agrees less than this share with its best place on the table may stand on something. That is
 # believed if it agrees this share, and the place on the table less than this share as well.
 CLEAR_SHARE, RAISED_SHARE, BETTER_SHARE = 0.9, 0.85, 0.93
+# What stands upright nowhere has tipped if it agrees by this share more than it would need to be found.
+TIPPED_MORE = 0.05
 
 
 @dataclass(frozen=True)
@@ -187,9 +189,9 @@ class SurfaceModel:
         )
 
     def _has_tipped(self, sights: Mapping[str, Sight]) -> bool:
-        """Whether it lies on the table; it has to agree as well as what stands on things."""
+        """Whether it lies on the table."""
         sides, table = lying(self.surface), self.backdrop.table_height
-        needed = max(self.found_share, RAISED_SHARE) * self.typical_agreement
+        needed = (self.found_share + TIPPED_MORE) * self.typical_agreement
         return has_tipped(sides, sights, self.backdrop.reach, table, YAWS, needed)
 
     @property
