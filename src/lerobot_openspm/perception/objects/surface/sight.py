@@ -18,7 +18,7 @@ from lerobot_openspm.types import Mask, Symmetry, View
 # Pictures are smoothed by a Gaussian of so many pixels at least, if they are 256 wide.
 FINEST = 0.6
 # Turned about its middle, a round object agrees with itself this well, CIELAB and share.
-ROUND_COLOUR, ROUND_SHARE, ROUND_SPACINGS = 20.0, 0.7, 3.0
+ROUND_COLOUR, ROUND_SHARE, ROUND_SPACINGS = 20.0, 0.52, 3.0
 # Turned about its middle, an object has the same shape if this share of its points comes this near to others.
 SAME_SHAPE_SHARE, SAME_SHAPE_SPACINGS = 0.7, 2.0
 # Colours this far apart, CIELAB, are alike in the search over the table.
