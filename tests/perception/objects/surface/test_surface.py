@@ -14,6 +14,7 @@ from lerobot_openspm.perception.objects.base import Look, localise_all
 from lerobot_openspm.perception.objects.kinds import learn_objects
 from lerobot_openspm.perception.objects.surface.compare import correlation
 from lerobot_openspm.perception.objects.surface.model import SurfaceModel
+from lerobot_openspm.perception.objects.surface.search import _areas
 from lerobot_openspm.types import ContactCue, DemonstrationScene, Moment
 
 HOME = (-0.05, 0.0, 0.45)
@@ -277,4 +278,29 @@ def test_a_record_that_lacks_an_array_is_refused(models, name):
 def test_the_shape_tells_by_what_an_object_turns_into_itself(models):
     assert models["cup"].symmetry.turn == 0
     assert models["block"].symmetry.turn == pytest.approx(np.pi)
-    assert models["block"].symmetry.middle == pytest.approx(models["block"].surface.middle, abs=0.004)
+    usual = se3.from_yaw((*MIDDLES["block"][:2], 0.0), 0.0)
+    T_world_frame = (
+        models["block"].localise(Look(views_at({"block": usual}, looking_down(*HOME)))).T_world_obj
+    )
+    middle = se3.apply(T_world_obj, np.array([[*models["block"].symmetry.middle, 0.0]]))[0, :2]
+    assert middle == pytest.approx(usual[:2, 3], abs=models["block"].surface.spacing)
+
+
+def test_of_large_objects_cameras_see_other_sides_elsewhere(models):
+    small = models["block"].surface
+    large = dataclasses.replace(small, points=3 * small.points)
+    places = np.array([[0.1, 0.1, 0.0], [0.2, 0.1, 0.0], [0.4, 0.1, 0.0], [0.1, -0.1, 0.0]])
+    assert list(_areas(small, places)) == [0, 0, 0, 0]
+    alike = _areas(large, places)
+    assert alike[0] == alike[1]
+    assert len(set(alike)) == 3
+
+
+def test_objects_of_one_memory_share_prepared_views(models):
+    read = [store.from_parts(*store.to_parts(models[name]), "here") for name in ("block", "cup")]
+    assert read[0].backdrop.key == read[1].backdrop.key
+    look = Look(views_at(moved(0.12, 0.12, 0.0), looking_down(*HOME)))
+    for model in read:
+        model.localise(look)
+    sights = [key for key in look._prepared if isinstance(key, tuple) and key[0] in look.views]
+    assert len(sights) == len(look.views)
