@@ -279,9 +279,8 @@ def test_the_shape_tells_by_what_an_object_turns_into_itself(models):
     assert models["cup"].symmetry.turn == 0
     assert models["block"].symmetry.turn == pytest.approx(np.pi)
     usual = se3.from_yaw((*MIDDLES["block"][:2], 0.0), 0.0)
-    T_world_frame = (
-        models["block"].localise(Look(views_at({"block": usual}, looking_down(*HOME)))).T_world_obj
-    )
+    look = Look(views_at({"block": usual}, looking_down(*HOME)))
+    T_world_obj = models["block"].localise(look).T_world_obj
     middle = se3.apply(T_world_obj, np.array([[*models["block"].symmetry.middle, 0.0]]))[0, :2]
     assert middle == pytest.approx(usual[:2, 3], abs=models["block"].surface.spacing)
 
