@@ -14,6 +14,7 @@ from lerobot_openspm.geometry import se3
 from lerobot_openspm.perception.objects import store
 from lerobot_openspm.perception.objects.kinds import learn_objects
 from lerobot_openspm.perception.objects.patches.learn import learn_patches
+from lerobot_openspm.perception.objects.patches.match import correlations
 from lerobot_openspm.perception.objects.patches.model import PatchModel
 from lerobot_openspm.types import ContactCue, DemonstrationScene
 
@@ -169,6 +170,37 @@ def test_a_camera_that_moved_does_not_help(models, unseen):
 def test_what_is_not_there_is_not_found(models, unseen):
     empty = {name: T for name, T in unseen[0].items() if name == "distractor"}
     assert localise(views_of(empty), models["cup"]).status == "not_found"
+
+
+@pytest.mark.parametrize(("size", "at"), [((15, 15), (3, 9)), ((40, 23), (0, 0)), ((7, 50), (11, 2))])
+def test_correlations_are_those_of_opencv(size, at):
+    height, width = size
+    pixels = np.random.default_rng(0).integers(0, 255, (height + 12, width + 10, 3), dtype=np.uint8)
+    window = cv2.GaussianBlur(pixels, (5, 5), 2)
+    patch = window[at[0] : at[0] + height, at[1] : at[1] + width].copy()
+    told = correlations(window, patch)
+    np.testing.assert_allclose(told, cv2.matchTemplate(window, patch, cv2.TM_CCOEFF_NORMED), atol=1e-4)
+    assert np.unravel_index(told.argmax(), told.shape) == at
+
+
+@pytest.mark.parametrize("level", [0, 7, 255])
+def test_what_is_all_alike_correlates_with_nothing(level):
+    window, patch = (
+        np.full((30, 30, 3), level, np.uint8),
+        np.random.default_rng(0).integers(0, 255, (9, 9, 3)),
+    )
+    assert not correlations(window, patch.astype(np.uint8)).any()
+    assert not correlations(
+        np.tile(patch, (2, 2, 1)).astype(np.uint8), np.full((9, 9, 3), level, np.uint8)
+    ).any()
+
+
+@pytest.mark.parametrize(
+    ("away_m", "margin_m", "told"), [(0.0, 0.0, True), (0.08, 0.0, False), (0.08, 0.08, True)]
+)
+def test_patches_reach_as_far_as_they_are_sought(models, away_m, margin_m, told):
+    x, y, z = models["cup"].probes[0].patches[0].point_world
+    assert models["cup"].reaches(se3.from_yaw([x + away_m, y, z], 0.0), margin_m) == told
 
 
 def test_store_round_trip(models):

@@ -13,6 +13,8 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
+from itertools import islice
 
 import cv2
 import numpy as np
@@ -84,7 +86,7 @@ class _Trail:
         """In how many scenes the patch was found."""
         return int(np.isfinite(self.points[:, 0]).sum())
 
-    @property
+    @cached_property
     def motion(self) -> Array:
         """Displacements ``(n, 2)`` from the median place."""
         return self.points - np.nanmedian(self.points, axis=0)
@@ -256,8 +258,8 @@ def _claimed(trail: _Trail, scenes: Sequence[DemonstrationScene], known: Iterabl
 def _model(name: str, group: Sequence[_Trail], scenes: Sequence[DemonstrationScene]) -> PatchModel | None:
     """The object that a group follows; None if it turns."""
     # Of one place, so that all know the same point of the object.
-    kept = [trail for trail in group if trail.place == group[0].place]
-    kept = [trail for trail in kept if not _turns(trail, scenes)][:MAX_PROBES]
+    same = (trail for trail in group if trail.place == group[0].place)
+    kept = list(islice((trail for trail in same if not _turns(trail, scenes)), MAX_PROBES))
     if not kept:
         return None
     agreed = _agreed(kept)

@@ -9,10 +9,12 @@ Which patches to use is learned (:mod:`lerobot_openspm.perception.objects.patche
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from scipy.fft import next_fast_len
 
 from lerobot_openspm.geometry import se3
 from lerobot_openspm.geometry.camera import Camera, project
@@ -26,6 +28,8 @@ REACH_M = 0.035
 MIN_PATCH_PX = 7
 # A patch with less contrast than this, in CIELAB levels, is found everywhere.
 MIN_CONTRAST = 4.0
+# Variance per pixel, CIELAB levels squared, below which pixels are all alike but for rounding.
+MIN_SPREAD = 1e-3
 # A hand camera sees the patch as in the demonstrations only from the same place.
 MAX_CAMERA_SHIFT_M, MAX_CAMERA_TURN_RAD = 0.02, 0.10
 # A patch of which more is hidden is not looked for.
@@ -114,7 +118,7 @@ def match(patch: Patch, probe: Probe, view: View) -> Sight | None:
     window = view.image[low[1] : high[1], low[0] : high[0]]
     if window.shape[0] < height or window.shape[1] < width:
         return None
-    scores = np.asarray(cv2.matchTemplate(_lab(window), patch.image, cv2.TM_CCOEFF_NORMED), np.float32)
+    scores = correlations(_lab(window), patch.image)
     _, correlation, _, (u, v) = cv2.minMaxLoc(scores)
     shift = np.add(low, [u + _vertex(scores[v], u), v + _vertex(scores[:, u], v)]) - expected
     # How the projection moves as the point does, on its horizontal plane.
@@ -122,6 +126,34 @@ def match(patch: Patch, probe: Probe, view: View) -> Sight | None:
     return Sight(
         patch.point_world + np.append(np.linalg.solve((moved - uv).T / 1e-3, shift), 0.0), float(correlation)
     )
+
+
+def correlations(window: Picture, patch: Picture) -> NDArray[np.float32]:
+    """Normalised correlation of a patch ``(h, w, 3)`` with each place of a window ``(H, W, 3)``.
+
+    OpenCV's TM_CCOEFF_NORMED; on three channels that takes five to ten times as long.
+
+    Returns:
+        Correlations ``(H - h + 1, W - w + 1)``, all channels together; 0 where either has no contrast.
+    """
+    height, width = patch.shape[:2]
+    rows, columns = window.shape[0] - height + 1, window.shape[1] - width + 1
+    size = [next_fast_len(n, real=True) or n for n in window.shape[:2]]
+    centred = patch - patch.mean((0, 1), dtype=np.float32)
+    spectrum = np.fft.rfft2(window.astype(np.float32), size, (0, 1))
+    own = np.fft.rfft2(centred, size, (0, 1)).conj()
+    covariance = np.fft.irfft2((spectrum * own).sum(-1), size)[:rows, :columns]
+    sums, squares = (_boxes(table, height, width) for table in cv2.integral2(window))
+    spread = (squares - sums**2 / (height * width)).sum(-1) * float((centred**2).sum())
+    scale = np.sqrt(np.maximum(spread, 0.0))
+    has_contrast = scale > MIN_SPREAD * height * width
+    return np.where(has_contrast, covariance / np.where(has_contrast, scale, 1.0), 0.0).astype(np.float32)
+
+
+def _boxes(integral: NDArray[Any], height: int, width: int) -> Array:
+    """Sums over all boxes of a size, from an integral image."""
+    below, above = integral[height:].astype(float), integral[:-height].astype(float)
+    return below[:, width:] - below[:, :-width] - above[:, width:] + above[:, :-width]
 
 
 def _vertex(scores: NDArray[np.float32], best: int) -> float:

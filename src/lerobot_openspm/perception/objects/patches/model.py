@@ -125,8 +125,13 @@ class PatchModel:
             return True
         if abs(T_expected[2, 3] - self.height) > MAX_LIFT_M:
             return False
+        return is_found or self.reaches(T_expected)
+
+    def reaches(self, T_world_obj: Array, margin_m: float = 0.0) -> bool:
+        """Whether an object at a pose ``(4, 4)`` is where the patches are sought, or as far from there."""
         places = np.stack([patch.point_world[:2] for probe in self.probes for patch in probe.patches])
-        return is_found or bool(np.linalg.norm(places - T_expected[:2, 3], axis=1).min() <= REACH_M)
+        away_m = np.linalg.norm(places - T_world_obj[:2, 3], axis=1).min()
+        return bool(away_m <= REACH_M + margin_m)
 
     def to_record(self) -> Record:
         """See :class:`lerobot_openspm.perception.objects.base.KnownObject`."""
