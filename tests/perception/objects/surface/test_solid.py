@@ -8,7 +8,7 @@ from lerobot_openspm.geometry import se3
 from lerobot_openspm.geometry.camera import Camera, ray_directions
 from lerobot_openspm.perception.objects.surface.backdrop import learn_backdrop
 from lerobot_openspm.perception.objects.surface.carving import Frame, Frames
-from lerobot_openspm.perception.objects.surface.solid import Solid, carve_by_colour
+from lerobot_openspm.perception.objects.surface.solid import Depths, Solid, carve_by_colour
 from lerobot_openspm.types import View
 
 CELL = 0.01
@@ -69,7 +69,7 @@ def test_what_pictures_disagree_about_is_taken_out_down_to_where_they_agree():
     for place in PLACES:
         view, shown = picture(looking_down(*place), top, texture, CELL / 2)
         frames.append(Frame("hand", view, shown, None, {"mat": np.eye(4)}))
-    carved = carve_by_colour(Frames("mat", frames), block(16, 9), {})
+    carved = carve_by_colour(Frames("mat", frames), block(16, 9), Depths({}))
     heights = carved.filled[4:-4, 4:-4].sum(-1)
     assert 4 <= np.median(heights) <= 5
     assert (np.abs(heights - 4) <= 2).mean() > 0.85
@@ -81,7 +81,7 @@ def test_only_the_largest_piece_is_kept():
     alone[0, 0, 0] = True
     view, shown = picture(looking_down(*PLACES[0]), 0.0, np.zeros((1, 1, 3)), CELL)
     frames = Frames("block", [Frame("hand", view, shown, None, {"block": np.eye(4)})])
-    kept = carve_by_colour(frames, Solid(solid.x, solid.z, alone), {})
+    kept = carve_by_colour(frames, Solid(solid.x, solid.z, alone), Depths({}))
     assert_array_equal(kept.filled, solid.filled)
 
 

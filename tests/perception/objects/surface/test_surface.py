@@ -12,6 +12,7 @@ from lerobot_openspm.geometry.camera import project
 from lerobot_openspm.perception.objects import store
 from lerobot_openspm.perception.objects.base import Look, localise_all
 from lerobot_openspm.perception.objects.kinds import learn_objects
+from lerobot_openspm.perception.objects.surface import model as model_module
 from lerobot_openspm.perception.objects.surface.compare import correlation
 from lerobot_openspm.perception.objects.surface.model import SurfaceModel
 from lerobot_openspm.perception.objects.surface.search import _areas
@@ -119,6 +120,15 @@ def test_what_lies_on_its_side_is_not_found_and_said_to_have_tipped(models):
     assert (found.status, found.tipped) == ("not_found", True)
     away = models["cup"].localise(Look(views_at(moved(0.12, 0.12, 0.0), looking_down(*HOME))))
     assert (away.status, away.tipped) == ("not_found", False)
+
+
+def test_pictures_are_searched_once_for_what_has_tipped(models, monkeypatch):
+    searched = []
+    monkeypatch.setattr(model_module, "has_tipped", lambda *_: bool(searched.append(1)))
+    scene = {"block": se3.from_yaw([0.05, 0.1, 0.0], 0.4)}  # on which the missing cup is sought as well
+    found = localise_all(models, Look(views_at(scene, looking_down(*HOME))))
+    assert found["cup"].status == "not_found"
+    assert searched == [1]
 
 
 def test_what_stands_on_another_is_found_at_its_height(models):

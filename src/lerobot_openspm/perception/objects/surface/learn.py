@@ -23,7 +23,7 @@ from lerobot_openspm.perception.objects.surface.relief import WEIGHTS, find_reli
 from lerobot_openspm.perception.objects.surface.search import Freedom, over_table, search
 from lerobot_openspm.perception.objects.surface.sight import Sight, Surface, sight_of
 from lerobot_openspm.perception.objects.surface.solid import (
-    Drawn,
+    Depths,
     Solid,
     carve_by_colour,
     colours_of,
@@ -51,6 +51,9 @@ RIVAL_SCENES, MARGIN_PX = 6, 6
 # An object with fewer coloured points gets no surface.
 MIN_COLOURED = 40
 
+# The views of the demonstrations' first moments, and where an object stands in each: ``T_world_obj`` (4, 4).
+Standing = Sequence[tuple[Mapping[str, View], Array]]
+
 
 def learn_surfaces(examples: Examples) -> dict[str, SurfaceModel | PatchModel]:
     """Learn what hardly moves between demonstrations: its patches, and its surface where there are films."""
@@ -64,13 +67,15 @@ def _learn_surfaces(near: Mapping[str, PatchModel], examples: Examples) -> dict[
     if backdrop is None:
         return {}
     scenes = [scene for scene, _ in films]
-    touched = {name: _touched(name, scenes, model) for name, model in near.items()}
+    first = [_first_poses(scene, near) for scene in scenes]
+    touched = {name: _touched(name, scenes, first) for name in near}
     heights = {name: model.height for name, model in near.items()}
-    surfaces = build_surfaces(_frames(films, near, backdrop), touched, heights, backdrop)
+    surfaces = build_surfaces(_frames(films, first, backdrop), touched, heights, backdrop)
     models = {}
     for name, surface in surfaces.items():
-        surface = replace(surface, pattern=_pattern(name, surface, scenes, near[name], backdrop))
-        typical, rival = _agreements(name, surface, scenes, near[name], backdrop)
+        standing = [(scene.views, T[name]) for scene, T in zip(scenes, first, strict=True) if name in T]
+        surface = replace(surface, pattern=_pattern(surface, standing, backdrop))
+        typical, rival = _agreements(surface, standing, backdrop)
         models[name] = SurfaceModel(name, surface, backdrop, heights[name], typical, rival, near[name])
         logger.info("surface of %s: %d coloured points, agreement %.2f, without it %.2f",
                     name, len(surface.coloured), typical, rival)  # fmt: skip
@@ -98,12 +103,11 @@ def _first_poses(scene: DemonstrationScene, near: Mapping[str, PatchModel]) -> d
 
 def _frames(
     films: Sequence[tuple[DemonstrationScene, Sequence[Moment]]],
-    near: Mapping[str, PatchModel],
+    first: Sequence[Mapping[str, Array]],
     backdrop: Backdrop,
 ) -> list[Frame]:
     frames = []
-    for scene, moments in films:
-        poses = _first_poses(scene, near)
+    for (_, moments), poses in zip(films, first, strict=True):
         for moment in moments:
             standing = {name: T for name, T in poses.items() if name not in moment.moved}
             for camera, view in moment.views.items():
@@ -112,14 +116,14 @@ def _frames(
     return frames
 
 
-def _touched(name: str, scenes: Sequence[DemonstrationScene], model: PatchModel) -> Array:
+def _touched(name: str, scenes: Sequence[DemonstrationScene], first: Sequence[Mapping[str, Array]]) -> Array:
     """Points ``(k, 3)`` in the object's frame at which it was touched."""
-    points = []
-    for scene in scenes:
-        own = [cue.point_world for cue in scene.cues if cue.name == name]
-        found = model.localise(Look(scene.views)) if own else None
-        if found is not None and found.status == "found":
-            points += [se3.apply(se3.inverse(found.T_world_obj), point) for point in own]
+    points = [
+        se3.apply(se3.inverse(poses[name]), cue.point_world)
+        for scene, poses in zip(scenes, first, strict=True)
+        for cue in scene.cues
+        if cue.name == name and name in poses
+    ]
     return np.array(points).reshape(-1, 3)
 
 
@@ -143,22 +147,22 @@ def build_surfaces(
         if space is not None:
             carved[name], solids[name] = space, solid_under(find_relief(own[name], space), space)
     for _ in range(ROUNDS):
-        drawn = {name: solid.drawn for name, solid in solids.items()}
+        depths = Depths(solids)
         solids = {
-            name: fill_silhouettes(own[name], carved[name], solid, drawn) for name, solid in solids.items()
+            name: fill_silhouettes(own[name], carved[name], solid, depths) for name, solid in solids.items()
         }
-    drawn = {name: solid.drawn for name, solid in solids.items()}
-    solids = {name: carve_by_colour(own[name], solid, drawn) for name, solid in solids.items()}
-    drawn = {name: solid.drawn for name, solid in solids.items()}
-    surfaces = {name: _coloured(own[name], solid, drawn) for name, solid in solids.items()}
+    depths = Depths(solids)
+    solids = {name: carve_by_colour(own[name], solid, depths) for name, solid in solids.items()}
+    depths = Depths(solids)
+    surfaces = {name: _coloured(own[name], solid, depths) for name, solid in solids.items()}
     return {name: one for name, one in surfaces.items() if len(one.coloured) >= MIN_COLOURED}
 
 
-def _coloured(frames: Frames, solid: Solid, drawn: Drawn) -> Surface:
+def _coloured(frames: Frames, solid: Solid, depths: Depths) -> Surface:
     """A solid's points with the colours that the pictures agree about."""
     points, normals = solid.points, solid.normals
     seen: dict[str, list[Float32]] = {"world": [], "ee": []}
-    for frame, colours in colours_of(frames, solid, drawn):
+    for frame, colours in colours_of(frames, solid, depths):
         seen[frame.view.camera.mount].append(colours)
     fixed, hand = (_middle(seen[mount], len(points)) for mount in ("world", "ee"))
     middle, spread, count = hand
@@ -202,41 +206,31 @@ def _completed(points: Array, normals: Array, colours: Array) -> Float32:
     return done
 
 
-def _pattern(
-    name: str, surface: Surface, scenes: Sequence[DemonstrationScene], near: PatchModel, backdrop: Backdrop
-) -> float:
+def _pattern(surface: Surface, standing: Standing, backdrop: Backdrop) -> float:
     """How much the pattern of an object tells, from 0 to 1: by how well the demonstrations show it."""
     seen = []
-    for scene in scenes:
-        T = _first_poses(scene, {name: near}).get(name)
-        if T is not None:
-            sights = {c: sight_of(view, c, backdrop, None) for c, view in scene.views.items()}
-            seen.append(correlation_at(surface, sights, np.array([*T[:3, 3], 0.0])))
+    for views, T in standing:
+        sights = {c: sight_of(view, c, backdrop, None) for c, view in views.items()}
+        seen.append(correlation_at(surface, sights, np.array([*T[:3, 3], 0.0])))
     low, high = PATTERN_SEEN
     return float(np.clip((np.median(seen) - low) / (high - low), 0, 1)) if seen else 0.0
 
 
-def _agreements(
-    name: str, surface: Surface, scenes: Sequence[DemonstrationScene], near: PatchModel, backdrop: Backdrop
-) -> tuple[float, float]:
+def _agreements(surface: Surface, standing: Standing, backdrop: Backdrop) -> tuple[float, float]:
     """How well first pictures agree with the object where it stands, and with the best place without it.
 
     The first is the median of demonstrations, the second the most of some of them.
     """
     own, rivals = [], []
-    standing = [(scene, _first_poses(scene, {name: near}).get(name)) for scene in scenes]
-    found = [(scene, T) for scene, T in standing if T is not None]
-    searched = (
-        {id(found[i][0]) for i in np.linspace(0, len(found) - 1, RIVAL_SCENES).astype(int)} if found else ()
-    )
-    for scene, T in found:
-        sights = {c: sight_of(view, c, backdrop, None) for c, view in scene.views.items()}
+    searched = np.linspace(0, len(standing) - 1, RIVAL_SCENES).astype(int)
+    for i, (views, T) in enumerate(standing):
+        sights = {c: sight_of(view, c, backdrop, None) for c, view in views.items()}
         own.append(score_at(surface, sights, np.array([*T[:3, 3], 0.0])))
-        if id(scene) in searched:
+        if i in searched:
             world = se3.apply(T, surface.points)
             without = {
                 c: sight_of(view, c, backdrop, _covered(view, world, surface.spacing))
-                for c, view in scene.views.items()
+                for c, view in views.items()
             }
             rivals.append(_best_on_table(surface, without, backdrop, float(T[2, 3])))
     typical = float(np.clip(np.median(own), 0.05, 1.0)) if own else 0.05

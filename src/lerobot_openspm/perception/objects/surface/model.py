@@ -118,17 +118,16 @@ class SurfaceModel:
 
     def localise(self, look: Look) -> PoseEstimate:
         """Find the object: where it stood in the demonstrations, where it is expected, or anywhere."""
-        near, expected = self.near.localise(look), look.expected.get(self.name)
+        expected = look.expected.get(self.name)
+        there = None if expected is None or not self._is_away(expected) else self._at(look, expected)
+        if there is not None and (followed := _followed(there)).status == "found":
+            return followed
+        near = self.near.localise(look)
+        if expected is not None and self._is_lifted(expected):
+            return near  # in the hand, or where that put it, it is hidden more often than gone
         if near.status == "found" and expected is not None and _apart_m(near, expected) < FOLLOWED_M:
             return near
-        sights = {
-            camera: look.prepared((camera, self.backdrop.key), partial(self._sight, look, camera))
-            for camera in look.views
-        }
-        if expected is not None and expected[2, 3] - self.height > LIFTED_M:
-            # In the hand, or where that put it, it is hidden more often than gone.
-            seen = _followed(self._estimate(look, sights, [self._refined(sights, expected)]))
-            return seen if seen.status == "found" else near
+        sights = self._sights(look)
         if self.name in look.told_apart and expected is None:
             return self._estimate(look, sights, self._all_places(look, sights))
         near_score = 0.0
@@ -137,9 +136,9 @@ class SurfaceModel:
             if near_score >= BELIEVED_SHARE * self.typical_agreement:
                 return near
         if expected is not None:
-            seen = self._estimate(look, sights, [self._refined(sights, expected)])
-            if seen.confidence >= GONE_SHARE:
-                return _followed(seen)
+            there = there or self._at(look, expected)
+            if there.confidence >= GONE_SHARE:
+                return _followed(there)
         places = self._anywhere(look, sights)
         if near_score > BETTER_SHARE * places[0].score:  # something may stand on it
             return replace(near, confidence=min(near.confidence, near_score / self.typical_agreement))
@@ -147,9 +146,28 @@ class SurfaceModel:
         if found.status == "found":
             return found
         if expected is None:
-            return replace(found, tipped=found.status == "not_found" and self._has_tipped(sights))
+            return replace(found, tipped=found.status == "not_found" and self._has_tipped(look, sights))
         # Where its patches cannot tell that it is gone, it may be hidden.
         return replace(found, visible=min(found.visible, near.visible))
+
+    def _is_lifted(self, T_expected: Array) -> bool:
+        return bool(T_expected[2, 3] - self.height > LIFTED_M)
+
+    def _is_away(self, T_expected: Array) -> bool:
+        """Whether its patches cannot show it where it is expected."""
+        return self._is_lifted(T_expected) or not self.near.reaches(T_expected, FOLLOWED_M)
+
+    def _at(self, look: Look, T_expected: Array) -> PoseEstimate:
+        """What is seen of it around where it is expected."""
+        sights = self._sights(look)
+        return self._estimate(look, sights, [self._refined(sights, T_expected)])
+
+    def _sights(self, look: Look) -> dict[str, Sight]:
+        """The views as surfaces are compared with them, prepared once for all objects."""
+        return {
+            camera: look.prepared((camera, self.backdrop.key), partial(self._sight, look, camera))
+            for camera in look.views
+        }
 
     def _sight(self, look: Look, camera: str) -> Sight:
         return sight_of(look.views[camera], camera, self.backdrop, look.hidden.get(camera))
@@ -188,11 +206,12 @@ class SurfaceModel:
             self.surface, sights, ground, self._yaws, Freedom(not self.surface.is_round, lifts=True), several
         )
 
-    def _has_tipped(self, sights: Mapping[str, Sight]) -> bool:
+    def _has_tipped(self, look: Look, sights: Mapping[str, Sight]) -> bool:
         """Whether it lies on the table."""
         sides, table = lying(self.surface), self.backdrop.table_height
         needed = (self.found_share + TIPPED_MORE) * self.typical_agreement
-        return has_tipped(sides, sights, self.backdrop.reach, table, YAWS, needed)
+        told = partial(has_tipped, sides, sights, self.backdrop.reach, table, YAWS, needed)
+        return look.prepared((self.name, id(self), "tipped"), told)
 
     @property
     def _yaws(self) -> tuple[float, ...]:

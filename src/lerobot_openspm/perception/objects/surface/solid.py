@@ -33,9 +33,6 @@ SWEEPS = 12
 # A camera sees a cell that is at most this many cells behind the nearest one.
 DEPTH_CELLS = 1.5
 
-# By object: points ``(n, 3)`` of its surface in its own frame, and their spacing in metres.
-Drawn = Mapping[str, tuple[Array, float]]
-
 
 @dataclass(frozen=True)
 class Solid:
@@ -70,10 +67,38 @@ class Solid:
         out = -np.stack([slope[..., 3:][self.surface] for slope in slopes], -1)
         return out / np.maximum(np.linalg.norm(out, axis=1, keepdims=True), 1e-9)
 
-    @property
-    def drawn(self) -> tuple[Array, float]:
-        """The points and their spacing."""
-        return self.points, self.cell
+    def depth(self, frame: Frame, name: str) -> Float32:
+        """Depth ``(H, W)`` of the surface in a picture in which the object of that name stands."""
+        return silhouette(frame, se3.apply(frame.standing[name], self.points), self.cell)
+
+
+class Depths:
+    """How far away the surfaces of standing objects are in each picture; each is drawn once."""
+
+    def __init__(self, solids: Mapping[str, Solid]) -> None:
+        """Take the objects by name."""
+        self._solids = solids
+        self._drawn: dict[tuple[str, int], Float32] = {}
+        self._frames: list[Frame] = []  # kept, so that no other frame gets the id of one of them
+
+    def nearest(self, frame: Frame, besides: str = "") -> Float32:
+        """Depth ``(H, W)`` of the nearest surface, except one object's; infinite where there is none."""
+        height, width = frame.view.image.shape[:2]
+        names = [name for name in frame.standing if name in self._solids and name != besides]
+        depths = [self._depth(frame, name) for name in names]
+        return np.min(depths, axis=0) if depths else np.full((height, width), np.inf, np.float32)
+
+    def covered(self, frame: Frame) -> Mask:
+        """Pixels ``(H, W)`` that the surfaces explain."""
+        covered = np.isfinite(self.nearest(frame)).astype(np.uint8)
+        return cv2.dilate(covered, np.ones((3, 3), np.uint8)).astype(bool)
+
+    def _depth(self, frame: Frame, name: str) -> Float32:
+        key = name, id(frame)
+        if key not in self._drawn:
+            self._frames.append(frame)
+            self._drawn[key] = self._solids[name].depth(frame, name)
+        return self._drawn[key]
 
 
 def solid_under(top: NDArray[np.int64], carved: Carved) -> Solid:
@@ -81,14 +106,14 @@ def solid_under(top: NDArray[np.int64], carved: Carved) -> Solid:
     return Solid(carved.x, carved.z, carved.solid & (np.arange(len(carved.z)) <= top[..., None]))
 
 
-def fill_silhouettes(frames: Frames, carved: Carved, solid: Solid, drawn: Drawn) -> Solid:
+def fill_silhouettes(frames: Frames, carved: Carved, solid: Solid, depths: Depths) -> Solid:
     """Raise a solid to where pictures show something that no object's surface explains.
 
     Args:
         frames: The frames in which the object stands.
         carved: The space that it may take.
         solid: What of it is filled so far.
-        drawn: The surfaces of all objects, this one too.
+        depths: The surfaces of all objects, this one too.
     """
     columns: Mask = np.any(solid.filled, axis=-1)
     top = np.where(columns, solid.filled.shape[2] - 1 - solid.filled[..., ::-1].argmax(-1), -1)
@@ -97,7 +122,7 @@ def fill_silhouettes(frames: Frames, carved: Carved, solid: Solid, drawn: Drawn)
     points = carved.points[above]
     seen, unexplained = np.zeros(len(points)), np.zeros(len(points))
     for frame in frames.distinct:
-        explained = _covered(frame, drawn)
+        explained = depths.covered(frame)
         rows, cols, _, inside = frame.look(se3.apply(frame.standing[frames.name], points))
         seen += inside
         unexplained += inside & frame.foreground[rows, cols] & ~explained[rows, cols]
@@ -107,10 +132,10 @@ def fill_silhouettes(frames: Frames, carved: Carved, solid: Solid, drawn: Drawn)
     return replace(solid, filled=solid.filled | (above & (layers <= new_top[..., None])))
 
 
-def carve_by_colour(frames: Frames, solid: Solid, drawn: Drawn) -> Solid:
+def carve_by_colour(frames: Frames, solid: Solid, depths: Depths) -> Solid:
     """Take out cells of the surface that pictures disagree about, until they agree about all."""
     for _ in range(SWEEPS):
-        seen = colours_of(frames, solid, {**drawn, frames.name: solid.drawn})
+        seen = colours_of(frames, solid, depths)
         gone = disagreement(np.stack([colours for _, colours in seen]), 0.0) > INCONSISTENT
         if gone.sum() < 1e-3 * len(gone):
             break
@@ -128,8 +153,14 @@ def _largest_piece(filled: Mask) -> Mask:
     return np.asarray(pieces == 1 + int(np.bincount(pieces.ravel())[1:].argmax()))
 
 
-def colours_of(frames: Frames, solid: Solid, drawn: Drawn) -> list[tuple[Frame, Float32]]:
-    """How each picture shows the points of a surface: CIELAB ``(k, 3)``, not a number where it does not."""
+def colours_of(frames: Frames, solid: Solid, depths: Depths) -> list[tuple[Frame, Float32]]:
+    """How each picture shows the points of a surface: CIELAB ``(k, 3)``, not a number where it does not.
+
+    Args:
+        frames: The frames in which the object stands.
+        solid: The object.
+        depths: The surfaces of the other objects, which may be before it.
+    """
     points, normals, seen = solid.points, solid.normals, list[tuple[Frame, Float32]]()
     for frame in frames.distinct:
         T, view = frame.standing[frames.name], frame.view
@@ -137,25 +168,9 @@ def colours_of(frames: Frames, solid: Solid, drawn: Drawn) -> list[tuple[Frame, 
         rows, columns, depth, inside = frame.look(world)
         facing = ((world - view.T_world_cam[:3, 3]) * (normals @ T[:3, :3].T)).sum(1) < 0
         shown = inside & facing & frame.foreground[rows, columns]
-        shown &= depth <= depth_of_all(frame, drawn)[rows, columns] + DEPTH_CELLS * solid.cell
+        nearest = np.minimum(depths.nearest(frame, besides=frames.name), solid.depth(frame, frames.name))
+        shown &= depth <= nearest[rows, columns] + DEPTH_CELLS * solid.cell
         colours = sample(frame.colours, view.camera, view.T_world_cam, world, frame.hidden)
         colours[~shown] = np.nan
         seen.append((frame, colours))
     return seen
-
-
-def depth_of_all(frame: Frame, drawn: Drawn) -> Array:
-    """Depth ``(H, W)`` of the nearest surface of the standing objects; infinite where there is none."""
-    depths = [
-        silhouette(frame, se3.apply(T, drawn[name][0]), drawn[name][1])
-        for name, T in frame.standing.items()
-        if name in drawn
-    ]
-    height, width = frame.view.image.shape[:2]
-    return np.min(np.stack(depths), axis=0).astype(float) if depths else np.full((height, width), np.inf)
-
-
-def _covered(frame: Frame, drawn: Drawn) -> Mask:
-    """Pixels ``(H, W)`` that the surfaces of standing objects explain."""
-    covered = np.isfinite(depth_of_all(frame, drawn)).astype(np.uint8)
-    return cv2.dilate(covered, np.ones((3, 3), np.uint8)).astype(bool)
