@@ -8,6 +8,7 @@ Which patches to use is learned (:mod:`lerobot_openspm.perception.objects.patche
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -184,7 +185,15 @@ def is_covered(probe: Probe, hidden: Mask) -> bool:
     return float(np.median(shares)) > MAX_HIDDEN_SHARE
 
 
-def as_seen(view: View | None, probe: Probe) -> View | None:
+Resize = Callable[[View, tuple[int, int]], Picture]
+
+
+def resized(view: View, size: tuple[int, int]) -> Picture:
+    """A view's image at another width and height."""
+    return np.asarray(cv2.resize(view.image, size, interpolation=cv2.INTER_AREA), np.uint8)
+
+
+def as_seen(view: View | None, probe: Probe, resize: Resize = resized) -> View | None:
     """A view at the size of the patches; None if there is none or its camera is elsewhere now."""
     if view is None:
         return None
@@ -195,5 +204,4 @@ def as_seen(view: View | None, probe: Probe) -> View | None:
     size = (probe.calibration.width, probe.calibration.height)
     if view.image.shape[:2] == size[::-1]:
         return view
-    image = np.asarray(cv2.resize(view.image, size, interpolation=cv2.INTER_AREA), np.uint8)
-    return View(image, probe.calibration, view.T_world_cam)
+    return View(resize(view, size), probe.calibration, view.T_world_cam)

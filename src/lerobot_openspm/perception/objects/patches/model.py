@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, ClassVar
 
 import numpy as np
@@ -15,8 +16,17 @@ from lerobot_openspm.geometry.camera import Camera
 from lerobot_openspm.geometry.se3 import Array
 from lerobot_openspm.perception.objects import records
 from lerobot_openspm.perception.objects.base import Look, Record
-from lerobot_openspm.perception.objects.patches.match import REACH_M, Patch, Probe, as_seen, is_covered, match
-from lerobot_openspm.types import UNKNOWN_YAW_STD, PoseEstimate, Support
+from lerobot_openspm.perception.objects.patches.match import (
+    REACH_M,
+    Patch,
+    Picture,
+    Probe,
+    as_seen,
+    is_covered,
+    match,
+    resized,
+)
+from lerobot_openspm.types import UNKNOWN_YAW_STD, PoseEstimate, Support, View
 
 # A patch is looked for at the height it was learned at; an object this much above or below is another matter.
 MAX_LIFT_M = 0.005
@@ -68,9 +78,14 @@ class PatchModel:
         Views of a camera that has moved since the patches were cut do not help, nor do patches that may be
         hidden.
         """
+
+        def resize(view: View, size: tuple[int, int]) -> Picture:  # once for all objects and probes
+            return look.prepared((id(view), size), partial(resized, view, size))
+
         stds, places, correlations, area_px = [], [], [], 0.0
         for probe in self.probes:
-            view, covered = as_seen(look.views.get(probe.camera), probe), look.hidden.get(probe.camera)
+            view = as_seen(look.views.get(probe.camera), probe, resize)
+            covered = look.hidden.get(probe.camera)
             if view is None or (covered is not None and is_covered(probe, covered)):
                 continue
             found = [match(patch, probe, view) for patch in probe.patches]
