@@ -31,10 +31,10 @@ CORE_SHARE = 0.7
 AROUND_SHARE, AROUND_COST = 1.8, 0.5
 # Of all places these, where most looks like the object, are compared in every direction.
 KEPT_PLACES, MIN_PLACES, MAX_PLACES = 0.3, 600, 2000
-STARTS_PER_YAW, CANDIDATES, BEST_PER_YAW, FINALISTS, MANY = 6, 4, 2, 3, 12
+STARTS_PER_YAW, BEST_PER_YAW, FINALISTS, MANY = 6, 2, 3, 12
 # All demonstrations show an object turned alike. Turned otherwise by more than this many radians, its
-# agreement counts this share.
-TURNED_RAD, TURNED_SHARE = 0.4, 0.95
+# agreement counts this share; that of a large object this one, since what is seen of it is only a part.
+TURNED_RAD, TURNED_SHARE, LARGE_TURNED_SHARE = 0.4, 0.95, 0.88
 NUDGE_M = 0.006
 # Of an object with this radius a camera sees other sides in each area of this width, metres.
 LARGE_M, SEEN_ALIKE_M = 0.10, 0.25
@@ -92,31 +92,35 @@ def search(
     """
     apart = max(SAME_PLACE_M, 0.3 * surface.radius)
     likely = _likely(surface, sights, ground)
-    # Few points tell directions badly, so that the best places for each of them are looked at more closely.
-    count = MANY if several else max(CANDIDATES // len(yaws), BEST_PER_YAW)
-    starts = [_distinct(_turned(surface, sights, likely, yaw, apart), apart, count)[:, :4] for yaw in yaws]
+    # Few points tell directions and places badly, so that the best places for each direction are looked at
+    # more closely; most of them for the demonstrated one.
+    starts = []
+    for yaw in yaws:
+        count = MANY if several else BEST_PER_YAW if _is_turned(yaw) else STARTS_PER_YAW
+        starts.append(_distinct(_turned(surface, sights, likely, yaw, apart), apart, count)[:, :4])
     places = [
         refine(surface, sights, pose, freedom, QUICK_POINTS, QUICK_STEPS) for pose in np.concatenate(starts)
     ]
-    places = _ranked(places)
+    places = _ranked(surface, places)
     finalists = places[:FINALISTS]
     if several:
         for place in places[FINALISTS:]:
             if all(np.linalg.norm(place.pose[:2] - one.pose[:2]) > apart for one in finalists):
                 finalists.append(place)
     finest = [refine(surface, sights, place.pose, freedom, FINE_POINTS, FINE_STEPS) for place in finalists]
-    return _ranked(finest)
+    return _ranked(surface, finest)
 
 
-def _ranked(places: Sequence[Place]) -> list[Place]:
+def _ranked(surface: Surface, places: Sequence[Place]) -> list[Place]:
     """Places, the most likely first."""
-    return sorted(places, key=lambda place: -place.score * _likelihood(float(place.pose[3])))
+    turned = LARGE_TURNED_SHARE if surface.radius >= LARGE_M else TURNED_SHARE
+    counts = [place.score * (turned if _is_turned(float(place.pose[3])) else 1.0) for place in places]
+    return [places[i] for i in np.argsort(-np.array(counts), kind="stable")]
 
 
-def _likelihood(yaw: float) -> float:
-    """What agreement counts for a direction, radians from the demonstrated one."""
-    turn = abs((yaw + np.pi) % (2 * np.pi) - np.pi)
-    return TURNED_SHARE if turn > TURNED_RAD else 1.0
+def _is_turned(yaw: float) -> bool:
+    """Whether a direction, radians, is another than the demonstrated one."""
+    return abs((yaw + np.pi) % (2 * np.pi) - np.pi) > TURNED_RAD
 
 
 def _distinct(scored: Array, metres: float, count: int) -> Array:
