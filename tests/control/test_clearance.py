@@ -8,7 +8,7 @@ from tests.geometry.test_arm import LIBERO
 from tests.memory.builders import entry, hand_pose, pick_and_place, robot
 
 from lerobot_openspm.control import feasibility
-from lerobot_openspm.control.clearance import BESIDE, CLEARANCE_M, Way, lifted
+from lerobot_openspm.control.clearance import BESIDE, CLEARANCE_M, Way, crowding, lifted
 from lerobot_openspm.control.feasibility import TransferLimits, find_stance
 from lerobot_openspm.control.planning import MOST_IN_A_SCENE, Plan
 from lerobot_openspm.control.state import Status
@@ -158,6 +158,45 @@ def test_the_hand_of_an_episode_rises_over_what_it_was_not_asked_about():
         assert one.state.status is Status.RUNNING
         assert one.state.used == (shown,)
         assert (len(one.state.plan.entry.key_poses) > len(shown.key_poses)) == bool(more)
+
+
+def beside_grasp(context, poses, home, along):
+    """A post beside the hand where it grasps the bowl, ``along`` (x, y) in the hand's frame, metres."""
+    targets = Plan(context.entries[0], poses, home).targets(context)
+    T = next(one.T_world_ee for one in targets if one.key_pose.phase == "grasp")
+    place = se3.apply(T, np.array([[*along, 0.0]]))[0]
+    return targets, {"post": se3.from_yaw([*place[:2], T[2, 3] - 0.1], 0.0)}
+
+
+@pytest.mark.parametrize(
+    ("along", "is_crowded"),
+    [((0.0, 0.1), True), ((0.0, -0.1), True), ((0.05, 0.0), False), ((0.0, 0.12), False)],
+)
+def test_a_hand_is_wide_along_the_axis_over_which_its_fingers_open(along, is_crowded):
+    context, poses, home = scene(None, 0.3)
+    targets, post = beside_grasp(context, poses, home, along)
+    points = {"post": se3.apply(post["post"], pillar(0.0, 0.0, 0.25))}
+    assert bool(crowding(targets, points, RADIUS)) == is_crowded
+    # What it takes hold of, and what its key poses belong to, it is to be at.
+    assert not crowding(targets, {"bowl": points["post"]}, RADIUS)
+    assert not crowding([one for one in targets if one.key_pose.phase == "approach"], points, RADIUS)
+
+
+def test_a_grasp_beside_another_object_is_turned_about_a_round_object(caplog):
+    context, poses, home = scene(None, 0.0)
+    _, post = beside_grasp(context, poses, home, (0.0, 0.09))
+    context = replace(context, points={"post": pillar(0.0, 0.0, 0.25)}, hand_radius_m=RADIUS)
+    plan, problems = chosen(context, poses | post, home)
+    assert problems == []
+    assert plan.turned != 0
+    posts = {"post": se3.apply(post["post"], context.points["post"])}
+    assert not crowding(plan.targets(context), posts, RADIUS)
+    assert not caplog.records
+    # Without a symmetry there is no other grasp.
+    plan, problems = chosen(replace(context, symmetries={}), poses | post, home)
+    assert (plan.turned, problems) == (0, [])
+    (record,) = caplog.records
+    assert "the hand may touch the post where it takes hold or lets go" in record.getMessage()
 
 
 @pytest.fixture

@@ -1,4 +1,4 @@
-"""Ways that are clear of what stands about: the hand is lifted over it.
+"""Clear of what stands about: ways are lifted over it, and grasps and places that it crowds are told.
 
 Key poses say where the hand has to be, not how it gets there; on the way it goes straight. Where other
 objects stand elsewhere than in the demonstration, one may be in the way. Then the hand first rises, crosses
@@ -12,6 +12,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from lerobot_openspm.control.transfer import Target
 from lerobot_openspm.geometry import se3
@@ -30,6 +31,11 @@ CLEARANCE_M = 0.03
 BESIDE = 1.5
 # So many places of a way are compared with what stands about.
 STEPS = 24
+# Where the hand takes hold and lets go it has no other choice than to be.
+HOLDING = ("grasp", "place", "release")
+# The hand in its own frame, palm and fingers: half its length along x and y as shares of its radius, and from
+# where to where it reaches along z, metres. Fingers open along y.
+PARTS = ((0.45, 1.35, -0.16, -0.05), (0.2, 0.75, -0.05, -0.01))
 
 
 @dataclass(frozen=True)
@@ -123,6 +129,36 @@ def lifted(
             points.pop(entry.key.sub_tasks[pose.sub_task].target, None)
         before = T
     return replace(entry, key_poses=tuple(poses)), list(crossed)
+
+
+def crowding(targets: Sequence[Target], points: Mapping[str, Array], radius: float) -> dict[str, int]:
+    """How many points of what else stands about are inside the hand where it takes hold and lets go.
+
+    Args:
+        targets: Key poses in the scene.
+        points: Points ``(n, 3)`` in the world of the objects that were found, by name.
+        radius: Of the hand, metres.
+
+    Returns:
+        Numbers by name, of those that have any.
+    """
+    found: dict[str, int] = {}
+    grasped = ""
+    for pose, T in ((one.key_pose, one.T_world_ee) for one in targets if one.key_pose.phase in HOLDING):
+        grasped = pose.anchor.place if pose.phase == "grasp" else grasped
+        for name, own in points.items():
+            if name == grasped or name in pose.anchor.objects:
+                continue
+            if count := int(_inside(se3.apply(se3.inverse(T), own), radius).sum()):
+                found[name] = found.get(name, 0) + count
+    return found
+
+
+def _inside(points: Array, radius: float) -> NDArray[np.bool_]:
+    """Which points ``(n, 3)`` in the hand's frame are inside it."""
+    x, y, z = np.abs(points[:, 0]), np.abs(points[:, 1]), points[:, 2]
+    parts = [(x < a * radius) & (y < b * radius) & (z > low) & (z < high) for a, b, low, high in PARTS]
+    return np.any(parts, axis=0)
 
 
 def _raised(pose: MemoryKeyPose, rise: float) -> MemoryKeyPose:

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from lerobot_openspm.control.clearance import lifted
+from lerobot_openspm.control.clearance import crowding, lifted
 from lerobot_openspm.control.feasibility import (
     Miss,
     TransferLimits,
@@ -29,7 +29,7 @@ from lerobot_openspm.geometry import se3
 from lerobot_openspm.geometry.se3 import Array
 from lerobot_openspm.language.names import TABLE_NAMES, NameSimilarity
 from lerobot_openspm.memory.compose import Candidate
-from lerobot_openspm.memory.entry import WORLD, MemoryEntry, MemoryKeyPose, Outcome, RetrievalKey
+from lerobot_openspm.memory.entry import MemoryEntry, MemoryKeyPose, Outcome, RetrievalKey
 from lerobot_openspm.memory.retrieval import Scored, retrieve
 from lerobot_openspm.memory.robot import RobotModel
 from lerobot_openspm.types import Execution, SubTask, Symmetry
@@ -123,6 +123,7 @@ class PlanningContext:
         """The best entry that the arm can follow, its grasps turned by an object's symmetry if need be.
 
         The hand goes the other way round, by half a turn about its approach axis, where nothing else does.
+        An entry is better the other way round, or another entry, where the hand would be in other objects.
 
         Returns:
             The plan, and what keeps the hand from following it, in words. Where none of the first entries
@@ -132,16 +133,37 @@ class PlanningContext:
         if any(name not in object_poses for name in first.entry.objects):
             return first, []
         first = replace(first, stance=find_stance(self.robot, T_world_ee))
+        points, crowded = self._points(object_poses), list[tuple[Plan, dict[str, int]]]()
         for entry in (one.entry for one in ranked[:MAX_TRIED] if one.geometric > 0):
             for is_half_turned in (False, True):
-                plan = self._turned(replace(first, entry=entry, is_half_turned=is_half_turned))
-                if plan is not None:
-                    return plan, []
-        return first, first.problems(self)
+                found = self._turned(replace(first, entry=entry, is_half_turned=is_half_turned), points)
+                if found is not None and not found[1]:
+                    return found[0], []
+                crowded += [found] if found is not None else []
+        if not crowded:
+            return first, first.problems(self)
+        plan, inside = crowded[0]
+        logger.warning(
+            "%r: the hand may touch the %s where it takes hold or lets go",
+            plan.entry.language,
+            " and the ".join(inside),
+        )
+        return plan, []
 
-    def _turned(self, plan: Plan) -> Plan | None:
-        """A plan with its grasps turned by the least with which the arm can follow it; None where none is."""
-        turning = plan.symmetric_grasps(self)
+    def _turned(self, plan: Plan, points: Mapping[str, Array]) -> tuple[Plan, dict[str, int]] | None:
+        """A plan with its grasps turned by the least with which the arm can follow it clear of other objects.
+
+        Where that is not to be had, they are turned to where the hand is least in other objects. None where
+        the arm cannot follow it at all.
+
+        Args:
+            plan: As it is.
+            points: Points ``(n, 3)`` in the world of the objects that were found, by name.
+
+        Returns:
+            The plan, and how much of what the hand is in, see :func:`crowding`.
+        """
+        turning, crowded = plan.symmetric_grasps(self), list[tuple[Plan, dict[str, int]]]()
         for radians in plan.turns(self):
             turned = replace(plan, turned=radians)
             targets = turned.targets(self)
@@ -149,21 +171,27 @@ class PlanningContext:
                 continue
             miss = turned.miss(self, targets)
             if miss is None:
-                return turned
-            if miss.target.key_pose.sub_task not in turning:
-                return None  # turning the grasps leaves it where it is
-        return None
+                crowded.append((turned, crowding(targets, points, self.hand_radius_m)))
+                if not crowded[-1][1]:
+                    return crowded[-1]
+            elif miss.target.key_pose.sub_task not in turning:
+                break  # turning the grasps leaves it where it is
+        return min(crowded, key=lambda one: sum(one[1].values()), default=None)
+
+    def _points(self, object_poses: Mapping[str, Array]) -> dict[str, Array]:
+        """Points ``(n, 3)`` in the world of the objects that were found and whose shape is known."""
+        return {
+            name: se3.apply(object_poses[name], own)
+            for name, own in self.points.items()
+            if name in object_poses
+        }
 
     def clear(self, plan: Plan) -> Plan:
         """A plan whose ways are lifted over what stands about.
 
         Where the arm cannot follow the lifted ways, the plan stays as it is, and that is said.
         """
-        points = {
-            name: se3.apply(plan.object_poses[name], own)
-            for name, own in self.points.items()
-            if name in plan.object_poses
-        }
+        points = self._points(plan.object_poses)
         entry, crossed = lifted(plan.entry, plan.targets(self), plan.T_world_ee, points, self.hand_radius_m)
         if not crossed:
             return plan
@@ -207,7 +235,7 @@ class Plan:
         last: int | None = None,
     ) -> tuple[Target, ...]:
         """The key poses in the scene; see :func:`transfer`. Those after sub-task `last` are left out."""
-        entry = self.entry if last is None else until(self.entry, last)
+        entry = self.entry if last is None else self.entry.until(last)
         turns = {
             sub_task: Turn(self.object_poses[name], context.symmetries[name].middle, self.turned)
             for sub_task, name in self.symmetric_grasps(context).items()
@@ -309,23 +337,8 @@ class Plan:
         """
         outcomes = self.outcomes
         seen = [one for one in outcomes if one.target in recognised and poses.keys() >= set(one.objects)]
-        missed = [one for one in seen if not _is_met(one, poses, yaw_periods)]
+        missed = [one for one in seen if not one.is_met_either_way(poses, yaw_periods)]
         return missed if missed or len(seen) == len(outcomes) else None
-
-
-def until(entry: MemoryEntry, sub_task: int) -> MemoryEntry:
-    """An entry without the sub-tasks after one."""
-    key = replace(entry.key, sub_tasks=entry.key.sub_tasks[: sub_task + 1])
-    return replace(entry, key=key, key_poses=tuple(p for p in entry.key_poses if p.sub_task <= sub_task))
-
-
-def _is_met(outcome: Outcome, poses: Mapping[str, Array], yaw_periods: Mapping[str, float]) -> bool:
-    """Whether an outcome is met whichever way round a symmetric landmark was seen."""
-    axes = outcome.anchor.axes
-    if axes == WORLD:
-        return outcome.is_met(poses)
-    turned = se3.yaw_equivalents(poses[axes], yaw_periods.get(axes, 2 * np.pi))
-    return any(outcome.is_met({**poses, axes: T}) for T in turned)
 
 
 # Before the first plan: nothing is done, nowhere.

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Literal, get_args
 
 import numpy as np
@@ -170,6 +170,19 @@ class Outcome:
         beside = float(np.linalg.norm(off[:2]))
         return beside <= self.tolerance_m and -MAX_FALL_M <= float(off[2]) <= self.tolerance_m
 
+    def is_met_either_way(self, object_poses: Mapping[str, Array], yaw_periods: Mapping[str, float]) -> bool:
+        """Whether it is met whichever way round a landmark that turns into itself was seen.
+
+        Args:
+            object_poses: Poses ``T_world_obj`` ``(4, 4)``.
+            yaw_periods: Angle by object that turns it into itself, radians.
+        """
+        axes = self.anchor.axes
+        if axes == WORLD:
+            return self.is_met(object_poses)
+        turned = se3.yaw_equivalents(object_poses[axes], yaw_periods.get(axes, 2 * np.pi))
+        return any(self.is_met({**object_poses, axes: T}) for T in turned)
+
 
 @dataclass(frozen=True)
 class MemoryEntry:
@@ -204,3 +217,8 @@ class MemoryEntry:
     def objects(self) -> tuple[str, ...]:
         """The objects the entry needs a pose of, each once, in the order of their first use."""
         return tuple(dict.fromkeys(name for pose in self.key_poses for name in pose.anchor.objects))
+
+    def until(self, sub_task: int) -> MemoryEntry:
+        """The entry without the sub-tasks after one."""
+        key = replace(self.key, sub_tasks=self.key.sub_tasks[: sub_task + 1])
+        return replace(self, key=key, key_poses=tuple(p for p in self.key_poses if p.sub_task <= sub_task))
