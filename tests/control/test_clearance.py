@@ -160,43 +160,88 @@ def test_the_hand_of_an_episode_rises_over_what_it_was_not_asked_about():
         assert (len(one.state.plan.entry.key_poses) > len(shown.key_poses)) == bool(more)
 
 
-def beside_grasp(context, poses, home, along):
-    """A post beside the hand where it grasps the bowl, ``along`` (x, y) in the hand's frame, metres."""
+def at_key_pose(context, poses, home, phase, along):
+    """Key poses, and the pose of a post beside the hand at one, ``along`` (x, y) in its frame, metres."""
     targets = Plan(context.entries[0], poses, home).targets(context)
-    T = next(one.T_world_ee for one in targets if one.key_pose.phase == "grasp")
+    T = next(one.T_world_ee for one in targets if one.key_pose.phase == phase)
     place = se3.apply(T, np.array([[*along, 0.0]]))[0]
-    return targets, {"post": se3.from_yaw([*place[:2], T[2, 3] - 0.1], 0.0)}
+    return targets, se3.from_yaw([*place[:2], T[2, 3] - 0.1], 0.0)
 
 
+POST = pillar(0.0, 0.0, 0.25)
+
+
+@pytest.mark.parametrize("phase", ["grasp", "release"])
 @pytest.mark.parametrize(
     ("along", "is_crowded"),
     [((0.0, 0.1), True), ((0.0, -0.1), True), ((0.05, 0.0), False), ((0.0, 0.12), False)],
 )
-def test_a_hand_is_wide_along_the_axis_over_which_its_fingers_open(along, is_crowded):
+def test_a_hand_is_wide_along_the_axis_over_which_its_fingers_open(phase, along, is_crowded):
     context, poses, home = scene(None, 0.3)
-    targets, post = beside_grasp(context, poses, home, along)
-    points = {"post": se3.apply(post["post"], pillar(0.0, 0.0, 0.25))}
-    assert bool(crowding(targets, points, RADIUS)) == is_crowded
+    (shown,) = context.entries
+    targets, place = at_key_pose(context, poses, home, phase, along)
+    post = se3.apply(place, POST)
+    assert bool(crowding(shown, targets, {"post": post}, RADIUS)) == is_crowded
     # What it takes hold of, and what its key poses belong to, it is to be at.
-    assert not crowding(targets, {"bowl": points["post"]}, RADIUS)
-    assert not crowding([one for one in targets if one.key_pose.phase == "approach"], points, RADIUS)
+    assert not crowding(shown, targets, {"bowl" if phase == "grasp" else "plate": post}, RADIUS)
+    assert not crowding(
+        shown, [one for one in targets if one.key_pose.phase == "approach"], {"post": post}, RADIUS
+    )
+    # The same thing by another name.
+    bowl = se3.apply(poses["bowl"], POST)
+    assert not crowding(shown, targets, {"bowl": bowl, "black bowl": bowl}, RADIUS)
+
+
+def test_what_was_put_down_crowds_the_hand_where_it_was_put():
+    shown, poses = two_sub_tasks()
+    bowl = {"bowl": se3.apply(poses["bowl"], POST)}
+    targets = transfer(shown, poses, {}, HOME)
+    grasps = [one.T_world_ee for one in targets if one.key_pose.phase == "grasp"]
+    let_go = next(one.T_world_ee for one in targets if one.key_pose.phase == "release")
+    for beside, is_crowded in ((grasps[0], False), (let_go, True)):
+        # The cup is taken right beside where the bowl was, or where it was put.
+        x, y = (beside[:3, 3] - grasps[1][:3, 3] + 0.09 * grasps[1][:3, 1])[:2]
+        now = poses | {"cup": se3.from_yaw([x, y, 0.0], 0.0) @ poses["cup"]}
+        found = crowding(shown, transfer(shown, now, {}, HOME), bowl, RADIUS)
+        assert bool(found) == is_crowded
 
 
 def test_a_grasp_beside_another_object_is_turned_about_a_round_object(caplog):
     context, poses, home = scene(None, 0.0)
-    _, post = beside_grasp(context, poses, home, (0.0, 0.09))
-    context = replace(context, points={"post": pillar(0.0, 0.0, 0.25)}, hand_radius_m=RADIUS)
-    plan, problems = chosen(context, poses | post, home)
+    _, place = at_key_pose(context, poses, home, "grasp", (0.0, 0.09))
+    context, poses = replace(context, points={"post": POST}, hand_radius_m=RADIUS), poses | {"post": place}
+    plan, problems = chosen(context, poses, home)
     assert problems == []
     assert plan.turned != 0
-    posts = {"post": se3.apply(post["post"], context.points["post"])}
-    assert not crowding(plan.targets(context), posts, RADIUS)
+    assert not crowding(plan.entry, plan.targets(context), {"post": se3.apply(place, POST)}, RADIUS)
     assert not caplog.records
     # Without a symmetry there is no other grasp.
-    plan, problems = chosen(replace(context, symmetries={}), poses | post, home)
+    plan, problems = chosen(replace(context, symmetries={}), poses, home)
     assert (plan.turned, problems) == (0, [])
     (record,) = caplog.records
     assert "the hand may touch the post where it takes hold or lets go" in record.getMessage()
+
+
+def test_where_another_entry_grasps_from_elsewhere_it_is_taken_if_it_means_the_same():
+    context, poses, home = scene(None, 0.0)
+    context = replace(context, symmetries={})
+    shown = context.entries[0]
+    _, place = at_key_pose(context, poses, home, "grasp", (0.0, 0.09))
+    context = replace(context, points={"post": POST}, hand_radius_m=RADIUS)
+    quarter = se3.from_yaw(np.zeros(3), np.pi / 2)
+    turned = replace(
+        shown,
+        key_poses=tuple(replace(pose, T_obj_ee=pose.T_obj_ee @ quarter) for pose in shown.key_poses),
+        source="turned",
+    )
+    other = replace(
+        turned, key=replace(turned.key, sub_tasks=(replace(turned.key.sub_tasks[0], target="cup"),))
+    )
+    for second, taken in ((turned, "turned"), (other, shown.source)):
+        both = [Candidate(one, 1.0 - i / 10, one, one.key.sub_tasks) for i, one in enumerate((shown, second))]
+        found = poses | {"post": place}
+        plan, problems = context.choose(context.rank(both, found, home), found, home)
+        assert (plan.entry.source, problems) == (taken, [])
 
 
 @pytest.fixture

@@ -1,4 +1,4 @@
-"""Clear of what stands about: ways are lifted over it, and grasps and places that it crowds are told.
+"""Clear of what stands about: the hand is lifted over it, and what it would be in at a key pose is told.
 
 Key poses say where the hand has to be, not how it gets there; on the way it goes straight. Where other
 objects stand elsewhere than in the demonstration, one may be in the way. Then the hand first rises, crosses
@@ -9,7 +9,7 @@ paper's check of the minimum distance, for objects.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,11 +31,14 @@ CLEARANCE_M = 0.03
 BESIDE = 1.5
 # So many places of a way are compared with what stands about.
 STEPS = 24
-# Where the hand takes hold and lets go it has no other choice than to be.
-HOLDING = ("grasp", "place", "release")
-# The hand in its own frame, palm and fingers: half its length along x and y as shares of its radius, and from
-# where to where it reaches along z, metres. Fingers open along y.
+# Where the fingers close and open, the hand is beside objects.
+FINGERS_MOVE = ("grasp", "release")
+# Palm and fingers in the hand's frame, which is between the fingertips: half their length along x and y as
+# shares of the hand's radius, and from where to where they reach along z, metres. Fingers open along y.
 PARTS = ((0.45, 1.35, -0.16, -0.05), (0.2, 0.75, -0.05, -0.01))
+# Fewer points of an object than this inside the hand are noise, and what is this near to what is grasped,
+# metres, is the same thing by another name.
+NOISE_POINTS, SAME_THING_M = 5, 0.02
 
 
 @dataclass(frozen=True)
@@ -83,6 +86,36 @@ class Way:
         return float(points[is_under.any(0), 2].max()) + self.below + CLEARANCE_M
 
 
+@dataclass
+class Standing:
+    """Where objects stand as key poses are passed.
+
+    Attributes:
+        points: Points ``(n, 3)`` in the world by name; not of what was pushed, since where that ends is not
+            known by its points.
+        grasped: What was grasped last; the hand is right beside it, also when it has let go of it.
+        is_held: Whether it is still in the hand.
+        T_world_grasp: Where the hand took hold of it ``(4, 4)``.
+    """
+
+    points: dict[str, Array]
+    grasped: str = ""
+    is_held: bool = False
+    T_world_grasp: Array = field(default_factory=lambda: np.eye(4))
+
+    def pass_by(self, pose: MemoryKeyPose, T_world_ee: Array, entry: MemoryEntry) -> None:
+        """Take in that a key pose of an entry was met, with the hand at ``T_world_ee`` ``(4, 4)``."""
+        if pose.phase == "grasp":
+            self.grasped, self.is_held, self.T_world_grasp = pose.anchor.place, True, T_world_ee
+        elif pose.phase == "release" and self.is_held:
+            self.is_held = False
+            if self.grasped in self.points:  # it stands where the hand let go of it
+                T = T_world_ee @ se3.inverse(self.T_world_grasp)
+                self.points[self.grasped] = se3.apply(T, self.points[self.grasped])
+        elif pose.phase == "push":
+            self.points.pop(entry.key.sub_tasks[pose.sub_task].target, None)
+
+
 def lifted(
     entry: MemoryEntry,
     targets: Sequence[Target],
@@ -101,17 +134,15 @@ def lifted(
     """
     poses: list[MemoryKeyPose] = []
     crossed: dict[str, None] = {}
-    # What was grasped last; the hand is right beside it, also when it has let go of it.
-    grasped, is_held, T_world_grasp = "", False, np.eye(4)
-    before, points = T_world_ee, dict(points)
+    standing, before = Standing(dict(points)), T_world_ee
     for i, (pose, target) in enumerate(zip(entry.key_poses, targets, strict=False)):
-        T = target.T_world_ee
-        below = _below(T_world_grasp, points.get(grasped)) if is_held else 0.0
+        T, grasped = target.T_world_ee, standing.grasped
+        below = _below(standing.T_world_grasp, standing.points.get(grasped)) if standing.is_held else 0.0
         way = Way(before[:3, 3], T[:3, 3], below)
         if -T[2, 2] > UPRIGHT and pose.phase in CROSSING and way.length > SHORTEST_M:
             previous = entry.key_poses[i - 1] if i else None
             near = {grasped, *pose.anchor.objects, *(previous.anchor.objects if previous else ())}
-            others = {name: own for name, own in points.items() if name not in near}
+            others = {name: own for name, own in standing.points.items() if name not in near}
             height, names = way.crossing(others, BESIDE * radius)
             if previous and height > way.start[2]:
                 poses.append(_above(previous, height - way.start[2], pose))
@@ -119,39 +150,40 @@ def lifted(
                 poses.append(_raised(pose, height - way.goal[2]))
             crossed |= dict.fromkeys(names)
         poses.append(pose)
-        if pose.phase == "grasp":
-            grasped, is_held, T_world_grasp = pose.anchor.place, True, T
-        elif pose.phase == "release" and is_held:
-            is_held = False
-            if grasped in points:  # it stands where the hand let go of it
-                points[grasped] = se3.apply(T @ se3.inverse(T_world_grasp), points[grasped])
-        elif pose.phase == "push":  # where it ends is not known by its points
-            points.pop(entry.key.sub_tasks[pose.sub_task].target, None)
+        standing.pass_by(pose, T, entry)
         before = T
     return replace(entry, key_poses=tuple(poses)), list(crossed)
 
 
-def crowding(targets: Sequence[Target], points: Mapping[str, Array], radius: float) -> dict[str, int]:
-    """How many points of what else stands about are inside the hand where it takes hold and lets go.
+def crowding(
+    entry: MemoryEntry, targets: Sequence[Target], points: Mapping[str, Array], radius: float
+) -> dict[str, int]:
+    """How many points of other objects are inside the hand where it takes hold and lets go.
 
     Args:
-        targets: Key poses in the scene.
+        entry: What is to be executed.
+        targets: Its key poses in the scene.
         points: Points ``(n, 3)`` in the world of the objects that were found, by name.
         radius: Of the hand, metres.
 
     Returns:
-        Numbers by name, of those that have any.
+        Numbers by name, of those that have more than noise.
     """
     found: dict[str, int] = {}
-    grasped = ""
-    for pose, T in ((one.key_pose, one.T_world_ee) for one in targets if one.key_pose.phase in HOLDING):
-        grasped = pose.anchor.place if pose.phase == "grasp" else grasped
-        for name, own in points.items():
-            if name == grasped or name in pose.anchor.objects:
-                continue
-            if count := int(_inside(se3.apply(se3.inverse(T), own), radius).sum()):
-                found[name] = found.get(name, 0) + count
-    return found
+    standing = Standing(dict(points))
+    for pose, T in ((target.key_pose, target.T_world_ee) for target in targets):
+        if pose.phase in FINGERS_MOVE:
+            grasped = pose.anchor.place if pose.phase == "grasp" else standing.grasped
+            near = {grasped, *pose.anchor.objects}
+            own = standing.points.get(grasped)
+            for name in standing.points.keys() - near:
+                other = standing.points[name]
+                if own is not None and np.linalg.norm(other.mean(0) - own.mean(0)) < SAME_THING_M:
+                    continue
+                inside = int(_inside(se3.apply(se3.inverse(T), other), radius).sum())
+                found[name] = found.get(name, 0) + inside
+        standing.pass_by(pose, T, entry)
+    return {name: found[name] for name in points if found.get(name, 0) >= NOISE_POINTS}
 
 
 def _inside(points: Array, radius: float) -> NDArray[np.bool_]:

@@ -300,7 +300,7 @@ class EpisodeController:
         if not self._is_tracking:
             return self._end_part(hand)
         state.followed |= self.executor.followed_sub_tasks()
-        names = dict.fromkeys(name for one in state.plan.outcomes for name in one.objects)
+        names = dict.fromkeys(name for one in state.plan.entry.served_outcomes for name in one.objects)
         if not names:
             state.judge(())
             return self._end_part(hand)
@@ -310,7 +310,7 @@ class EpisodeController:
     def _judge(self, hand: Hand) -> LookRequest | None:
         """Compare what is seen with the outcomes: go on if all are met, else go back to what can mend it."""
         state, poses = self.state, self.scene.tracker.poses(hand.T_world_ee)
-        missed = state.plan.missed(poses, self.scene.recognised(), self._context.yaw_periods)
+        missed = state.plan.entry.missed(poses, self.scene.recognised(), self._context.yaw_periods)
         if missed is None:
             return None if state.looks_left > 0 else self._end_part(hand)
         state.judge(missed)

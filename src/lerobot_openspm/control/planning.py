@@ -27,9 +27,10 @@ from lerobot_openspm.control.transfer import (
 )
 from lerobot_openspm.geometry import se3
 from lerobot_openspm.geometry.se3 import Array
+from lerobot_openspm.language.meaning import means_the_same
 from lerobot_openspm.language.names import TABLE_NAMES, NameSimilarity
 from lerobot_openspm.memory.compose import Candidate
-from lerobot_openspm.memory.entry import MemoryEntry, MemoryKeyPose, Outcome, RetrievalKey
+from lerobot_openspm.memory.entry import MemoryEntry, MemoryKeyPose, RetrievalKey
 from lerobot_openspm.memory.retrieval import Scored, retrieve
 from lerobot_openspm.memory.robot import RobotModel
 from lerobot_openspm.types import Execution, SubTask, Symmetry
@@ -44,6 +45,8 @@ MAX_TRIED = 3
 TURNS = tuple(
     np.deg2rad([0, *(sign * turn for turn in range(30, 180, 30) for sign in (1, -1)), 180]).tolist()
 )
+# The hand is in much more of other objects if it is in so many times as many points of them.
+MUCH_MORE = 2
 # A memory that knows more objects than this knows several scenes, and not all objects are looked for.
 MOST_IN_A_SCENE = 20
 # Where an object is that was never seen.
@@ -123,7 +126,8 @@ class PlanningContext:
         """The best entry that the arm can follow, its grasps turned by an object's symmetry if need be.
 
         The hand goes the other way round, by half a turn about its approach axis, where nothing else does.
-        An entry is better the other way round, or another entry, where the hand would be in other objects.
+        Where it would be in other objects as it takes hold or lets go, grasps are turned too, and entries
+        that mean the same are tried.
 
         Returns:
             The plan, and what keeps the hand from following it, in words. Where none of the first entries
@@ -135,6 +139,8 @@ class PlanningContext:
         first = replace(first, stance=find_stance(self.robot, T_world_ee))
         points, crowded = self._points(object_poses), list[tuple[Plan, dict[str, int]]]()
         for entry in (one.entry for one in ranked[:MAX_TRIED] if one.geometric > 0):
+            if crowded and not self._mean_the_same(entry, crowded[0][0].entry):
+                continue
             for is_half_turned in (False, True):
                 found = self._turned(replace(first, entry=entry, is_half_turned=is_half_turned), points)
                 if found is not None and not found[1]:
@@ -142,18 +148,18 @@ class PlanningContext:
                 crowded += [found] if found is not None else []
         if not crowded:
             return first, first.problems(self)
-        plan, inside = crowded[0]
-        logger.warning(
-            "%r: the hand may touch the %s where it takes hold or lets go",
-            plan.entry.language,
-            " and the ".join(inside),
-        )
+        plan, inside = min(crowded, key=_amount)
+        logger.warning("%r: the hand may touch the %s where it takes hold or lets go",
+                       plan.entry.language, " and the ".join(inside))  # fmt: skip
         return plan, []
+
+    def _mean_the_same(self, entry: MemoryEntry, other: MemoryEntry) -> bool:
+        return means_the_same(entry.key.sub_tasks, other.key.sub_tasks, self.names.lexicon)
 
     def _turned(self, plan: Plan, points: Mapping[str, Array]) -> tuple[Plan, dict[str, int]] | None:
         """A plan with its grasps turned by the least with which the arm can follow it clear of other objects.
 
-        Where that is not to be had, they are turned to where the hand is least in other objects. None where
+        Where that is not to be had, they are turned only if the hand is in much less of them then. None where
         the arm cannot follow it at all.
 
         Args:
@@ -163,20 +169,19 @@ class PlanningContext:
         Returns:
             The plan, and how much of what the hand is in, see :func:`crowding`.
         """
-        turning, crowded = plan.symmetric_grasps(self), list[tuple[Plan, dict[str, int]]]()
-        for radians in plan.turns(self):
-            turned = replace(plan, turned=radians)
+        turning, ways = plan.symmetric_grasps(self), list[tuple[Plan, dict[str, int]]]()
+        for turned in (replace(plan, turned=radians) for radians in plan.turns(self)):
             targets = turned.targets(self)
-            if check_transfer(targets, plan.T_world_ee, self.robot, self.limits):
-                continue
-            miss = turned.miss(self, targets)
+            if not check_transfer(targets, plan.T_world_ee, self.robot, self.limits):
+                ways.append((turned, crowding(turned.entry, targets, points, self.hand_radius_m)))
+        least = min(map(_amount, ways), default=0)
+        for turned, inside in sorted(ways, key=lambda way: _amount(way) > MUCH_MORE * least):
+            miss = turned.miss(self, turned.targets(self))
             if miss is None:
-                crowded.append((turned, crowding(targets, points, self.hand_radius_m)))
-                if not crowded[-1][1]:
-                    return crowded[-1]
-            elif miss.target.key_pose.sub_task not in turning:
-                break  # turning the grasps leaves it where it is
-        return min(crowded, key=lambda one: sum(one[1].values()), default=None)
+                return turned, inside
+            if miss.target.key_pose.sub_task not in turning:
+                return None  # turning the grasps leaves it where it is
+        return None
 
     def _points(self, object_poses: Mapping[str, Array]) -> dict[str, Array]:
         """Points ``(n, 3)`` in the world of the objects that were found and whose shape is known."""
@@ -322,27 +327,14 @@ class Plan:
         """The sub-task that a key pose serves."""
         return self.entry.key.sub_tasks[pose.sub_task]
 
-    @property
-    def outcomes(self) -> list[Outcome]:
-        """The outcomes that the key poses can bring about; others could not be mended."""
-        served = {pose.sub_task for pose in self.entry.key_poses}
-        return [one for one in self.entry.outcomes if one.sub_task in served]
-
-    def missed(
-        self, poses: Mapping[str, Array], recognised: Collection[str], yaw_periods: Mapping[str, float]
-    ) -> list[Outcome] | None:
-        """The outcomes that are seen not to be met, in order; None where none is, but not all are seen.
-
-        One is seen where its target was recognised and the poses of its objects are known.
-        """
-        outcomes = self.outcomes
-        seen = [one for one in outcomes if one.target in recognised and poses.keys() >= set(one.objects)]
-        missed = [one for one in seen if not one.is_met_either_way(poses, yaw_periods)]
-        return missed if missed or len(seen) == len(outcomes) else None
-
 
 # Before the first plan: nothing is done, nowhere.
 NO_PLAN = Plan(MemoryEntry(RetrievalKey((), ()), "", (), 0.0, 0, ""), {}, np.eye(4))
+
+
+def _amount(way: tuple[Plan, Mapping[str, int]]) -> int:
+    """In how many points of other objects the hand is."""
+    return sum(way[1].values())
 
 
 def _is_multiple(radians: float, turn: float) -> bool:

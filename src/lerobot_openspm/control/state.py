@@ -151,6 +151,6 @@ class EpisodeState:
 
     def judge(self, missed: Sequence[Outcome]) -> None:
         """Take in which outcomes are missed. The others, and handles that went all the way, are done."""
-        done = {one.sub_task for one in self.plan.outcomes} | self.followed
+        done = {one.sub_task for one in self.plan.entry.served_outcomes} | self.followed
         is_all_known = done >= set(range(len(self.plan.entry.key.sub_tasks)))
         self.verdict = False if missed else (is_all_known or None)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Literal, get_args
 
@@ -222,3 +222,21 @@ class MemoryEntry:
         """The entry without the sub-tasks after one."""
         key = replace(self.key, sub_tasks=self.key.sub_tasks[: sub_task + 1])
         return replace(self, key=key, key_poses=tuple(p for p in self.key_poses if p.sub_task <= sub_task))
+
+    @property
+    def served_outcomes(self) -> list[Outcome]:
+        """The outcomes that the key poses can bring about; others could not be mended."""
+        served = {pose.sub_task for pose in self.key_poses}
+        return [one for one in self.outcomes if one.sub_task in served]
+
+    def missed(
+        self, poses: Mapping[str, Array], recognised: Collection[str], yaw_periods: Mapping[str, float]
+    ) -> list[Outcome] | None:
+        """The outcomes that are seen not to be met, in order; None where none is, but not all are seen.
+
+        One is seen where its target was recognised and the poses of its objects are known.
+        """
+        outcomes = self.served_outcomes
+        seen = [one for one in outcomes if one.target in recognised and poses.keys() >= set(one.objects)]
+        missed = [one for one in seen if not one.is_met_either_way(poses, yaw_periods)]
+        return missed if missed or len(seen) == len(outcomes) else None

@@ -141,14 +141,15 @@ def correlations(window: Picture, patch: Picture) -> NDArray[np.float32]:
     rows, columns = window.shape[0] - height + 1, window.shape[1] - width + 1
     size = [next_fast_len(n, real=True) or n for n in window.shape[:2]]
     centred = patch - patch.mean((0, 1), dtype=np.float32)
-    spectrum = np.fft.rfft2(window.astype(np.float32), size, (0, 1))
+    spectrum = np.fft.rfft2(window - window.mean((0, 1), dtype=np.float32), size, (0, 1))
     own = np.fft.rfft2(centred, size, (0, 1)).conj()
     covariance = np.fft.irfft2((spectrum * own).sum(-1), size)[:rows, :columns]
     sums, squares = (_boxes(table, height, width) for table in cv2.integral2(window))
     spread = (squares - sums**2 / (height * width)).sum(-1) * float((centred**2).sum())
     scale = np.sqrt(np.maximum(spread, 0.0))
     has_contrast = scale > MIN_SPREAD * height * width
-    return np.where(has_contrast, covariance / np.where(has_contrast, scale, 1.0), 0.0).astype(np.float32)
+    told = np.where(has_contrast, covariance / np.where(has_contrast, scale, 1.0), 0.0)
+    return np.clip(told, -1.0, 1.0).astype(np.float32)
 
 
 def _boxes(integral: NDArray[Any], height: int, width: int) -> Array:

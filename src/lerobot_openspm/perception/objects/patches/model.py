@@ -143,7 +143,7 @@ class PatchModel:
         return is_found or self.reaches(T_expected)
 
     def reaches(self, T_world_obj: Array, margin_m: float = 0.0) -> bool:
-        """Whether an object at a pose ``(4, 4)`` is where the patches are sought, or as far from there."""
+        """Whether an object at a pose ``(4, 4)`` is where patches are sought, or so far beyond."""
         places = np.stack([patch.point_world[:2] for probe in self.probes for patch in probe.patches])
         away_m = np.linalg.norm(places - T_world_obj[:2, 3], axis=1).min()
         return bool(away_m <= REACH_M + margin_m)
