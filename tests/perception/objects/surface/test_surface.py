@@ -15,7 +15,7 @@ from lerobot_openspm.perception.objects.kinds import learn_objects
 from lerobot_openspm.perception.objects.surface import model as model_module
 from lerobot_openspm.perception.objects.surface.compare import correlation
 from lerobot_openspm.perception.objects.surface.model import SurfaceModel
-from lerobot_openspm.perception.objects.surface.search import _areas
+from lerobot_openspm.perception.objects.surface.search import Place, _areas, _ranked
 from lerobot_openspm.types import ContactCue, DemonstrationScene, Moment
 
 HOME = (-0.05, 0.0, 0.45)
@@ -185,6 +185,17 @@ def test_where_it_stood_in_the_demonstrations_its_patches_are_believed(models):
     look = Look(views_at(usual, looking_down(*HOME)))
     found, near = models["cup"].localise(look), models["cup"].near.localise(look)
     assert np.array_equal(found.T_world_obj, near.T_world_obj)
+
+
+@pytest.mark.parametrize(("radius", "first"), [(0.05, np.pi / 2), (0.15, 0.0)])
+def test_another_direction_counts_less_of_a_large_object(models, radius, first):
+    surface = dataclasses.replace(models["block"].surface)
+    surface.__dict__["radius"] = radius
+    turned, shown = (
+        Place(np.array([0.0, 0.0, 0.0, yaw]), score) for yaw, score in ((np.pi / 2, 0.6), (0, 0.55))
+    )
+    for places in ([turned, shown], [shown, turned]):
+        assert _ranked(surface, places)[0].pose[3] == first
 
 
 def test_it_is_followed_from_where_it_is_expected(models):
