@@ -9,12 +9,12 @@ from tests.memory.builders import entry, hand_pose, pick_and_place, robot
 
 from lerobot_openspm.control import feasibility
 from lerobot_openspm.control.clearance import BESIDE, CLEARANCE_M, Way, crowding, lifted
-from lerobot_openspm.control.feasibility import TransferLimits, check_reach, find_stance
+from lerobot_openspm.control.feasibility import TransferLimits, find_stance
 from lerobot_openspm.control.planning import MOST_IN_A_SCENE, Plan
 from lerobot_openspm.control.state import Status
 from lerobot_openspm.control.transfer import Turn, transfer
 from lerobot_openspm.geometry import se3
-from lerobot_openspm.geometry.arm import OUT_OF_REACH_RAD, load_arm
+from lerobot_openspm.geometry.arm import load_arm
 from lerobot_openspm.memory.compose import Candidate
 from lerobot_openspm.memory.entry import Anchor
 from lerobot_openspm.perception.objects.box.model import BoxModel
@@ -321,17 +321,6 @@ def test_a_way_that_cannot_be_lifted_is_gone_straight_and_that_is_said(caplog):
     (record,) = caplog.records
     assert "the post may be in the way" in record.getMessage()
     assert "outside the demonstrated workspace" in record.getMessage()
-
-
-@pytest.mark.parametrize(
-    ("phase", "times", "is_missed"), [("approach", 1.5, True), ("retreat", 1.5, False), ("retreat", 4, True)]
-)
-def test_a_hand_that_backs_off_may_miss_by_more(panda, monkeypatch, phase, times, is_missed):
-    context, poses, home = scene(panda, 0.0)
-    first = Plan(context.entries[0], poses, home).targets(context)[0]
-    target = replace(first, key_pose=replace(first.key_pose, phase=phase))
-    monkeypatch.setattr(type(panda), "misses", lambda *_: [(0.0, times * OUT_OF_REACH_RAD)])
-    assert (check_reach([target], home, panda, np.zeros(7)) is not None) == is_missed
 
 
 def test_a_key_pose_that_no_turn_moves_ends_the_search(panda, monkeypatch):

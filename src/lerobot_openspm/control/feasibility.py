@@ -25,8 +25,6 @@ MAX_JUMP_M, MAX_JUMP_RAD = 0.8, 2.8
 FREE_SPACE_SHARE = 0.2
 # An entry whose motions differ by this much scores 1/e.
 SHAPE_SCALE_M = 0.1
-# Where the hand only backs off it may miss a key pose by so many times as much.
-BACKING_OFF = 3
 # An entry that can be executed at all scores at least this.
 MIN_USABLE_SCORE = 1e-3
 
@@ -133,8 +131,7 @@ def check_reach(targets: Sequence[Target], T_world_ee: Array, arm: Arm, stance: 
     """
     misses = arm.misses((target.T_world_ee for target in targets), T_world_ee, stance)
     for i, (target, (metres, radians)) in enumerate(zip(targets, misses, strict=True)):
-        times = BACKING_OFF if target.key_pose.phase == "retreat" else 1
-        if metres > times * OUT_OF_REACH_M or radians > times * OUT_OF_REACH_RAD:
+        if metres > OUT_OF_REACH_M or radians > OUT_OF_REACH_RAD:
             return Miss(i, target, metres, radians)
     return None
 
