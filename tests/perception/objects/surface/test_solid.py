@@ -75,6 +75,24 @@ def test_what_pictures_disagree_about_is_taken_out_down_to_where_they_agree():
     assert (np.abs(heights - 4) <= 2).mean() > 0.85
 
 
+def test_every_surface_is_drawn_once_a_picture_and_the_nearest_counts(monkeypatch):
+    drawn = []
+    draw = Solid.depth
+    monkeypatch.setattr(
+        Solid, "depth", lambda self, frame, name: drawn.append(name) or draw(self, frame, name)
+    )
+    view, shown = picture(looking_down(*PLACES[0]), 0.0, np.zeros((1, 1, 3)), CELL)
+    frame = Frame("hand", view, shown, None, {"low": np.eye(4), "high": np.eye(4), "unknown": np.eye(4)})
+    depths = Depths({"low": block(16, 2), "high": block(6, 9), "absent": block(6, 20)})
+    both, low, high = depths.nearest(frame), depths.nearest(frame, "high"), depths.nearest(frame, "low")
+    assert_array_equal(both, np.minimum(low, high))
+    assert (both < low).any()
+    assert (both < high).any()
+    assert_array_equal(depths.covered(frame) | ~np.isfinite(both), True)
+    assert not np.isfinite(depths.nearest(Frame("hand", view, shown, None, {}))).any()
+    assert sorted(drawn) == ["high", "low"]
+
+
 def test_only_the_largest_piece_is_kept():
     solid = block(6, 2)
     alone = solid.filled.copy()

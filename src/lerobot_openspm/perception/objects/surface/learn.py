@@ -52,7 +52,7 @@ RIVAL_SCENES, MARGIN_PX = 6, 6
 MIN_COLOURED = 40
 
 # The views of the demonstrations' first moments, and where an object stands in each: ``T_world_obj`` (4, 4).
-Standing = Sequence[tuple[Mapping[str, View], Array]]
+FirstSights = Sequence[tuple[Mapping[str, View], Array]]
 
 
 def learn_surfaces(examples: Examples) -> dict[str, SurfaceModel | PatchModel]:
@@ -206,7 +206,7 @@ def _completed(points: Array, normals: Array, colours: Array) -> Float32:
     return done
 
 
-def _pattern(surface: Surface, standing: Standing, backdrop: Backdrop) -> float:
+def _pattern(surface: Surface, standing: FirstSights, backdrop: Backdrop) -> float:
     """How much the pattern of an object tells, from 0 to 1: by how well the demonstrations show it."""
     seen = []
     for views, T in standing:
@@ -216,7 +216,7 @@ def _pattern(surface: Surface, standing: Standing, backdrop: Backdrop) -> float:
     return float(np.clip((np.median(seen) - low) / (high - low), 0, 1)) if seen else 0.0
 
 
-def _agreements(surface: Surface, standing: Standing, backdrop: Backdrop) -> tuple[float, float]:
+def _agreements(surface: Surface, standing: FirstSights, backdrop: Backdrop) -> tuple[float, float]:
     """How well first pictures agree with the object where it stands, and with the best place without it.
 
     The first is the median of demonstrations, the second the most of some of them.
