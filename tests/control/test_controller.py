@@ -8,7 +8,8 @@ from tests.memory.builders import OPEN_WIDTH, entry, hand_pose, robot
 
 from lerobot_openspm.control.controller import EpisodeController
 from lerobot_openspm.control.feasibility import TransferLimits
-from lerobot_openspm.control.planning import MOVED_M, PlanningContext
+from lerobot_openspm.control.plan import MOVED_M
+from lerobot_openspm.control.planning import PlanningContext
 from lerobot_openspm.control.scene import LOOK_AGAIN_S
 from lerobot_openspm.control.state import Status
 from lerobot_openspm.geometry import se3

@@ -5,7 +5,8 @@ import pytest
 from numpy.testing import assert_allclose
 from tests.memory.builders import entry, hand_pose, key_pose, robot
 
-from lerobot_openspm.control.planning import Plan, PlanningContext
+from lerobot_openspm.control.plan import Plan
+from lerobot_openspm.control.planning import PlanningContext
 from lerobot_openspm.control.transfer import HALF_TURN, transfer
 from lerobot_openspm.geometry import se3
 from lerobot_openspm.memory.entry import WORLD, Anchor, Outcome

@@ -8,7 +8,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from lerobot_openspm.control.grounding import Grounding, demonstrations, references
-from lerobot_openspm.control.planning import Plan, PlanningContext
+from lerobot_openspm.control.plan import Plan
+from lerobot_openspm.control.planning import PlanningContext
 from lerobot_openspm.control.reasons import why_missing
 from lerobot_openspm.control.transfer import Target
 from lerobot_openspm.geometry.se3 import Array

@@ -8,7 +8,7 @@ from enum import StrEnum
 
 import numpy as np
 
-from lerobot_openspm.control.planning import NO_PLAN, Plan
+from lerobot_openspm.control.plan import NO_PLAN, Plan
 from lerobot_openspm.memory.compose import Candidate
 from lerobot_openspm.memory.entry import MemoryEntry, Outcome
 from lerobot_openspm.memory.retrieval import Scored

@@ -68,6 +68,7 @@ def transfer(
     T_world_ee: Array,
     gone: Mapping[int, float] | None = None,
     turns: Mapping[int, Turn] | None = None,
+    retreat_m: float = RETREAT_M,
 ) -> tuple[Target, ...]:
     """Carry an entry's key poses over to the scene.
 
@@ -81,6 +82,7 @@ def transfer(
         T_world_ee: Present hand pose ``(4, 4)``.
         gone: How far a drawer or a knob has moved already, by sub-task, metres or radians.
         turns: By how much the grasp of an object is turned about its axis of symmetry, by sub-task.
+        retreat_m: How far the hand backs off at the end of a demonstration that was cut before it did.
     """
     chosen: dict[str, Array] = {}
     targets: list[Target] = []
@@ -109,7 +111,7 @@ def transfer(
         targets = _gone_on(targets, sub_task, amount)
     if targets and entry.key.sub_tasks[-1].operation == "put":
         targets += _release(targets)
-    return tuple(targets) + _retreat(targets)
+    return tuple(targets) + _retreat(targets, retreat_m)
 
 
 def _turned(targets: Sequence[Target], sub_task: int, turn: Turn) -> list[Target]:
@@ -205,7 +207,7 @@ def _release(targets: Sequence[Target]) -> list[Target]:
     return [Target(last.T_world_ee, key_pose, precise=True)]
 
 
-def _retreat(targets: Sequence[Target]) -> tuple[Target, ...]:
+def _retreat(targets: Sequence[Target], metres: float) -> tuple[Target, ...]:
     """Backing off at the end, for a demonstration that was cut when its goal was reached.
 
     The hand leaves the way it came: against the direction in which it arrived at its last contact, in the
@@ -221,11 +223,11 @@ def _retreat(targets: Sequence[Target]) -> tuple[Target, ...]:
     if not arrivals or not contacts:
         return ()
     last, contact = targets[-1], contacts[-1]
-    if float(se3.distances(last.T_world_ee, contact.T_world_ee)[0]) >= RETREAT_M:
+    if float(se3.distances(last.T_world_ee, contact.T_world_ee)[0]) >= metres:
         return ()
     arrival, before = targets[arrivals[-1]], targets[arrivals[-1] - 1]
     back = (se3.inverse(arrival.T_world_ee) @ before.T_world_ee)[:3, 3]
-    step = se3.transform(np.eye(3), RETREAT_M * back / max(float(np.linalg.norm(back)), 1e-9))
+    step = se3.transform(np.eye(3), metres * back / max(float(np.linalg.norm(back)), 1e-9))
     key_pose = replace(last.key_pose, phase="retreat", n_steps=1, dwell=False, confidence=0.5)
     return (Target(contact.T_world_ee @ step, key_pose, precise=False),)
 

@@ -1,0 +1,182 @@
+"""An entry, and the scene that its key poses are carried over to."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from lerobot_openspm.control.feasibility import Miss, check_reach, check_transfer
+from lerobot_openspm.control.pushes import pushed_by_landmark
+from lerobot_openspm.control.transfer import (
+    HALF_TURN,
+    RETREAT_M,
+    Target,
+    Turn,
+    half_turned,
+    transfer,
+)
+from lerobot_openspm.geometry import se3
+from lerobot_openspm.geometry.se3 import Array
+from lerobot_openspm.memory.entry import MemoryEntry, MemoryKeyPose, RetrievalKey
+from lerobot_openspm.types import SubTask
+
+if TYPE_CHECKING:
+    from lerobot_openspm.control.planning import PlanningContext
+
+# An object this far from where the key poses took it to be takes them along; less is noise.
+MOVED_M, MOVED_RAD = 0.002, 0.05
+# Grasps of objects that turn into themselves are turned by so much or what their symmetry allows of it,
+# radians.
+TURNS = tuple(
+    np.deg2rad([0, *(sign * turn for turn in range(30, 180, 30) for sign in (1, -1)), 180]).tolist()
+)
+# What a retreat of our own is shortened to where the arm does not reach further, metres.
+SHORTER_RETREATS_M = (RETREAT_M / 2, 0.0)
+# Where an object is that was never seen.
+NOWHERE = se3.transform(np.eye(3), np.full(3, np.inf))
+
+
+@dataclass(frozen=True)
+class Plan:
+    """An entry, and the scene that its key poses are carried over to.
+
+    Attributes:
+        entry: What is acted by.
+        object_poses: Poses ``T_world_obj`` ``(4, 4)`` that the key poses are carried over by. For what the
+            hand has touched they are those from before.
+        T_world_ee: The hand's pose ``(4, 4)`` where the plan begins.
+        turned: How far the hand is turned about the axis of objects that it grasps, which turn into
+            themselves by that, radians.
+        is_half_turned: Whether the hand is turned by half a turn about its approach axis.
+        stance: The arm's joint angles ``(n,)`` where the plan begins; None where they are not known, and
+            reach is not checked by them.
+        retreat_m: How far the hand backs off at the end of a demonstration that was cut before it did.
+    """
+
+    entry: MemoryEntry
+    object_poses: Mapping[str, Array]
+    T_world_ee: Array
+    turned: float = 0.0
+    is_half_turned: bool = False
+    stance: Array | None = None
+    retreat_m: float = RETREAT_M
+
+    def targets(
+        self,
+        context: PlanningContext,
+        gone: Mapping[int, float] | None = None,
+        last: int | None = None,
+    ) -> tuple[Target, ...]:
+        """The key poses in the scene; see :func:`transfer`. Those after sub-task `last` are left out."""
+        entry = self.entry if last is None else self.entry.until(last)
+        turns = {
+            sub_task: Turn(self.object_poses[name], context.symmetries[name].middle, self.turned)
+            for sub_task, name in self.symmetric_grasps(context).items()
+            if self.turned and name in self.object_poses
+        }
+        # Which pose of a symmetric object is meant is told by the hand as it was demonstrated.
+        T_world_ee = self.T_world_ee @ HALF_TURN if self.is_half_turned else self.T_world_ee
+        scene = self.object_poses, context.yaw_periods, T_world_ee
+        targets = transfer(entry, *scene, gone, turns, self.retreat_m)
+        return half_turned(targets) if self.is_half_turned else targets
+
+    def symmetric_grasps(self, context: PlanningContext) -> dict[int, str]:
+        """Objects that are grasped and turn into themselves, by sub-task."""
+        grasps = (pose for pose in self.entry.key_poses if pose.phase == "grasp")
+        return {p.sub_task: p.anchor.place for p in grasps if p.anchor.place in context.symmetries}
+
+    def turns(self, context: PlanningContext) -> list[float]:
+        """By how much its grasps may be turned, the least first, radians; none but 0 without a symmetry."""
+        least = [context.symmetries[name].turn for name in self.symmetric_grasps(context).values()]
+        return [
+            radians
+            for radians in TURNS
+            if radians == 0 or (least and all(turn == 0 or _is_multiple(radians, turn) for turn in least))
+        ]
+
+    def problems(self, context: PlanningContext) -> list[str]:
+        """What keeps the hand from following the plan, in words."""
+        targets = self.targets(context)
+        problems = check_transfer(targets, self.T_world_ee, context.robot, context.limits)
+        if not problems and (miss := self.miss(context, targets)):
+            return [str(miss)]
+        return problems
+
+    def miss(self, context: PlanningContext, targets: Sequence[Target]) -> Miss | None:
+        """The first of its key poses in the scene that the arm's joints do not reach, as far as is known."""
+        arm = context.robot.arm
+        if arm is None or self.stance is None:
+            return None
+        return check_reach(targets, self.T_world_ee, arm, self.stance)
+
+    def backing_off(self, context: PlanningContext) -> tuple[Plan, Miss | None]:
+        """The plan, backing off as far as the arm reaches, and the first key pose that it does not reach.
+
+        Only a retreat of our own is shortened: what was demonstrated has to be reached.
+        """
+        plan, miss = self, self.miss(context, self.targets(context))
+        for metres in SHORTER_RETREATS_M:
+            if miss is None or miss.index < len(self.entry.key_poses):
+                break
+            plan = replace(self, retreat_m=metres)
+            miss = plan.miss(context, plan.targets(context))
+        return plan, miss
+
+    def is_same_scene(self, object_poses: Mapping[str, Array], T_world_ee: Array) -> bool:
+        """Whether the same objects, and the hand, are where the plan was made for."""
+        is_still = float(se3.distance(self.T_world_ee, T_world_ee)) < MOVED_M
+        is_known = object_poses.keys() == self.object_poses.keys()
+        return is_still and is_known and not self.moved(list(object_poses), object_poses)
+
+    def moved(self, names: Sequence[str], object_poses: Mapping[str, Array]) -> dict[str, Array]:
+        """The poses of those objects that are elsewhere now than where the plan takes them to be."""
+        moved: dict[str, Array] = {}
+        for name in (name for name in names if name in object_poses):
+            T = object_poses[name]
+            metres, radians = se3.distances(T, self.object_poses.get(name, NOWHERE))
+            if metres > MOVED_M or radians > MOVED_RAD:
+                moved[name] = T
+        return moved
+
+    def objects(self, index: int, altered: Collection[str]) -> list[str]:
+        """Objects of the key poses from an index on, without those that look different by now."""
+        ahead = self.entry.key_poses[index:]
+        names = dict.fromkeys(name for pose in ahead for name in pose.anchor.objects)
+        # What is pushed is needed until the push begins, also if no key pose belongs to it.
+        pushed = pushed_by_landmark(self.entry)
+        for pose in ahead[1:]:
+            if pose.phase == "push" and pose.sub_task in pushed:
+                names[pushed[pose.sub_task]] = None
+        return [name for name in names if name not in altered]
+
+    def touched(self, passed: Sequence[Target]) -> set[str]:
+        """What the hand took hold of or moved at the key poses passed: it is elsewhere from then on."""
+        touched: set[str] = set()
+        for pose in (target.key_pose for target in passed):
+            if pose.phase == "push":  # its anchor may be where the target goes
+                touched.add(self.sub_task(pose).target)
+            elif pose.phase in ("grasp", "open", "turn"):
+                touched.add(pose.anchor.place)
+        return touched
+
+    def regrasped(self, index: int) -> set[str]:
+        """What is grasped from a key pose on, within its sub-task: it is not in the hand any more."""
+        ahead = self.entry.key_poses[index:]
+        own = [pose for pose in ahead if pose.sub_task == ahead[0].sub_task]
+        return {pose.anchor.place for pose in own if pose.phase in ("approach", "grasp")}
+
+    def sub_task(self, pose: MemoryKeyPose) -> SubTask:
+        """The sub-task that a key pose serves."""
+        return self.entry.key.sub_tasks[pose.sub_task]
+
+
+# Before the first plan: nothing is done, nowhere.
+NO_PLAN = Plan(MemoryEntry(RetrievalKey((), ()), "", (), 0.0, 0, ""), {}, np.eye(4))
+
+
+def _is_multiple(radians: float, turn: float) -> bool:
+    """Whether an angle is some turns, to a degree."""
+    return abs(radians / turn - round(radians / turn)) * turn < np.deg2rad(1)

@@ -1,0 +1,147 @@
+"""Key poses that the arm's joints cannot reach: refused, or met another way."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+from tests.control.test_controller import planning_context
+from tests.geometry.test_arm import LIBERO
+from tests.memory.builders import entry, hand_pose, key_pose, robot
+
+from lerobot_openspm.control import feasibility
+from lerobot_openspm.control.feasibility import TransferLimits, find_stance
+from lerobot_openspm.control.plan import Plan
+from lerobot_openspm.control.transfer import RETREAT_M
+from lerobot_openspm.geometry import se3
+from lerobot_openspm.geometry.arm import load_arm
+from lerobot_openspm.memory.compose import Candidate
+from lerobot_openspm.memory.entry import Anchor, Axis
+from lerobot_openspm.types import Symmetry
+
+
+@pytest.fixture
+def panda(request):
+    return load_arm(request.config.rootpath / LIBERO)
+
+
+def scene(panda, yaw, x=-0.1, turn=0.0):
+    """A context with a Panda, poses of a bowl and a plate that were turned together, and the hand's."""
+    poses = {"bowl": se3.from_yaw([x, 0.1, 0.9], yaw), "plate": se3.from_yaw([-0.05, -0.1, 0.9], yaw)}
+    context = planning_context(symmetries={"bowl": Symmetry(np.zeros(2), turn)})
+    own = robot(workspace=np.array([[-2.0, -2.0, 0.0], [2.0, 2.0, 2.0]]), arm=panda)
+    return replace(context, robot=own), poses, hand_pose(-0.2, 0.0, 1.17)
+
+
+def chosen(context, poses, home):
+    (shown,) = context.entries
+    candidate = Candidate(shown, 1.0, shown, shown.key.sub_tasks)
+    return context.choose(context.rank([candidate], poses, home), poses, home)
+
+
+def test_a_grasp_that_the_joints_cannot_reach_is_turned_about_a_round_object(panda):
+    # The last joint may turn by less, so that the hand cannot; the bowl looks alike from all sides.
+    *joints, last = panda.joints
+    stiff = replace(panda, joints=(*joints, replace(last, limits=np.array([-0.5, 1.5]))))
+    context, poses, home = scene(stiff, np.deg2rad(90))
+    plan = Plan(context.entries[0], poses, home)
+    assert not plan.problems(context)
+    (problem,) = replace(plan, stance=find_stance(context.robot, home)).problems(context)
+    assert "beyond what the arm's joints reach" in problem
+    plan, problems = chosen(context, poses, home)
+    assert plan.turned != 0
+    assert problems == plan.problems(context) == []
+
+
+@pytest.mark.parametrize(
+    ("turn", "expected"), [(np.pi, [0, 180]), (np.pi / 2, [0, 90, -90, 180]), (2.0, [0]), (None, [0])]
+)
+def test_grasps_are_turned_by_what_the_shape_allows(panda, turn, expected):
+    context, poses, home = scene(panda, 0.0, turn=turn)
+    if turn is None:
+        context = replace(context, symmetries={})
+    assert_allclose(np.rad2deg(Plan(context.entries[0], poses, home).turns(context)), expected)
+
+
+def test_a_grasp_within_reach_stays_as_shown(panda):
+    assert chosen(*scene(panda, 0.0))[0].turned == 0
+
+
+def test_what_is_out_of_reach_from_all_sides_is_refused(panda):
+    context, poses, home = scene(panda, 0.0, x=0.9)
+    assert chosen(context, poses, home)[1]
+
+
+def test_an_arm_that_does_not_fit_the_scene_is_named_once_and_refuses_nothing(panda, caplog):
+    # LIBERO's other suites have the robot on the floor.
+    first, *others = panda.joints
+    lower = replace(first, T_before_joint=se3.transform(np.eye(3), [0, 0, -0.912]) @ first.T_before_joint)
+    context, poses, home = scene(replace(panda, joints=(lower, *others)), 0.0)
+    for _ in range(2):
+        assert chosen(context, poses, home)[1] == []
+    (record,) = caplog.records
+    assert record.getMessage().startswith("the arm does not fit: its joints miss even where the hand is now")
+    assert "--policy.arm=FILE" in record.getMessage()
+
+
+def test_a_key_pose_that_no_turn_moves_ends_the_search(panda, monkeypatch):
+    context, poses, home = scene(panda, 0.0)
+    shown = context.entries[0]
+    # The second sub-task grasps nothing that turns into itself, and is out of reach.
+    poses |= {"cup": se3.from_yaw([0.9, 0.0, 0.9], 0.0)}
+    reach = replace(shown.key_poses[0], sub_task=1, anchor=Anchor("cup", "cup"))
+    far = replace(shown, key_poses=(*shown.key_poses, reach), object_poses=poses)
+    asked = []
+    monkeypatch.setattr(type(panda), "misses", counted(type(panda).misses, asked))
+    context = replace(context, limits=TransferLimits(), entries=(far,))
+    monkeypatch.setattr(feasibility, "MAX_JUMP_M", 2.0)
+    plan, (problem,) = chosen(context, poses, home)
+    assert plan.entry is far
+    assert "at cup" in problem
+    assert len(asked) == 3  # either way round, and to say what is wrong
+
+
+def counted(function, calls):
+    def call(*args):
+        calls.append(args)
+        return function(*args)
+
+    return call
+
+
+def drawer(x):
+    """A drawer of LIBERO that is pulled towards where the arm is stretched, x metres from the table's middle.
+
+    The demonstration ends with the drawer open; backing off is of our own.
+    """
+    hand = se3.transform(se3.exp_so3([1.57, -0.035, -0.035]), np.zeros(3))
+    poses = [
+        key_pose("cabinet", se3.transform(np.eye(3), p) @ hand, phase, phase != "approach", axis=axis)
+        for p, phase, axis in (
+            ([0.018, 0.035, -0.002], "approach", None),
+            ([0.003, 0.0, 0.002], "approach", None),
+            ([0.0, 0.0, 0.0], "grasp", None),
+            ([0.003, 0.154, 0.0], "open", Axis("slide", np.array([0.0, 1.0, 0.0]), 0.154)),
+        )
+    ]
+    poses_now = {"cabinet": se3.from_yaw([x, -0.133, 1.014], 0.0)}
+    return entry("open the top drawer of the cabinet", poses, poses_now), poses_now
+
+
+@pytest.mark.parametrize(("x", "backs_off"), [(-0.05, RETREAT_M), (0.04, RETREAT_M / 2), (0.07, 0.0)])
+def test_the_hand_backs_off_as_far_as_the_arm_reaches(panda, x, backs_off):
+    shown, poses = drawer(x)
+    context, _, _ = scene(panda, 0.0)
+    context = replace(context, entries=(shown,))
+    plan, problems = chosen(context, poses, hand_pose(-0.22, -0.01, 1.177))
+    assert problems == plan.problems(context) == []
+    opened, *left = plan.targets(context)[3:]
+    gone = [se3.distances(opened.T_world_ee, one.T_world_ee)[0] for one in left]
+    assert_allclose(gone, [backs_off] if backs_off else [], atol=1e-9)
+
+
+def test_a_drawer_that_cannot_be_opened_all_the_way_is_refused(panda):
+    shown, poses = drawer(0.08)
+    context, _, _ = scene(panda, 0.0)
+    _, (problem,) = chosen(replace(context, entries=(shown,)), poses, hand_pose(-0.22, -0.01, 1.177))
+    assert "(open at cabinet)" in problem
