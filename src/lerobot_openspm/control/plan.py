@@ -15,6 +15,7 @@ from lerobot_openspm.control.transfer import (
     RETREAT_M,
     Target,
     Turn,
+    as_shown,
     half_turned,
     transfer,
 )
@@ -72,14 +73,15 @@ class Plan:
     ) -> tuple[Target, ...]:
         """The key poses in the scene; see :func:`transfer`. Those after sub-task `last` are left out."""
         entry = self.entry if last is None else self.entry.until(last)
+        object_poses = as_shown(entry, self.object_poses, context.symmetries)
         turns = {
-            sub_task: Turn(self.object_poses[name], context.symmetries[name].middle, self.turned)
+            sub_task: Turn(object_poses[name], context.symmetries[name].middle, self.turned)
             for sub_task, name in self.symmetric_grasps(context).items()
-            if self.turned and name in self.object_poses
+            if self.turned and name in object_poses
         }
         # Which pose of a symmetric object is meant is told by the hand as it was demonstrated.
         T_world_ee = self.T_world_ee @ HALF_TURN if self.is_half_turned else self.T_world_ee
-        scene = self.object_poses, context.yaw_periods, T_world_ee
+        scene = object_poses, context.yaw_periods, T_world_ee
         targets = transfer(entry, *scene, gone, turns, self.retreat_m)
         return half_turned(targets) if self.is_half_turned else targets
 

@@ -17,6 +17,7 @@ from lerobot_openspm.control.feasibility import (
 )
 from lerobot_openspm.control.plan import Plan
 from lerobot_openspm.control.pushes import pushed_by_landmark
+from lerobot_openspm.control.transfer import as_shown
 from lerobot_openspm.geometry import se3
 from lerobot_openspm.geometry.se3 import Array
 from lerobot_openspm.language.meaning import means_the_same
@@ -99,8 +100,10 @@ class PlanningContext:
 
         The scene is the poses ``T_world_obj`` ``(4, 4)`` of the objects that were found, and the hand's.
         """
-        scene = object_poses, self.yaw_periods, T_world_ee, self.robot, self.limits
-        geometric = {id(one.entry): geometric_score(one.entry, *scene) for one in candidates}
+        rest = self.yaw_periods, T_world_ee, self.robot, self.limits
+        entries = [one.entry for one in candidates]
+        poses = [as_shown(entry, object_poses, self.symmetries) for entry in entries]
+        geometric = {id(e): geometric_score(e, own, *rest) for e, own in zip(entries, poses, strict=True)}
         semantic = [(one.entry, one.semantic) for one in candidates]
         return tuple(retrieve(semantic, lambda entry: geometric[id(entry)], self.names))
 

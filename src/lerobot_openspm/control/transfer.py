@@ -12,6 +12,7 @@ from lerobot_openspm.control.pushes import PushPath, push_paths
 from lerobot_openspm.geometry import se3
 from lerobot_openspm.geometry.se3 import Array
 from lerobot_openspm.memory.entry import CONTACT_PHASES, Axis, MemoryEntry, MemoryKeyPose
+from lerobot_openspm.types import Symmetry
 
 # How far the hand backs off at the end.
 RETREAT_M = 0.06
@@ -59,6 +60,34 @@ class Target:
 def transfer_pose(T_world_obj: Array, T_obj_ee: Array) -> Array:
     """``T_world_ee = T_world_obj @ T_obj_ee``, the paper's transfer rule; batched over leading axes."""
     return T_world_obj @ T_obj_ee
+
+
+def as_shown(
+    entry: MemoryEntry, object_poses: Mapping[str, Array], symmetries: Mapping[str, Symmetry]
+) -> dict[str, Array]:
+    """Object poses with what an entry grasps turned into itself, as near to how it was shown as can be.
+
+    A bottle with a label is found turned by any angle, and grasped and put down as if it were not.
+
+    Args:
+        entry: The entry.
+        object_poses: Poses ``T_world_obj`` ``(4, 4)``.
+        symmetries: How objects turn into themselves, of those that do.
+    """
+    shown = dict(object_poses)
+    grasped = {pose.anchor.place for pose in entry.key_poses if pose.phase == "grasp"}
+    for name in grasped & symmetries.keys() & object_poses.keys() & entry.object_poses.keys():
+        own, T = symmetries[name], object_poses[name]
+        off = float(se3.yaw_of(T) - se3.yaw_of(entry.object_poses[name]))
+        left = float(se3.wrap_angle(off, own.turn)) if own.turn else 0.0
+        shown[name] = T @ about(own.middle, left - off)
+    return shown
+
+
+def about(middle: Array, radians: float) -> Array:
+    """A turn ``(4, 4)`` about the vertical through a point ``(2,)``."""
+    point = np.array([*middle, 0.0])
+    return se3.from_yaw(point, radians) @ se3.from_yaw(-point, 0.0)
 
 
 def transfer(
@@ -131,8 +160,7 @@ def _turned(targets: Sequence[Target], sub_task: int, turn: Turn) -> list[Target
         if pose.phase == "grasp" and T_ee_obj is None:
             T_ee_obj = se3.inverse(target.T_world_ee) @ turn.T_world_obj
         point = se3.apply(axis, np.array([[*turn.middle, 0.0]]))[0]
-        about = se3.from_yaw(point, turn.radians) @ se3.from_yaw(-point, 0.0)
-        turned[i] = replace(target, T_world_ee=about @ target.T_world_ee)
+        turned[i] = replace(target, T_world_ee=about(point[:2], turn.radians) @ target.T_world_ee)
     return turned
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Protocol
 
 import cv2
@@ -12,7 +12,7 @@ import numpy as np
 from lerobot_openspm.geometry import se3
 from lerobot_openspm.geometry.camera import Camera, project
 from lerobot_openspm.geometry.se3 import Array
-from lerobot_openspm.perception.objects.base import KnownObject, Look, localise_all, look_at
+from lerobot_openspm.perception.objects.base import EarlierLook, KnownObject, Look, localise_all, look_at
 from lerobot_openspm.perception.observation import Observation
 from lerobot_openspm.perception.oracle import name_simulator_poses
 from lerobot_openspm.perception.tracking.camera_health import MIN_COMMON, CameraWatch, disagreements
@@ -22,6 +22,9 @@ from lerobot_openspm.types import Detections, Fault, Mask, PoseEstimate, Segment
 ORACLE_STD = 1e-4
 # So many objects are compared between views at most.
 MOST_COMPARED = 6
+# The first look is remembered and so many of the last ones, each from where the hand's camera was so far from
+# where it was before, metres, or turned by so much, radians.
+MOST_REMEMBERED, ELSEWHERE_M, ELSEWHERE_RAD = 3, 0.05, 0.3
 # The hand and the arm behind it as balls along the hand's approach axis: from its fingertips this far back.
 TIP_M, BACK_M, BALLS = 0.01, -0.30, 12
 # The fingers are slimmer than what carries them; they end here.
@@ -69,6 +72,7 @@ class Perception:
     _has_looked: bool = False
     _has_compared: bool = False
     _labelled: set[str] = field(default_factory=set[str])
+    _before: tuple[EarlierLook, ...] = ()
 
     def detect(
         self,
@@ -109,12 +113,21 @@ class Perception:
             return Detections({}, faults)
         hidden = {camera: hand_mask(view, T_world_ee, self.hand_radius_m) for camera, view in sound.items()}
         known = {name: self.memory.objects[name] for name in names if name in self.memory.objects}
-        look = look_at(sound, list(known), self.segmenter, hidden, expected, told_apart)
+        look = look_at(sound, list(known), self.segmenter, hidden, expected, told_apart, self._before)
         estimates = localise_all(known, look)
+        self._remember(look, estimates)
         if not self._has_compared:  # only at the first look, before anything moves
             self._has_compared = True
             faults = faults or disagreeing_cameras(look, known, estimates)
         return Detections(estimates, faults)
+
+    def _remember(self, look: Look, estimates: Mapping[str, PoseEstimate]) -> None:
+        """Keep a look from elsewhere than the last one that was kept."""
+        if self._before and not _is_elsewhere(look, self._before[-1].look):
+            return
+        poses = {name: one.T_world_obj for name, one in estimates.items() if one.status == "found"}
+        kept = EarlierLook(replace(look, before=()), poses)
+        self._before = (*self._before[:1], *self._before[1:][-MOST_REMEMBERED + 1 :], kept)
 
     def _simulator_poses(self, observation: Observation, names: Sequence[str]) -> dict[str, PoseEstimate]:
         poses = observation.simulator_poses(self.memory.simulator_objects)
@@ -151,6 +164,16 @@ def disagreeing_cameras(
         }
     # What such a camera shows was never usable.
     return {camera: Fault(reason, float("inf")) for camera, reason in disagreements(places).items()}
+
+
+def _is_elsewhere(look: Look, before: Look) -> bool:
+    """Whether a camera of the hand is elsewhere, or looks in another direction, than it did before."""
+    for camera, view in look.views.items():
+        if view.camera.mount == "ee" and camera in before.views:
+            metres, radians = se3.distances(view.T_world_cam, before.views[camera].T_world_cam)
+            if metres > ELSEWHERE_M or radians > ELSEWHERE_RAD:
+                return True
+    return False
 
 
 def detect(

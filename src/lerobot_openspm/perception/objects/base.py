@@ -72,6 +72,7 @@ class Look:
         expected: Poses ``T_world_obj`` ``(4, 4)`` by object at which it is looked for first.
         told_apart: Objects that words tell from others of their kind, all of which are sought therefore.
         supports: Points ``(n, 3)`` of other things' surfaces, world, that an object may stand on or in.
+        before: Earlier looks from elsewhere, the oldest first.
 
     Raises:
         ObservationError: There is no view, or one is malformed.
@@ -83,6 +84,7 @@ class Look:
     expected: Mapping[str, Array] = field(default_factory=dict[str, Array])
     told_apart: Collection[str] = ()
     supports: Array = field(default_factory=lambda: np.zeros((0, 3)))
+    before: Sequence[EarlierLook] = ()
     _bins: dict[str, Bins] = field(default_factory=dict[str, Bins])
     _prepared: dict[Hashable, Any] = field(default_factory=dict[Hashable, Any])
 
@@ -127,6 +129,19 @@ class Look:
         return max(shares)
 
 
+@dataclass(frozen=True)
+class EarlierLook:
+    """A look of before, and where objects were found in it.
+
+    Attributes:
+        look: The look.
+        poses: Poses ``T_world_obj`` ``(4, 4)`` by object, of those that were found.
+    """
+
+    look: Look
+    poses: Mapping[str, Array]
+
+
 def look_at(
     views: Mapping[str, View],
     phrases: Sequence[str],
@@ -134,10 +149,11 @@ def look_at(
     hidden: Mapping[str, Mask],
     expected: Mapping[str, Array],
     told_apart: Collection[str] = (),
+    before: Sequence[EarlierLook] = (),
 ) -> Look:
     """A :class:`Look` for objects. A segmenter is asked once for all of their phrases."""
     found = segmenter.segment(views, phrases) if segmenter is not None and phrases else {}
-    return Look(views, found, hidden, expected, told_apart)
+    return Look(views, found, hidden, expected, told_apart, before=before)
 
 
 def localise_all(objects: Mapping[str, KnownObject], look: Look) -> dict[str, PoseEstimate]:

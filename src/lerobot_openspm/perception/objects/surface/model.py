@@ -61,6 +61,9 @@ KEPT_SHARE, GONE_SHARE = 0.7, 0.4
 # That it is where it was expected needs less evidence, if the pictures tell its place as sharply as this:
 # from this share on nothing is in doubt. What tells it more vaguely than that is no evidence. Metres.
 SURE_SHARE, SHARP_M, VAGUE_M = 0.8, 0.004, 0.008
+# Earlier looks that found an object less than so far from where it is expected, metres, count as long as the
+# place by all of them agrees with the present look by this share of the typical agreement.
+STILL_M, STILL_SHARE = 0.03, 0.85
 # Directions that the search begins from, for an object that does not look alike from all of them.
 YAWS = tuple(np.linspace(0, 2 * np.pi, 8, endpoint=False))
 # An object that agrees less than this share with its best place on the table may stand on something. That is
@@ -158,9 +161,31 @@ class SurfaceModel:
         return self._is_lifted(T_expected) or not self.near.reaches(T_expected, FOLLOWED_M)
 
     def _at(self, look: Look, T_expected: Array) -> PoseEstimate:
-        """What is seen of it around where it is expected."""
+        """What is seen of it around where it is expected.
+
+        By earlier looks too, as long as the place by all of them explains the present one: a look from nearby
+        shows only a part of an object, and tells its place badly.
+        """
         sights = self._sights(look)
+        if before := self._sights_before(look, T_expected):
+            both = sights | before
+            still = refine(self.surface, both, _pose(T_expected), self._freedom, FINE_POINTS, FINE_STEPS)
+            score = score_at(self.surface, sights, still.pose)
+            if score >= STILL_SHARE * self.typical_agreement:
+                return self._estimate(look, both, [replace(still, score=score)])
         return self._estimate(look, sights, [self._refined(sights, T_expected)])
+
+    def _sights_before(self, look: Look, T_expected: Array) -> dict[str, Sight]:
+        """The views of earlier looks in which it was found where it is expected."""
+        found: dict[str, Sight] = {}
+        for i, earlier in enumerate(look.before):
+            T = earlier.poses.get(self.name)
+            if T is not None and np.linalg.norm(T[:3, 3] - T_expected[:3, 3]) < STILL_M:
+                # A camera that stands still shows the same again.
+                cameras = [c for c, view in earlier.look.views.items() if not i or view.camera.mount == "ee"]
+                own = self._sights(earlier.look)
+                found |= {f"{camera}, earlier look {i}": own[camera] for camera in cameras}
+        return found
 
     def _sights(self, look: Look) -> dict[str, Sight]:
         """The views as surfaces are compared with them, prepared once for all objects."""
@@ -193,7 +218,7 @@ class SurfaceModel:
 
     def _on_table(self, sights: Mapping[str, Sight], several: bool = False) -> list[Place]:
         ground = over_table(self.surface, self.backdrop.reach, (self.height,))
-        return search(self.surface, sights, ground, self._yaws, Freedom(not self.surface.is_round), several)
+        return search(self.surface, sights, ground, self._yaws, self._freedom, several)
 
     def _on_things(self, supports: Array, sights: Mapping[str, Sight], several: bool = False) -> list[Place]:
         table = self.backdrop.table_height
@@ -217,10 +242,14 @@ class SurfaceModel:
     def _yaws(self) -> tuple[float, ...]:
         return YAWS[:1] if self.surface.is_round else YAWS
 
+    @property
+    def _freedom(self) -> Freedom:
+        return Freedom(not self.surface.is_round)
+
     def _refined(self, sights: Mapping[str, Sight], T_world_obj: Array) -> Place:
-        freedom = Freedom(not self.surface.is_round)
-        quick = refine(self.surface, sights, _pose(T_world_obj), freedom, QUICK_POINTS, QUICK_STEPS)
-        return refine(self.surface, sights, quick.pose, freedom, FINE_POINTS, FINE_STEPS)
+        pose, free = _pose(T_world_obj), self._freedom
+        quick = refine(self.surface, sights, pose, free, QUICK_POINTS, QUICK_STEPS)
+        return refine(self.surface, sights, quick.pose, free, FINE_POINTS, FINE_STEPS)
 
     def _estimate(self, look: Look, sights: Mapping[str, Sight], places: list[Place]) -> PoseEstimate:
         best = places[0]

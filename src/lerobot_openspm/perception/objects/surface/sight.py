@@ -78,7 +78,7 @@ class Surface:
 
     def _turned(self, degrees: int) -> tuple[float, Array]:
         """The share of the points that come near to others if turned, and about which middle ``(2,)``."""
-        points, at, share = self.coloured, np.append(self.middle, 0.0), 0.0
+        points, at, share = self.points, np.append(self.middle, 0.0), 0.0
         R = se3.from_yaw(np.zeros(3), float(np.deg2rad(degrees)))[:3, :3]
         tree, near = KDTree(points), SAME_SHAPE_SPACINGS * self.spacing
         for _ in range(3):
