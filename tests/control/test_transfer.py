@@ -13,9 +13,10 @@ from lerobot_openspm.control.feasibility import (
     geometric_score,
     shape_deviation,
 )
-from lerobot_openspm.control.transfer import RETREAT_M, Turn, transfer, transfer_pose
+from lerobot_openspm.control.transfer import RETREAT_M, Turn, about, as_shown, transfer, transfer_pose
 from lerobot_openspm.geometry import se3
 from lerobot_openspm.memory.entry import WORLD
+from lerobot_openspm.types import Symmetry
 
 HOME = hand_pose(0.0, 0.0, 0.3)
 
@@ -268,3 +269,17 @@ def test_what_can_be_done_at_all_scores_something(monkeypatch):
     monkeypatch.setattr(feasibility, "MAX_JUMP_M", 9)
     monkeypatch.setattr(feasibility, "MAX_JUMP_RAD", 9)
     assert 0 < score(here, memory) < 0.01
+
+
+def test_a_round_thing_is_grasped_and_put_as_it_was_shown_however_it_is_turned():
+    memory = entry()
+    turned = {**memory.object_poses, "bowl": memory.object_poses["bowl"] @ about(np.array([0.02, 0.01]), 2.5)}
+    for turn, stays in ((0.0, True), (np.pi, False)):
+        poses = as_shown(memory, turned, {"bowl": Symmetry(np.array([0.02, 0.01]), turn)})
+        own = transfer(memory, poses, {}, HOME)
+        shown = transfer(memory, memory.object_poses, {}, HOME)
+        same = [np.allclose(a.T_world_ee, b.T_world_ee) for a, b in zip(own, shown, strict=True)]
+        assert all(same) == stays
+    # What is only put something on is turned as it is.
+    poses = as_shown(memory, turned, {"plate": Symmetry(np.zeros(2), 0.0)})
+    assert poses["plate"] is turned["plate"]

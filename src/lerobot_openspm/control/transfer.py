@@ -65,22 +65,21 @@ def transfer_pose(T_world_obj: Array, T_obj_ee: Array) -> Array:
 def as_shown(
     entry: MemoryEntry, object_poses: Mapping[str, Array], symmetries: Mapping[str, Symmetry]
 ) -> dict[str, Array]:
-    """Object poses with what an entry grasps turned into itself, as near to how it was shown as can be.
+    """Object poses ``T_world_obj`` ``(4, 4)`` with the round things that an entry grasps turned as shown.
 
-    A bottle with a label is found turned by any angle, and grasped and put down as if it were not.
+    A bottle with a label is found turned by any angle, and is grasped and put down as if it were not.
 
     Args:
         entry: The entry.
-        object_poses: Poses ``T_world_obj`` ``(4, 4)``.
+        object_poses: Poses as they were found.
         symmetries: How objects turn into themselves, of those that do.
     """
     shown = dict(object_poses)
     grasped = {pose.anchor.place for pose in entry.key_poses if pose.phase == "grasp"}
     for name in grasped & symmetries.keys() & object_poses.keys() & entry.object_poses.keys():
-        own, T = symmetries[name], object_poses[name]
-        off = float(se3.yaw_of(T) - se3.yaw_of(entry.object_poses[name]))
-        left = float(se3.wrap_angle(off, own.turn)) if own.turn else 0.0
-        shown[name] = T @ about(own.middle, left - off)
+        if symmetries[name].turn == 0:
+            yaw = se3.yaw_of(entry.object_poses[name]) - se3.yaw_of(object_poses[name])
+            shown[name] = object_poses[name] @ about(symmetries[name].middle, float(yaw))
     return shown
 
 

@@ -63,16 +63,17 @@ class Perception:
         memory: What objects and cameras are known.
         hand_radius_m: Radius of the hand, which hides what is behind it.
         segmenter: Finds the masks of objects that were learned from a segmenter's; None if none were.
+        before: Looks that are remembered, the oldest first.
     """
 
     memory: KnownWorld
     hand_radius_m: float
     segmenter: Segmenter | None = None
+    before: tuple[EarlierLook, ...] = ()
     _watch: CameraWatch = field(default_factory=CameraWatch)
     _has_looked: bool = False
     _has_compared: bool = False
     _labelled: set[str] = field(default_factory=set[str])
-    _before: tuple[EarlierLook, ...] = ()
 
     def detect(
         self,
@@ -113,21 +114,21 @@ class Perception:
             return Detections({}, faults)
         hidden = {camera: hand_mask(view, T_world_ee, self.hand_radius_m) for camera, view in sound.items()}
         known = {name: self.memory.objects[name] for name in names if name in self.memory.objects}
-        look = look_at(sound, list(known), self.segmenter, hidden, expected, told_apart, self._before)
+        look = look_at(sound, list(known), self.segmenter, hidden, expected, told_apart, self.before)
         estimates = localise_all(known, look)
-        self._remember(look, estimates)
+        self.remember(look, estimates)
         if not self._has_compared:  # only at the first look, before anything moves
             self._has_compared = True
             faults = faults or disagreeing_cameras(look, known, estimates)
         return Detections(estimates, faults)
 
-    def _remember(self, look: Look, estimates: Mapping[str, PoseEstimate]) -> None:
+    def remember(self, look: Look, estimates: Mapping[str, PoseEstimate]) -> None:
         """Keep a look from elsewhere than the last one that was kept."""
-        if self._before and not _is_elsewhere(look, self._before[-1].look):
+        if self.before and not _is_elsewhere(look, self.before[-1].look):
             return
         poses = {name: one.T_world_obj for name, one in estimates.items() if one.status == "found"}
         kept = EarlierLook(replace(look, before=()), poses)
-        self._before = (*self._before[:1], *self._before[1:][-MOST_REMEMBERED + 1 :], kept)
+        self.before = (*self.before[:1], *self.before[1:][-MOST_REMEMBERED + 1 :], kept)
 
     def _simulator_poses(self, observation: Observation, names: Sequence[str]) -> dict[str, PoseEstimate]:
         poses = observation.simulator_poses(self.memory.simulator_objects)

@@ -10,13 +10,14 @@ from lerobot_openspm.errors import MemoryFormatError
 from lerobot_openspm.geometry import se3
 from lerobot_openspm.geometry.camera import project
 from lerobot_openspm.perception.objects import store
-from lerobot_openspm.perception.objects.base import Look, localise_all
+from lerobot_openspm.perception.objects.base import EarlierLook, Look, localise_all
 from lerobot_openspm.perception.objects.kinds import learn_objects
 from lerobot_openspm.perception.objects.surface import model as model_module
 from lerobot_openspm.perception.objects.surface.compare import correlation
 from lerobot_openspm.perception.objects.surface.model import SurfaceModel
 from lerobot_openspm.perception.objects.surface.search import Place, _areas, _ranked
-from lerobot_openspm.types import ContactCue, DemonstrationScene, Moment
+from lerobot_openspm.perception.pipeline import Perception
+from lerobot_openspm.types import ContactCue, DemonstrationScene, Moment, PoseEstimate
 
 HOME = (-0.05, 0.0, 0.45)
 MIDDLES = {"block": (0.02, -0.15, 0.0), "cup": (0.0, 0.15, 0.0), "distractor": (-0.02, 0.0, 0.0)}
@@ -208,6 +209,48 @@ def test_it_is_followed_from_where_it_is_expected(models):
     assert float(se3.distance(first.T_world_obj, again.T_world_obj)) < 0.006
 
 
+def from_nearby(scene):
+    """Views of a hand right above a corner of the block; the arm hides everything from the fixed cameras."""
+    views = views_at(scene, looking_down(*(scene["block"][:2, 3] + [0.03, 0.03]), 0.13))
+    return views, {name: np.full(view.image.shape[:2], name != "hand") for name, view in views.items()}
+
+
+def test_where_a_look_from_nearby_shows_a_part_earlier_looks_tell_the_place(models):
+    model, scene = models["block"], moved(0.12, 0.12, 0.3)
+    first = Look(views_at(scene, looking_down(*HOME)))
+    T = model.localise(first).T_world_obj
+    views, hidden = from_nearby(scene)
+    nudged = se3.from_yaw([0.006, -0.006, 0.0], 0.0) @ T
+    off = []
+    for before in ((), (EarlierLook(first, {"block": T}),)):
+        look = Look(views, hidden=hidden, expected={"block": nudged}, before=before)
+        off.append(float(se3.distances(model.localise(look).T_world_obj, T)[0]))
+    assert off[1] < 0.003 < off[0]
+
+
+def test_earlier_looks_do_not_hold_back_what_has_moved(models):
+    model, scene = models["block"], moved(0.12, 0.12, 0.3)
+    first = Look(views_at(scene, looking_down(*HOME)))
+    T = model.localise(first).T_world_obj
+    now = views_at(moved(0.135, 0.12, 0.3), looking_down(0.0, 0.1, 0.35))
+    before = (EarlierLook(first, {"block": T}),)
+    found = model.localise(Look(now, expected={"block": T}, before=before))
+    assert found.status == "found"
+    assert found.T_world_obj[0, 3] - T[0, 3] == pytest.approx(0.015, abs=0.004)
+
+
+def test_the_first_look_and_the_last_ones_from_elsewhere_are_remembered():
+    perception = Perception(None, 0.08)
+    looks = [Look(views_at({}, looking_down(0.1 * i, 0.0, 0.4))) for i in (0, 0, 1, 2, 3, 4, 4)]
+    found = PoseEstimate("found", np.eye(4), np.eye(4), 1.0)
+    for look in looks:
+        look = dataclasses.replace(look, before=perception.before)
+        perception.remember(look, {"cup": found, "block": dataclasses.replace(found, status="not_found")})
+    kept = [one.look.views["hand"] for one in perception.before]
+    assert kept == [looks[i].views["hand"] for i in (0, 3, 4, 5)]
+    assert all(one.poses.keys() == {"cup"} and not one.look.before for one in perception.before)
+
+
 def test_pictures_that_tell_a_place_vaguely_are_no_evidence(models):
     model, scene = models["block"], moved(0.12, 0.12, 0.3)
     views = views_at(scene, looking_down(0.12, 0.1, 0.35))
@@ -304,6 +347,13 @@ def test_the_shape_tells_by_what_an_object_turns_into_itself(models):
     T_world_obj = models["block"].localise(look).T_world_obj
     middle = se3.apply(T_world_obj, np.array([[*models["block"].symmetry.middle, 0.0]]))[0, :2]
     assert middle == pytest.approx(usual[:2, 3], abs=models["block"].surface.spacing)
+
+
+def test_a_shape_that_was_seen_from_one_side_is_told_by_all_its_points(models):
+    surface = models["cup"].surface
+    is_behind = surface.points[:, 0] < surface.middle[0]
+    colours = np.where(is_behind[:, None, None], np.nan, surface.colours)
+    assert dataclasses.replace(surface, colours=colours).symmetry.turn == 0
 
 
 def test_of_large_objects_cameras_see_other_sides_elsewhere(models):

@@ -18,7 +18,8 @@ from lerobot_openspm.perception.objects.patches.model import PatchModel
 from lerobot_openspm.perception.objects.surface.backdrop import Backdrop, Float32, learn_backdrop
 from lerobot_openspm.perception.objects.surface.carving import Carved, Frame, Frames, carve, silhouette
 from lerobot_openspm.perception.objects.surface.compare import correlation_at, score_at
-from lerobot_openspm.perception.objects.surface.model import YAWS, SurfaceModel, from_record
+from lerobot_openspm.perception.objects.surface.model import YAWS, SurfaceModel
+from lerobot_openspm.perception.objects.surface.record import from_record
 from lerobot_openspm.perception.objects.surface.relief import WEIGHTS, find_relief
 from lerobot_openspm.perception.objects.surface.search import Freedom, over_table, search
 from lerobot_openspm.perception.objects.surface.sight import Sight, Surface, sight_of

@@ -10,14 +10,11 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from lerobot_openspm.errors import MemoryFormatError
 from lerobot_openspm.geometry import se3
 from lerobot_openspm.geometry.se3 import Array
-from lerobot_openspm.perception.objects import records
 from lerobot_openspm.perception.objects.base import Look, Record
-from lerobot_openspm.perception.objects.patches import model as patches
 from lerobot_openspm.perception.objects.patches.model import PatchModel
-from lerobot_openspm.perception.objects.surface.backdrop import TABLE_MARGIN_M, Backdrop, Colour
+from lerobot_openspm.perception.objects.surface.backdrop import Backdrop
 from lerobot_openspm.perception.objects.surface.compare import FINE_POINTS, score_at
 from lerobot_openspm.perception.objects.surface.search import (
     FINE_STEPS,
@@ -36,8 +33,8 @@ from lerobot_openspm.perception.objects.surface.sight import Sight, Surface, sig
 from lerobot_openspm.perception.objects.surface.tipped import has_tipped, lying
 from lerobot_openspm.types import PoseEstimate, Symmetry
 
-# What a record may hold: points, coloured ones at least, and the table's length and width in metres, rounded.
-MAX_POINTS, MIN_COLOURED, MAX_TABLE_M, ROUNDING_M = 60_000, 8, 10.0, 1e-3
+# In a record, the colour of points that have none.
+UNCOLOURED = -1000.0
 # An object is found from here on between what agrees at most where it is not, and what is typical of it;
 # and with less than this share of the typical agreement it is never.
 FOUND_BETWEEN, LEAST_SHARE = 0.35, 0.55
@@ -294,52 +291,6 @@ class SurfaceModel:
         return fields, arrays | {f"near.{key}": value for key, value in near_arrays.items()}
 
 
-# In a record, the colour of points that have none.
-UNCOLOURED = -1000.0
-
-
-def from_record(fields: Mapping[str, Any], arrays: Mapping[str, NDArray[Any]], where: str) -> SurfaceModel:
-    """Inverse of :meth:`SurfaceModel.to_record`. Raises MemoryFormatError, which names ``where``."""
-    name, near, cameras = fields["name"], fields.get("near"), fields.get("hand_cameras")
-    if not isinstance(near, Mapping) or near.get("kind") != PatchModel.kind:
-        raise MemoryFormatError(f"{where}: 'near' of {name!r} must be an object of kind {PatchModel.kind}")
-    if not isinstance(cameras, list) or not all(isinstance(one, str) for one in cameras):
-        raise MemoryFormatError(f"{where}: 'hand_cameras' of {name!r} must be a list of camera keys")
-    points = records.array(arrays, "points", (-1, 3), where)
-    if not 8 <= len(points) <= MAX_POINTS:
-        raise MemoryFormatError(f"{where}: 'points' has {len(points)} rows, expected 8 to {MAX_POINTS}")
-    normals = records.array(arrays, "normals", (len(points), 3), where)
-    colours = records.array(arrays, "colours", (len(points), 2, 3), where).copy()
-    colours[(colours <= UNCOLOURED).any((1, 2))] = np.nan
-    if (coloured := int(np.isfinite(colours[:, 0, 0]).sum())) < MIN_COLOURED:
-        raise MemoryFormatError(
-            f"{where}: {coloured} points of {name!r} have colours, expected {MIN_COLOURED} or more; "
-            "learn the objects again"
-        )
-    table = records.array(arrays, "table_colour", (4, 3), where).astype(float)
-    area = records.array(arrays, "table_area", (2, 2), where).astype(float)
-    sides = area[1] - area[0]
-    if sides.min() < 2 * TABLE_MARGIN_M - ROUNDING_M or sides.max() > MAX_TABLE_M:
-        raise MemoryFormatError(
-            f"{where}: 'table_area' is {area.tolist()}, expected least and largest x and y, "
-            f"{2 * TABLE_MARGIN_M} to {MAX_TABLE_M} m apart"
-        )
-    hand = {
-        camera: records.array(arrays, f"hand.{i}", (-1, -1), where, np.uint8).astype(bool)
-        for i, camera in enumerate(cameras)
-    }
-    if any(mask.size == 0 for mask in hand.values()):
-        raise MemoryFormatError(f"{where}: a picture of the hand has no pixels; learn the objects again")
-    numbers = {key: records.number(fields, key, *BOUNDS[key], where) for key in BOUNDS}
-    backdrop = Backdrop(Colour(table[0], table[1:]), numbers["table_height"], area, {}, hand)
-    own = {key.removeprefix("near."): value for key, value in arrays.items() if key.startswith("near.")}
-    return SurfaceModel(
-        name, Surface(points, normals, colours, numbers["spacing"], numbers["pattern"]), backdrop,
-        numbers["height"],
-        numbers["typical_agreement"], numbers["rival_agreement"], patches.from_record(near, own, where),
-    )  # fmt: skip
-
-
 def _followed(seen: PoseEstimate) -> PoseEstimate:
     """What is seen around where an object was expected, as far as the pictures can tell."""
     std_m = float(np.sqrt(seen.covariance[:2, :2].diagonal().max()))
@@ -348,16 +299,6 @@ def _followed(seen: PoseEstimate) -> PoseEstimate:
     if std_m <= SHARP_M:
         seen = replace(seen, confidence=min(1.0, seen.confidence / SURE_SHARE))
     return seen
-
-
-BOUNDS = {
-    "height": (-100.0, 100.0),
-    "typical_agreement": (0.05, 1.0),
-    "rival_agreement": (0.0, 1.0),
-    "spacing": (1e-6, 1.0),
-    "pattern": (0.0, 1.0),
-    "table_height": (-100.0, 100.0),
-}
 
 
 def _apart_m(estimate: PoseEstimate, T_world_obj: Array) -> float:

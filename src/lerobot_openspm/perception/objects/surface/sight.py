@@ -52,9 +52,7 @@ class Surface:
     @cached_property
     def middle(self) -> Array:
         """Horizontal middle ``(2,)`` of the coloured points."""
-        return (
-            np.percentile(self.coloured[:, :2], 5, axis=0) + np.percentile(self.coloured[:, :2], 95, axis=0)
-        ) / 2
+        return _middle(self.coloured)
 
     @cached_property
     def palette(self) -> Float32:
@@ -78,7 +76,7 @@ class Surface:
 
     def _turned(self, degrees: int) -> tuple[float, Array]:
         """The share of the points that come near to others if turned, and about which middle ``(2,)``."""
-        points, at, share = self.points, np.append(self.middle, 0.0), 0.0
+        points, at, share = self.points, np.append(_middle(self.points), 0.0), 0.0
         R = se3.from_yaw(np.zeros(3), float(np.deg2rad(degrees)))[:3, :3]
         tree, near = KDTree(points), SAME_SHAPE_SPACINGS * self.spacing
         for _ in range(3):
@@ -103,6 +101,12 @@ class Surface:
             alike = np.linalg.norm(colours - colours[index], axis=1) < ROUND_COLOUR
             shares.append(float((alike & (away < ROUND_SPACINGS * self.spacing)).mean()))
         return min(shares) > ROUND_SHARE
+
+
+def _middle(points: Array) -> Array:
+    """Horizontal middle ``(2,)`` of points ``(n, 3)``, whatever a few of them do."""
+    low, high = np.percentile(points[:, :2], (5, 95), axis=0)
+    return np.asarray((low + high) / 2, float)
 
 
 @dataclass(frozen=True)
