@@ -72,6 +72,15 @@ def test_what_is_out_of_reach_from_all_sides_is_refused(panda):
     assert chosen(context, poses, home)[1]
 
 
+def test_where_the_joints_are_known_they_tell_the_reach_and_not_where_the_demonstrations_went(panda):
+    context, poses, home = scene(panda, 0.0)
+    small = replace(context.robot, workspace=np.array([[-0.1, -0.1, 0.0], [0.0, 0.0, 2.0]]))
+    poses["plate"] = se3.from_yaw([-0.05, -0.25, 0.9], 0.0)
+    assert chosen(replace(context, robot=small), poses, home)[1] == []
+    _, problems = chosen(replace(context, robot=replace(small, arm=None)), poses, home)
+    assert "outside the demonstrated workspace" in problems[0]
+
+
 def test_an_arm_that_does_not_fit_the_scene_is_named_once_and_refuses_nothing(panda, caplog):
     # LIBERO's other suites have the robot on the floor.
     first, *others = panda.joints

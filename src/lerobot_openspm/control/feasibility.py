@@ -34,7 +34,8 @@ class TransferLimits:
     """Bounds of the checks on transferred key poses.
 
     Attributes:
-        reach_margin_m: How far outside the box that the demonstrations covered the hand may go.
+        reach_margin_m: How far outside the box that the demonstrations covered the hand may go, where the
+            arm's joints do not tell its reach.
         min_clearance_m: How far below the lowest demonstrated hand position the hand may go.
     """
 
@@ -43,12 +44,23 @@ class TransferLimits:
 
 
 def check_transfer(
-    targets: Sequence[Target], T_world_ee: Array, robot: RobotModel, limits: TransferLimits
+    targets: Sequence[Target],
+    T_world_ee: Array,
+    robot: RobotModel,
+    limits: TransferLimits,
+    joints_known: bool = False,
 ) -> list[str]:
     """The paper's checks: reachability, pose jump, minimum distance. Returns what is wrong, in words.
 
     Minimum distance is kept from the support surface: the lowest point that the hand reached in the
     demonstrations bounds how low it may be sent.
+
+    Args:
+        targets: The key poses.
+        T_world_ee: Where the hand is ``(4, 4)``.
+        robot: The robot.
+        limits: The bounds.
+        joints_known: Whether :func:`check_reach` tells the reach; else it is where the demonstrations went.
     """
     problems: list[str] = []
     low, high = robot.workspace
@@ -57,12 +69,9 @@ def check_transfer(
         where = f"key pose {i} ({target.key_pose.phase} at {target.key_pose.anchor.place})"
         p = target.T_world_ee[:3, 3]
         outside = np.maximum(np.maximum(low - p, p - high), 0.0)
-        if (beyond := float(np.linalg.norm(outside[:2]))) > limits.reach_margin_m or (
-            p[2] - high[2] > limits.reach_margin_m
-        ):
-            problems.append(
-                f"{where} is {max(beyond, p[2] - high[2]):.3f} m outside the demonstrated workspace"
-            )
+        beyond = max(float(np.linalg.norm(outside[:2])), p[2] - high[2])
+        if beyond > limits.reach_margin_m and not joints_known:
+            problems.append(f"{where} is {beyond:.3f} m outside the demonstrated workspace")
         if low[2] - p[2] > limits.min_clearance_m:
             problems.append(f"{where} is {low[2] - p[2]:.3f} m below the lowest demonstrated hand position")
         metres, radians = se3.distances(before, target.T_world_ee)
@@ -153,7 +162,8 @@ def geometric_score(
     if any(name not in object_poses for name in entry.objects):
         return 0.0
     targets = transfer(entry, object_poses, yaw_periods, T_world_ee)
-    if all(check_transfer(way, T_world_ee, robot, limits) for way in (targets, half_turned(targets))):
+    checked = T_world_ee, robot, limits, robot.arm is not None
+    if all(check_transfer(way, *checked) for way in (targets, half_turned(targets))):
         return 0.0
     return max(float(np.exp(-shape_deviation(entry, targets) / SHAPE_SCALE_M)), MIN_USABLE_SCORE)
 

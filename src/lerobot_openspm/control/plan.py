@@ -102,10 +102,15 @@ class Plan:
     def problems(self, context: PlanningContext) -> list[str]:
         """What keeps the hand from following the plan, in words."""
         targets = self.targets(context)
-        problems = check_transfer(targets, self.T_world_ee, context.robot, context.limits)
+        problems = self.check(context, targets)
         if not problems and (miss := self.miss(context, targets)):
             return [str(miss)]
         return problems
+
+    def check(self, context: PlanningContext, targets: Sequence[Target]) -> list[str]:
+        """What is wrong with its key poses in the scene, the joints' reach left out."""
+        joints_known = self.stance is not None
+        return check_transfer(targets, self.T_world_ee, context.robot, context.limits, joints_known)
 
     def miss(self, context: PlanningContext, targets: Sequence[Target]) -> Miss | None:
         """The first of its key poses in the scene that the arm's joints do not reach, as far as is known."""

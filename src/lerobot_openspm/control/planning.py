@@ -11,7 +11,6 @@ import numpy as np
 from lerobot_openspm.control.clearance import crowding, lifted
 from lerobot_openspm.control.feasibility import (
     TransferLimits,
-    check_transfer,
     find_stance,
     geometric_score,
 )
@@ -159,7 +158,7 @@ class PlanningContext:
         turning, ways = plan.symmetric_grasps(self), list[tuple[Plan, dict[str, int]]]()
         for turned in (replace(plan, turned=radians) for radians in plan.turns(self)):
             targets = turned.targets(self)
-            if not check_transfer(targets, plan.T_world_ee, self.robot, self.limits):
+            if not turned.check(self, targets):
                 ways.append((turned, crowding(turned.entry, targets, points, self.hand_radius_m)))
         least = min(map(_amount, ways), default=0)
         for turned, inside in sorted(ways, key=lambda way: _amount(way) > MUCH_MORE * least):

@@ -199,6 +199,18 @@ def test_another_direction_counts_less_of_a_large_object(models, radius, first):
         assert _ranked(surface, places)[0].pose[3] == first
 
 
+@pytest.mark.parametrize(("radius", "status"), [(0.05, "ambiguous"), (0.15, "found")])
+def test_a_rival_in_another_direction_makes_a_large_object_less_doubtful(models, radius, status):
+    model = dataclasses.replace(models["block"], surface=dataclasses.replace(models["block"].surface))
+    model.surface.__dict__["radius"] = radius
+    look = Look(views_at(moved(0.12, 0.12, 0.0), looking_down(*HOME)))
+    shown, turned = (
+        Place(np.array([x, 0.12, model.height, yaw]), 0.97 * model.typical_agreement)
+        for x, yaw in ((0.12, 0.0), (-0.15, np.pi / 2))
+    )
+    assert model._estimate(look, model._sights(look), [shown, turned]).status == status
+
+
 def test_it_is_followed_from_where_it_is_expected(models):
     model, scene = models["block"], moved(0.12, 0.12, 0.3)
     first = model.localise(Look(views_at(scene, looking_down(*HOME))))

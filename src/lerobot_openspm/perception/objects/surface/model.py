@@ -24,6 +24,7 @@ from lerobot_openspm.perception.objects.surface.search import (
     Freedom,
     Place,
     covariance_at,
+    likelihood,
     over_supports,
     over_table,
     refine,
@@ -253,7 +254,8 @@ class SurfaceModel:
         share = best.score / self.typical_agreement
         apart = max(SAME_PLACE_M, OVERLAP_SHARE * self.surface.radius)
         rivals = [one for one in places[1:] if np.linalg.norm(one.pose[:2] - best.pose[:2]) > apart]
-        is_rivalled = any(one.score > RIVAL_SHARE * best.score for one in rivals)
+        likely = likelihood(self.surface, best)
+        is_rivalled = any(likelihood(self.surface, one) > RIVAL_SHARE * likely for one in rivals)
         is_raised = best.pose[2] > self.height + LIFTED_M / 2
         needed = max(self.found_share, RAISED_SHARE) if is_raised else self.found_share
         status = "not_found" if share < needed else "ambiguous" if is_rivalled else "found"

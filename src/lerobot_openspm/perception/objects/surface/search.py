@@ -111,11 +111,15 @@ def search(
     return _ranked(surface, finest)
 
 
+def likelihood(surface: Surface, place: Place) -> float:
+    """Its agreement, which counts less where the object is turned otherwise than it was shown."""
+    turned = LARGE_TURNED_SHARE if surface.radius >= LARGE_M else TURNED_SHARE
+    return place.score * (turned if _is_turned(float(place.pose[3])) else 1.0)
+
+
 def _ranked(surface: Surface, places: Sequence[Place]) -> list[Place]:
     """Places, the most likely first."""
-    turned = LARGE_TURNED_SHARE if surface.radius >= LARGE_M else TURNED_SHARE
-    counts = [place.score * (turned if _is_turned(float(place.pose[3])) else 1.0) for place in places]
-    return [places[i] for i in np.argsort(-np.array(counts), kind="stable")]
+    return sorted(places, key=lambda place: -likelihood(surface, place))
 
 
 def _is_turned(yaw: float) -> bool:
