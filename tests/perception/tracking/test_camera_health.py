@@ -104,6 +104,20 @@ def test_a_camera_that_shows_all_objects_elsewhere_is_named_with_how_far():
     assert "from where front and wrist do" in found["side"]
 
 
+def test_a_camera_that_is_turned_is_off_too():
+    turned = shown(2)
+    R = se3.from_yaw(np.zeros(3), np.deg2rad(6))[:2, :2]
+    turned = {name: [R @ place for place in places] for name, places in turned.items()}
+    assert list(disagreements({"front": shown(1), "side": turned})) == ["front", "side"]
+
+
+def test_objects_that_are_each_seen_badly_tell_nothing_of_the_cameras():
+    front, side = shown(1, names=NAMES[:3]), shown(2, names=NAMES[:3])
+    for name, off in zip(NAMES[:3], ((-0.008, 0.001), (-0.008, -0.001), (0.018, 0.002)), strict=True):
+        side[name] = [front[name][0] + off]
+    assert disagreements({"front": front, "side": side}) == {}
+
+
 def test_of_two_cameras_that_disagree_both_are_named():
     assert list(disagreements({"front": shown(1), "side": shown(2, (0.0, 0.02))})) == ["front", "side"]
 

@@ -28,6 +28,9 @@ STILL_M = 0.001
 # this: by one view alone some objects are seen badly, but a camera that is off shifts all of them. Of fewer
 # than so many objects only the best one counts.
 BEST_SHARE, FEW, DISAGREE_M = 0.35, 5, 0.007
+# A camera that is off shifts and turns objects as one: for most of them that leaves at most this share of how
+# far they are apart. Errors of single objects are left as they are.
+AS_ONE_SHARE = 0.5
 # So many objects must be seen by both.
 MIN_COMMON = 3
 
@@ -102,12 +105,13 @@ def disagreements(places: Mapping[str, Mapping[str, Sequence[Array]]]) -> dict[s
         places: By camera and object: where it stands ``(2,)``, metres, as this camera alone shows it; several
             places where several objects look like it.
     """
-    apart = {
-        pair: distances
-        for pair in itertools.combinations(places, 2)
-        if len(distances := _distances(*(places[camera] for camera in pair))) >= MIN_COMMON
-    }
-    off = {pair: _agreed(one) > DISAGREE_M for pair, one in apart.items()}
+    pairs: dict[tuple[str, str], tuple[Array, Array]] = {}
+    for pair in itertools.combinations(places, 2):
+        own, other = _nearest(*(places[camera] for camera in pair))
+        if len(own) >= MIN_COMMON:
+            pairs[pair] = own, other
+    apart = {pair: np.linalg.norm(a - b, axis=1) for pair, (a, b) in pairs.items()}
+    off = {pair: _agreed(apart[pair]) > DISAGREE_M and _is_as_one(a, b) for pair, (a, b) in pairs.items()}
     agreeing = {camera for pair, is_off in off.items() if not is_off for camera in pair}
     suspects = {camera for pair, is_off in off.items() if is_off for camera in pair}
     found: dict[str, str] = {}
@@ -122,10 +126,27 @@ def disagreements(places: Mapping[str, Mapping[str, Sequence[Array]]]) -> dict[s
     return found
 
 
-def _distances(a: Mapping[str, Sequence[Array]], b: Mapping[str, Sequence[Array]]) -> Array:
-    """Metres between where two cameras show each object that both of them show."""
+def _nearest(a: Mapping[str, Sequence[Array]], b: Mapping[str, Sequence[Array]]) -> tuple[Array, Array]:
+    """Where two cameras show the objects that both of them show, ``(n, 2)`` each, metres."""
     both = [name for name in a if a[name] and b.get(name)]
-    return np.array([min(float(np.linalg.norm(p - q)) for p in a[name] for q in b[name]) for name in both])
+    near = [
+        min(itertools.product(a[name], b[name]), key=lambda two: float(np.linalg.norm(two[0] - two[1])))
+        for name in both
+    ]
+    one, other = np.array(near).reshape(-1, 2, 2).swapaxes(0, 1)
+    return one, other
+
+
+def _is_as_one(a: Array, b: Array) -> bool:
+    """Whether some shift and turn in the plane lead from most of the places ``(n, 2)`` to the others."""
+    for i, j in itertools.combinations(range(len(a)), 2):
+        turn = np.arctan2(*(b[j] - b[i])[::-1]) - np.arctan2(*(a[j] - a[i])[::-1])
+        R = se3.from_yaw(np.zeros(3), turn)[:2, :2]
+        left = (a - (a[i] + a[j]) / 2) @ R.T + (b[i] + b[j]) / 2 - b
+        explained = np.linalg.norm(left, axis=1) <= AS_ONE_SHARE * np.linalg.norm(a - b, axis=1)
+        if explained.sum() >= max(MIN_COMMON, len(a) // 2 + 1):
+            return True
+    return False
 
 
 def _agreed(distances: Array) -> float:
