@@ -10,7 +10,7 @@ from tests.geometry.test_arm import LIBERO
 from tests.memory.builders import entry, hand_pose, key_pose, robot
 
 from lerobot_openspm.control import feasibility
-from lerobot_openspm.control.feasibility import TransferLimits, find_stance
+from lerobot_openspm.control.feasibility import MAX_JUMP_RAD, TransferLimits, find_stance
 from lerobot_openspm.control.plan import Plan
 from lerobot_openspm.control.transfer import RETREAT_M
 from lerobot_openspm.geometry import se3
@@ -60,7 +60,29 @@ def test_grasps_are_turned_by_what_the_shape_allows(panda, turn, expected):
     context, poses, home = scene(panda, 0.0, turn=turn)
     if turn is None:
         context = replace(context, symmetries={})
-    assert_allclose(np.rad2deg(Plan(context.entries[0], poses, home).turns(context)), expected)
+    ways = Plan(context.entries[0], poses, home).turns(context)
+    assert_allclose(np.rad2deg([way.turned for way in ways]), expected)
+    assert all(way.puts_turned for way in ways)
+
+
+def test_what_is_round_is_put_as_it_was_shown_where_the_hand_would_turn_too_far():
+    # The plate lies turned by nearly half a turn from how it lay, seen from the bowl.
+    context, poses, home = scene(None, 0.0)
+    poses["plate"] = poses["plate"] @ se3.from_yaw(np.zeros(3), 3.0)
+    plan, problems = chosen(context, poses, home)
+    assert problems == []
+    assert not plan.puts_turned
+    own, shown = plan.targets(context), Plan(plan.entry, poses, home).targets(context)
+    (grasp, place), (shown_grasp, shown_place) = ((one[2], one[5]) for one in (own, shown))
+    assert_allclose(place.T_world_ee, shown_place.T_world_ee)
+    assert se3.distances(grasp.T_world_ee, place.T_world_ee)[1] < MAX_JUMP_RAD
+    assert se3.distances(shown_grasp.T_world_ee, shown_place.T_world_ee)[1] > MAX_JUMP_RAD
+    # The bowl's axis is where the hand would have brought it.
+    middles = [
+        se3.apply(put.T_world_ee @ se3.inverse(held.T_world_ee) @ poses["bowl"], np.zeros((1, 3)))
+        for held, put in ((grasp, place), (shown_grasp, shown_place))
+    ]
+    assert_allclose(*middles, atol=1e-9)
 
 
 def test_a_grasp_within_reach_stays_as_shown(panda):

@@ -51,6 +51,7 @@ class Plan:
         T_world_ee: The hand's pose ``(4, 4)`` where the plan begins.
         turned: How far the hand is turned about the axis of objects that it grasps, which turn into
             themselves by that, radians.
+        puts_turned: Whether it is turned where it puts them too.
         is_half_turned: Whether the hand is turned by half a turn about its approach axis.
         stance: The arm's joint angles ``(n,)`` where the plan begins; None where they are not known, and
             reach is not checked by them.
@@ -61,6 +62,7 @@ class Plan:
     object_poses: Mapping[str, Array]
     T_world_ee: Array
     turned: float = 0.0
+    puts_turned: bool = True
     is_half_turned: bool = False
     stance: Array | None = None
     retreat_m: float = RETREAT_M
@@ -75,7 +77,7 @@ class Plan:
         entry = self.entry if last is None else self.entry.until(last)
         object_poses = as_shown(entry, self.object_poses, context.symmetries)
         turns = {
-            sub_task: Turn(object_poses[name], context.symmetries[name].middle, self.turned)
+            sub_task: Turn(object_poses[name], context.symmetries[name].middle, self.turned, self.puts_turned)
             for sub_task, name in self.symmetric_grasps(context).items()
             if self.turned and name in object_poses
         }
@@ -90,14 +92,18 @@ class Plan:
         grasps = (pose for pose in self.entry.key_poses if pose.phase == "grasp")
         return {p.sub_task: p.anchor.place for p in grasps if p.anchor.place in context.symmetries}
 
-    def turns(self, context: PlanningContext) -> list[float]:
-        """By how much its grasps may be turned, the least first, radians; none but 0 without a symmetry."""
+    def turns(self, context: PlanningContext) -> list[Plan]:
+        """The plan with its grasps turned as the objects' shapes allow, the least first; as it is at first.
+
+        What is round is put down as it was shown too, the hand being turned only where it grasps.
+        """
         least = [context.symmetries[name].turn for name in self.symmetric_grasps(context).values()]
-        return [
-            radians
-            for radians in TURNS
-            if radians == 0 or (least and all(turn == 0 or _is_multiple(radians, turn) for turn in least))
-        ]
+        ways: list[Plan] = [self]
+        for radians in TURNS:
+            if radians and least and all(turn == 0 or _is_multiple(radians, turn) for turn in least):
+                ways.append(replace(self, turned=radians))
+                ways += [replace(self, turned=radians, puts_turned=False)] if not any(least) else []
+        return ways
 
     def problems(self, context: PlanningContext) -> list[str]:
         """What keeps the hand from following the plan, in words."""

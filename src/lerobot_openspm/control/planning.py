@@ -124,7 +124,9 @@ class PlanningContext:
             return first, []
         first = replace(first, stance=find_stance(self.robot, T_world_ee))
         points, crowded = self._points(object_poses), list[tuple[Plan, dict[str, int]]]()
-        for entry in (one.entry for one in ranked[:MAX_TRIED] if one.geometric > 0):
+        for entry in (one.entry for one in ranked[:MAX_TRIED]):
+            if any(name not in object_poses for name in entry.objects):
+                continue
             if crowded and not self._mean_the_same(entry, crowded[0][0].entry):
                 continue
             for is_half_turned in (False, True):
@@ -156,7 +158,7 @@ class PlanningContext:
             The plan, and how much of what the hand is in, see :func:`crowding`.
         """
         turning, ways = plan.symmetric_grasps(self), list[tuple[Plan, dict[str, int]]]()
-        for turned in (replace(plan, turned=radians) for radians in plan.turns(self)):
+        for turned in plan.turns(self):
             targets = turned.targets(self)
             if not turned.check(self, targets):
                 ways.append((turned, crowding(turned.entry, targets, points, self.hand_radius_m)))

@@ -18,6 +18,8 @@ from lerobot_openspm.types import Symmetry
 RETREAT_M = 0.06
 # A hand that is at most this much too low need not rise.
 LEVEL_M = 0.02
+# Phases that bring what is held to where it goes.
+PUTTING = ("pre-place", "place", "release")
 # Of the hand about its approach axis, the z axis of its frame.
 HALF_TURN = se3.from_yaw(np.zeros(3), np.pi)
 
@@ -30,11 +32,13 @@ class Turn:
         T_world_obj: Where it stands ``(4, 4)``.
         middle: Where its axis is, x and y ``(2,)`` in its frame, metres.
         radians: How far the hand is turned about the axis.
+        puts_turned: Whether it is turned where it puts the object too; of a round one either will do.
     """
 
     T_world_obj: Array
     middle: Array
     radians: float
+    puts_turned: bool = True
 
 
 @dataclass(frozen=True)
@@ -154,6 +158,8 @@ def _turned(targets: Sequence[Target], sub_task: int, turn: Turn) -> list[Target
         pose = target.key_pose
         if pose.sub_task != sub_task:
             continue
+        if pose.phase in PUTTING and not turn.puts_turned:
+            break
         if T_ee_obj is not None and pose.phase != "retreat":
             axis = target.T_world_ee @ T_ee_obj
         if pose.phase == "grasp" and T_ee_obj is None:
