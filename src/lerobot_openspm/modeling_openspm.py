@@ -119,7 +119,7 @@ class OpenSPMPolicy(PreTrainedPolicy):
             look = controller.advance(hand)
             while look is not None:  # twice where a part of the instruction ends and the next one begins
                 detections = episode.perception.detect(
-                    observation, look.names, look.expected, look.time_s, look.told_apart
+                    observation, look.names, look.expected, look.time_s, look.told_apart, look.displaced
                 )
                 look = controller.take_in(look, detections, hand)
             for i in range(n_actions):

@@ -102,10 +102,31 @@ def two_sub_tasks():
     return replace(shown, key_poses=(*pick_and_place("bowl", "plate"), *later)), poses
 
 
+def test_the_hand_rises_turned_as_it_grasped_also_where_it_puts_unturned():
+    poses = {name: se3.from_yaw([*place, 0.0], 0.0) for name, place in PLACES.items()}
+    shown = entry(key_poses=pick_and_place(), object_poses=poses)
+    turns = {0: Turn("bowl", poses["bowl"], np.zeros(2), np.deg2rad(120), puts_turned=False)}
+    plain = transfer(shown, poses, {}, HOME, turns=turns)
+    middle = (poses["bowl"][:2, 3] + poses["plate"][:2, 3]) / 2
+    higher, crossed = lifted(shown, plain, HOME, {"post": pillar(*middle, 0.4)}, RADIUS)
+    assert crossed == ["post"]
+    targets = transfer(higher, poses, {}, HOME, turns=turns)
+    i = next(i for i, one in enumerate(targets) if one.key_pose.phase == "pre-place")
+    lift, rise, over = targets[i - 1 : i + 2]
+    assert rise.key_pose.anchor.place == "bowl"
+    assert_allclose(rise.T_world_ee[:3, :3], lift.T_world_ee[:3, :3], atol=1e-9)
+    assert_allclose(rise.T_world_ee[:2, 3], lift.T_world_ee[:2, 3], atol=1e-9)
+    assert se3.distances(rise.T_world_ee, over.T_world_ee)[1] > 1
+
+
 @pytest.mark.parametrize("sub_task", [0, 1])
 def test_the_hand_rises_where_it_leaves_one_sub_task_however_a_grasp_is_turned(sub_task):
     shown, poses = two_sub_tasks()
-    turns = {sub_task: Turn(poses[("bowl", "cup")[sub_task]], np.zeros(2), np.deg2rad(90))}
+    turns = {
+        sub_task: Turn(
+            ("bowl", "cup")[sub_task], poses[("bowl", "cup")[sub_task]], np.zeros(2), np.deg2rad(90)
+        )
+    }
     plain = transfer(shown, poses, {}, HOME, turns=turns)
     higher, crossed = lifted(shown, plain, HOME, {"post": pillar(0.0, -0.1, 0.4)}, RADIUS)
     assert crossed == ["post"]

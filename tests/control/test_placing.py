@@ -52,7 +52,7 @@ def test_a_hand_that_cannot_turn_so_far_goes_the_other_way_round(yaw, is_half_tu
     plan, problems = context.choose([Scored(memory, 1.0, 1.0, 1.0, 1.0)], now, HOME)
     assert plan.is_half_turned is is_half_turned
     assert not problems
-    assert not plan.problems(context)
+    assert not plan.followed(context)[1]
     usual = Plan(memory, now, HOME).targets(context)
     turn = HALF_TURN if is_half_turned else np.eye(4)
     for target, other in zip(plan.targets(context), usual, strict=True):

@@ -45,12 +45,12 @@ def test_a_grasp_that_the_joints_cannot_reach_is_turned_about_a_round_object(pan
     stiff = replace(panda, joints=(*joints, replace(last, limits=np.array([-0.5, 1.5]))))
     context, poses, home = scene(stiff, np.deg2rad(90))
     plan = Plan(context.entries[0], poses, home)
-    assert not plan.problems(context)
-    (problem,) = replace(plan, stance=find_stance(context.robot, home)).problems(context)
+    assert not plan.followed(context)[1]
+    _, (problem,) = replace(plan, stance=find_stance(context.robot, home)).followed(context)
     assert "beyond what the arm's joints reach" in problem
     plan, problems = chosen(context, poses, home)
     assert plan.turned != 0
-    assert problems == plan.problems(context) == []
+    assert problems == plan.followed(context)[1] == []
 
 
 @pytest.mark.parametrize(
@@ -165,8 +165,10 @@ def test_the_hand_backs_off_as_far_as_the_arm_reaches(panda, x, backs_off):
     context, _, _ = scene(panda, 0.0)
     context = replace(context, entries=(shown,))
     plan, problems = chosen(context, poses, hand_pose(-0.22, -0.01, 1.177))
-    assert problems == plan.problems(context) == []
+    assert problems == plan.followed(context)[1] == []
     opened, *left = plan.targets(context)[3:]
+    nearer = replace(plan, object_poses={"cabinet": se3.from_yaw([-0.05, -0.133, 1.014], 0.0)})
+    assert nearer.followed(context)[0].retreat_m == RETREAT_M
     gone = [se3.distances(opened.T_world_ee, one.T_world_ee)[0] for one in left]
     assert_allclose(gone, [backs_off] if backs_off else [], atol=1e-9)
 

@@ -13,7 +13,7 @@ from lerobot_openspm.control.feasibility import (
     geometric_score,
     shape_deviation,
 )
-from lerobot_openspm.control.transfer import RETREAT_M, Turn, about, as_shown, transfer, transfer_pose
+from lerobot_openspm.control.transfer import RETREAT_M, Turn, as_shown, transfer, transfer_pose, turn_about
 from lerobot_openspm.geometry import se3
 from lerobot_openspm.memory.entry import WORLD
 from lerobot_openspm.types import Symmetry
@@ -66,7 +66,7 @@ def test_moving_one_object_moves_its_own_targets_alone():
 def test_a_turned_grasp_takes_a_round_object_from_another_side_and_puts_it_to_the_same_place(turn, x, y):
     memory, middle = entry(), np.array([x, 0.01])
     poses = memory.object_poses | {"bowl": se3.from_yaw([0.1, y, 0.0], 0.4)}
-    turned = {0: Turn(poses["bowl"], middle, turn)}
+    turned = {0: Turn("bowl", poses["bowl"], middle, turn)}
     before, after = (transfer(memory, poses, {}, HOME, turns=turns) for turns in (None, turned))
     axis = se3.apply(poses["bowl"], np.array([[*middle, 0.0]]))[0]
     grasp = next(i for i, one in enumerate(before) if one.key_pose.phase == "grasp")
@@ -273,7 +273,10 @@ def test_what_can_be_done_at_all_scores_something(monkeypatch):
 
 def test_a_round_thing_is_grasped_and_put_as_it_was_shown_however_it_is_turned():
     memory = entry()
-    turned = {**memory.object_poses, "bowl": memory.object_poses["bowl"] @ about(np.array([0.02, 0.01]), 2.5)}
+    turned = {
+        **memory.object_poses,
+        "bowl": memory.object_poses["bowl"] @ turn_about(np.array([0.02, 0.01]), 2.5),
+    }
     for turn, stays in ((0.0, True), (np.pi, False)):
         poses = as_shown(memory, turned, {"bowl": Symmetry(np.array([0.02, 0.01]), turn)})
         own = transfer(memory, poses, {}, HOME)

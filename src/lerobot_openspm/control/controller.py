@@ -244,8 +244,9 @@ class EpisodeController:
         plan = self.state.plan
         changed = plan.moved(names, self.scene.tracker.poses(hand.T_world_ee))
         if changed:
-            plan = replace(plan, object_poses={**plan.object_poses, **changed})
-            if problems := plan.problems(self._context):
+            there = replace(plan, object_poses={**plan.object_poses, **changed})
+            plan, problems = there.followed(self._context)
+            if problems:
                 logger.info("%r: not believed: %s", self.instruction, "; ".join(problems))
                 return set()
             self.state.plan = plan

@@ -34,8 +34,8 @@ MOVED_M, MOVED_RAD = 0.002, 0.05
 TURNS = tuple(
     np.deg2rad([0, *(sign * turn for turn in range(30, 180, 30) for sign in (1, -1)), 180]).tolist()
 )
-# What a retreat of our own is shortened to where the arm does not reach further, metres.
-SHORTER_RETREATS_M = (RETREAT_M / 2, 0.0)
+# How long a retreat of our own is, metres: the first of these that the arm reaches.
+RETREATS_M = (RETREAT_M, RETREAT_M / 2, 0.0)
 # Where an object is that was never seen.
 NOWHERE = se3.transform(np.eye(3), np.full(3, np.inf))
 
@@ -77,7 +77,9 @@ class Plan:
         entry = self.entry if last is None else self.entry.until(last)
         object_poses = as_shown(entry, self.object_poses, context.symmetries)
         turns = {
-            sub_task: Turn(object_poses[name], context.symmetries[name].middle, self.turned, self.puts_turned)
+            sub_task: Turn(
+                name, object_poses[name], context.symmetries[name].middle, self.turned, self.puts_turned
+            )
             for sub_task, name in self.symmetric_grasps(context).items()
             if self.turned and name in object_poses
         }
@@ -105,13 +107,13 @@ class Plan:
                 ways += [replace(self, turned=radians, puts_turned=False)] if not any(least) else []
         return ways
 
-    def problems(self, context: PlanningContext) -> list[str]:
-        """What keeps the hand from following the plan, in words."""
-        targets = self.targets(context)
-        problems = self.check(context, targets)
-        if not problems and (miss := self.miss(context, targets)):
-            return [str(miss)]
-        return problems
+    def followed(self, context: PlanningContext) -> tuple[Plan, list[str]]:
+        """The plan, backing off as far as the arm reaches, and what keeps the hand from following it."""
+        problems = self.check(context, self.targets(context))
+        if problems:
+            return self, problems
+        plan, miss = self.backing_off(context)
+        return plan, [] if miss is None else [str(miss)]
 
     def check(self, context: PlanningContext, targets: Sequence[Target]) -> list[str]:
         """What is wrong with its key poses in the scene, the joints' reach left out."""
@@ -130,12 +132,12 @@ class Plan:
 
         Only a retreat of our own is shortened: what was demonstrated has to be reached.
         """
-        plan, miss = self, self.miss(context, self.targets(context))
-        for metres in SHORTER_RETREATS_M:
-            if miss is None or miss.index < len(self.entry.key_poses):
-                break
+        plan, miss = self, None
+        for metres in RETREATS_M:
             plan = replace(self, retreat_m=metres)
             miss = plan.miss(context, plan.targets(context))
+            if miss is None or miss.index < len(self.entry.key_poses):
+                break
         return plan, miss
 
     def is_same_scene(self, object_poses: Mapping[str, Array], T_world_ee: Array) -> bool:

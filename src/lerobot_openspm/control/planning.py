@@ -135,7 +135,7 @@ class PlanningContext:
                     return found[0], []
                 crowded += [found] if found is not None else []
         if not crowded:
-            return first, first.problems(self)
+            return first.followed(self)
         plan, inside = min(crowded, key=_amount)
         logger.warning("%r: the hand may touch the %s where it takes hold or lets go",
                        plan.entry.language, " and the ".join(inside))  # fmt: skip
@@ -188,8 +188,8 @@ class PlanningContext:
         entry, crossed = lifted(plan.entry, plan.targets(self), plan.T_world_ee, points, self.hand_radius_m)
         if not crossed:
             return plan
-        higher = replace(plan, entry=entry)
-        if problems := higher.problems(self):
+        higher, problems = replace(plan, entry=entry).followed(self)
+        if problems:
             logger.warning(
                 "%r: goes straight although the %s may be in the way: lifted over it, %s",
                 plan.entry.language, " and the ".join(crossed), "; ".join(problems),

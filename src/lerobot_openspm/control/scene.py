@@ -38,6 +38,7 @@ class LookRequest:
         time_s: Seconds since the episode began.
         held: Those of the objects that are taken to be in the hand.
         told_apart: Those that the instruction tells from others of their kind.
+        displaced: Those that need not be where they were in the first looks any more.
         back_to: The key pose to go back to after the look; None unless something is tried again.
     """
 
@@ -46,6 +47,7 @@ class LookRequest:
     time_s: float
     held: frozenset[str]
     told_apart: frozenset[str]
+    displaced: frozenset[str]
     back_to: int | None
 
 
@@ -90,7 +92,8 @@ class SceneState:
         held = self.tracker.held & frozenset(names)
         told_apart = frozenset(self.grounding.said) & frozenset(names)
         time_s = self._step * self._context.step_s
-        return LookRequest(tuple(names), expected, time_s, held, told_apart, back_to)
+        displaced = frozenset(self.tracker.displaced)
+        return LookRequest(tuple(names), expected, time_s, held, told_apart, displaced, back_to)
 
     def take_in(self, detections: Detections, hand: Hand) -> frozenset[str]:
         """Take in what a look brought; the names of the objects that are somewhere else than before.

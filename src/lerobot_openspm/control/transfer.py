@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from lerobot_openspm.control.placing import carried_outcomes, placing_position
+from lerobot_openspm.control.placing import ARRIVING, carried_outcomes, placing_position
 from lerobot_openspm.control.pushes import PushPath, push_paths
 from lerobot_openspm.geometry import se3
 from lerobot_openspm.geometry.se3 import Array
@@ -18,8 +18,6 @@ from lerobot_openspm.types import Symmetry
 RETREAT_M = 0.06
 # A hand that is at most this much too low need not rise.
 LEVEL_M = 0.02
-# Phases that bring what is held to where it goes.
-PUTTING = ("pre-place", "place", "release")
 # Of the hand about its approach axis, the z axis of its frame.
 HALF_TURN = se3.from_yaw(np.zeros(3), np.pi)
 
@@ -29,12 +27,14 @@ class Turn:
     """An object that turns into itself is grasped from another side than it was shown.
 
     Attributes:
+        name: What it is called.
         T_world_obj: Where it stands ``(4, 4)``.
         middle: Where its axis is, x and y ``(2,)`` in its frame, metres.
         radians: How far the hand is turned about the axis.
         puts_turned: Whether it is turned where it puts the object too; of a round one either will do.
     """
 
+    name: str
     T_world_obj: Array
     middle: Array
     radians: float
@@ -83,11 +83,11 @@ def as_shown(
     for name in grasped & symmetries.keys() & object_poses.keys() & entry.object_poses.keys():
         if symmetries[name].turn == 0:
             yaw = se3.yaw_of(entry.object_poses[name]) - se3.yaw_of(object_poses[name])
-            shown[name] = object_poses[name] @ about(symmetries[name].middle, float(yaw))
+            shown[name] = object_poses[name] @ turn_about(symmetries[name].middle, float(yaw))
     return shown
 
 
-def about(middle: Array, radians: float) -> Array:
+def turn_about(middle: Array, radians: float) -> Array:
     """A turn ``(4, 4)`` about the vertical through a point ``(2,)``."""
     point = np.array([*middle, 0.0])
     return se3.from_yaw(point, radians) @ se3.from_yaw(-point, 0.0)
@@ -158,14 +158,14 @@ def _turned(targets: Sequence[Target], sub_task: int, turn: Turn) -> list[Target
         pose = target.key_pose
         if pose.sub_task != sub_task:
             continue
-        if pose.phase in PUTTING and not turn.puts_turned:
+        if pose.phase in ARRIVING and pose.anchor.place != turn.name and not turn.puts_turned:
             break
         if T_ee_obj is not None and pose.phase != "retreat":
             axis = target.T_world_ee @ T_ee_obj
         if pose.phase == "grasp" and T_ee_obj is None:
             T_ee_obj = se3.inverse(target.T_world_ee) @ turn.T_world_obj
         point = se3.apply(axis, np.array([[*turn.middle, 0.0]]))[0]
-        turned[i] = replace(target, T_world_ee=about(point[:2], turn.radians) @ target.T_world_ee)
+        turned[i] = replace(target, T_world_ee=turn_about(point[:2], turn.radians) @ target.T_world_ee)
     return turned
 
 

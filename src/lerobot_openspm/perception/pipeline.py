@@ -82,6 +82,7 @@ class Perception:
         expected: Mapping[str, Array],
         time_s: float,
         told_apart: Collection[str] = (),
+        displaced: Collection[str] = (),
     ) -> Detections:
         """Look for objects.
 
@@ -92,6 +93,7 @@ class Perception:
                 there first.
             time_s: Seconds since the episode began.
             told_apart: Those of the objects that words tell from others of their kind.
+            displaced: Objects of which earlier looks tell nothing any more.
 
         Raises:
             ObservationError: A camera is missing or broken at the very first look.
@@ -114,21 +116,26 @@ class Perception:
             return Detections({}, faults)
         hidden = {camera: hand_mask(view, T_world_ee, self.hand_radius_m) for camera, view in sound.items()}
         known = {name: self.memory.objects[name] for name in names if name in self.memory.objects}
+        self.before = tuple(one.without(displaced) for one in self.before)
         look = look_at(sound, list(known), self.segmenter, hidden, expected, told_apart, self.before)
         estimates = localise_all(known, look)
-        self.remember(look, estimates)
+        self.remember(look, {name: one for name, one in estimates.items() if name not in displaced})
         if not self._has_compared:  # only at the first look, before anything moves
             self._has_compared = True
             faults = faults or disagreeing_cameras(look, known, estimates)
         return Detections(estimates, faults)
 
     def remember(self, look: Look, estimates: Mapping[str, PoseEstimate]) -> None:
-        """Keep a look from elsewhere than the last one that was kept."""
-        if self.before and not _is_elsewhere(look, self.before[-1].look):
-            return
+        """Keep a look that found something, from elsewhere than the last one that was kept.
+
+        Of all but the first one only what the hand's cameras show: the others show the same again.
+        """
         poses = {name: one.T_world_obj for name, one in estimates.items() if one.status == "found"}
-        kept = EarlierLook(replace(look, before=()), poses)
-        self.before = (*self.before[:1], *self.before[1:][-MOST_REMEMBERED + 1 :], kept)
+        if not poses or (self.before and not _is_elsewhere(look, self.before[-1].look)):
+            return
+        views = look.views if not self.before else _of_the_hand(look)
+        kept = EarlierLook(replace(look, views=views, before=()), poses)
+        self.before = (*self.before[:1], *(*self.before[1:], kept)[-MOST_REMEMBERED:])
 
     def _simulator_poses(self, observation: Observation, names: Sequence[str]) -> dict[str, PoseEstimate]:
         poses = observation.simulator_poses(self.memory.simulator_objects)
@@ -169,12 +176,18 @@ def disagreeing_cameras(
 
 def _is_elsewhere(look: Look, before: Look) -> bool:
     """Whether a camera of the hand is elsewhere, or looks in another direction, than it did before."""
-    for camera, view in look.views.items():
-        if view.camera.mount == "ee" and camera in before.views:
-            metres, radians = se3.distances(view.T_world_cam, before.views[camera].T_world_cam)
-            if metres > ELSEWHERE_M or radians > ELSEWHERE_RAD:
-                return True
+    for camera, view in _of_the_hand(look).items():
+        if camera not in before.views:
+            return True
+        metres, radians = se3.distances(view.T_world_cam, before.views[camera].T_world_cam)
+        if metres > ELSEWHERE_M or radians > ELSEWHERE_RAD:
+            return True
     return False
+
+
+def _of_the_hand(look: Look) -> dict[str, View]:
+    """The views of cameras that the hand carries."""
+    return {camera: view for camera, view in look.views.items() if view.camera.mount == "ee"}
 
 
 def detect(

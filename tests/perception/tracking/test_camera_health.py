@@ -118,6 +118,13 @@ def test_objects_that_are_each_seen_badly_tell_nothing_of_the_cameras():
     assert disagreements({"front": front, "side": side}) == {}
 
 
+def test_a_camera_that_sees_objects_badly_clears_no_other_one():
+    rng = np.random.default_rng(5)
+    badly = {name: [place + rng.normal(0, 0.015, 2) for place in ps] for name, ps in shown(3).items()}
+    found = disagreements({"front": shown(1), "side": shown(2, (0.02, 0.0)), "wrist": badly})
+    assert {"front", "side"} <= found.keys()
+
+
 def test_of_two_cameras_that_disagree_both_are_named():
     assert list(disagreements({"front": shown(1), "side": shown(2, (0.0, 0.02))})) == ["front", "side"]
 

@@ -86,9 +86,18 @@ def test_a_jump_is_believed_at_the_second_look_that_agrees():
     assert one.status("cup") is TrackStatus.AMBIGUOUS
     assert one.doubtful
     assert_allclose(pose(one), CUP)
+    assert one.displaced == set()
     assert look(one, seen(shifted(there, 0.004, 0.0, 0.0))) == {"cup"}
+    assert one.displaced == {"cup"}
     assert_allclose(pose(one), shifted(there, 0.004, 0.0, 0.0))
     assert one.status("cup") is TrackStatus.TRACKED
+
+
+@pytest.mark.parametrize("change", [lambda one: one.hold("cup", FAR_HAND), lambda one: one.forget(["cup"])])
+def test_what_the_hand_took_and_what_a_name_stood_for_before_need_not_be_where_it_was(change):
+    one = tracker()
+    change(one)
+    assert one.displaced == {"cup"}
 
 
 def test_two_looks_at_different_places_are_no_agreement():

@@ -141,6 +141,14 @@ class EarlierLook:
     look: Look
     poses: Mapping[str, Array]
 
+    def without(self, names: Collection[str]) -> EarlierLook:
+        """The same, telling nothing of some objects."""
+        return replace(self, poses={name: T for name, T in self.poses.items() if name not in names})
+
+    def __deepcopy__(self, memo: dict[int, object]) -> EarlierLook:
+        """Itself: nothing here ever changes, and pictures are large."""
+        return self
+
 
 def look_at(
     views: Mapping[str, View],

@@ -111,8 +111,9 @@ def disagreements(places: Mapping[str, Mapping[str, Sequence[Array]]]) -> dict[s
         if len(own) >= MIN_COMMON:
             pairs[pair] = own, other
     apart = {pair: np.linalg.norm(a - b, axis=1) for pair, (a, b) in pairs.items()}
-    off = {pair: _agreed(apart[pair]) > DISAGREE_M and _is_as_one(a, b) for pair, (a, b) in pairs.items()}
-    agreeing = {camera for pair, is_off in off.items() if not is_off for camera in pair}
+    differing = {pair for pair, one in apart.items() if _agreed(one) > DISAGREE_M}
+    off = {pair: pair in differing and _moved_as_one(*places) for pair, places in pairs.items()}
+    agreeing = {camera for pair in apart.keys() - differing for camera in pair}
     suspects = {camera for pair, is_off in off.items() if is_off for camera in pair}
     found: dict[str, str] = {}
     for camera in sorted(suspects - agreeing):
@@ -137,7 +138,7 @@ def _nearest(a: Mapping[str, Sequence[Array]], b: Mapping[str, Sequence[Array]])
     return one, other
 
 
-def _is_as_one(a: Array, b: Array) -> bool:
+def _moved_as_one(a: Array, b: Array) -> bool:
     """Whether some shift and turn in the plane lead from most of the places ``(n, 2)`` to the others."""
     for i, j in itertools.combinations(range(len(a)), 2):
         turn = np.arctan2(*(b[j] - b[i])[::-1]) - np.arctan2(*(a[j] - a[i])[::-1])

@@ -104,10 +104,12 @@ class Tracker:
     Attributes:
         yaw_periods: Angle by object that turns it into itself, radians; 0 for a body of revolution.
         settings: When a pose is believed.
+        displaced: Objects that were in the hand, or were seen elsewhere than before, at some time.
     """
 
     yaw_periods: Mapping[str, float]
     settings: TrackerSettings
+    displaced: set[str] = field(default_factory=set[str])
     _tracks: dict[str, _Track] = field(default_factory=dict)
 
     def poses(self, T_world_ee: Array) -> dict[str, Array]:
@@ -174,6 +176,7 @@ class Tracker:
         """The hand carries an object from now on."""
         track = self._tracks.get(name)
         if track is not None and not track.held:
+            self.displaced.add(name)
             track.stood_m = float(track.smoothed[2, 3])
             self._carry(track, se3.inverse(T_world_ee), held=True)
 
@@ -210,6 +213,7 @@ class Tracker:
         """These names stand for other objects from now on."""
         for name in names:
             self._tracks.pop(name, None)
+            self.displaced.add(name)
 
     @property
     def held(self) -> frozenset[str]:
@@ -253,6 +257,7 @@ class Tracker:
             track.missed_s += waited_s  # seen here and there, and not where it is taken to be
             return False
         self._begin(name, T_world_obj, estimate)
+        self.displaced.add(name)
         return True
 
     def _miss(self, track: _Track, estimate: PoseEstimate, T_world_ee: Array, waited_s: float) -> None:

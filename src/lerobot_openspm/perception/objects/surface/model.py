@@ -60,7 +60,7 @@ KEPT_SHARE, GONE_SHARE = 0.7, 0.4
 # from this share on nothing is in doubt. What tells it more vaguely than that is no evidence. Metres.
 SURE_SHARE, SHARP_M, VAGUE_M = 0.8, 0.004, 0.008
 # Earlier looks that found an object less than so far from where it is expected, metres, count as long as the
-# place by all of them agrees with the present look by this share of the typical agreement.
+# place by all of them agrees with the present look by this share of what the best place by that alone does.
 STILL_M, STILL_SHARE = 0.03, 0.85
 # Directions that the search begins from, for an object that does not look alike from all of them.
 YAWS = tuple(np.linspace(0, 2 * np.pi, 8, endpoint=False))
@@ -161,17 +161,18 @@ class SurfaceModel:
     def _at(self, look: Look, T_expected: Array) -> PoseEstimate:
         """What is seen of it around where it is expected.
 
-        By earlier looks too, as long as the place by all of them explains the present one: a look from nearby
-        shows only a part of an object, and tells its place badly.
+        The place is that by earlier looks too, as long as it explains the present one nearly as well as the
+        best place by that alone does: a look from nearby shows only a part, and tells the place badly.
         """
         sights = self._sights(look)
+        seen = self._refined(sights, T_expected)
         if before := self._sights_before(look, T_expected):
-            both = sights | before
-            still = refine(self.surface, both, _pose(T_expected), self._freedom, FINE_POINTS, FINE_STEPS)
+            together = sights | before
+            still = refine(self.surface, together, _pose(T_expected), self._freedom, FINE_POINTS, FINE_STEPS)
             score = score_at(self.surface, sights, still.pose)
-            if score >= STILL_SHARE * self.typical_agreement:
-                return self._estimate(look, both, [replace(still, score=score)])
-        return self._estimate(look, sights, [self._refined(sights, T_expected)])
+            if score >= STILL_SHARE * seen.score:
+                seen = replace(still, score=score)
+        return self._estimate(look, sights, [seen])
 
     def _sights_before(self, look: Look, T_expected: Array) -> dict[str, Sight]:
         """The views of earlier looks in which it was found where it is expected."""
@@ -179,10 +180,8 @@ class SurfaceModel:
         for i, earlier in enumerate(look.before):
             T = earlier.poses.get(self.name)
             if T is not None and np.linalg.norm(T[:3, 3] - T_expected[:3, 3]) < STILL_M:
-                # A camera that stands still shows the same again.
-                cameras = [c for c, view in earlier.look.views.items() if not i or view.camera.mount == "ee"]
                 own = self._sights(earlier.look)
-                found |= {f"{camera}, earlier look {i}": own[camera] for camera in cameras}
+                found |= {f"{camera}, earlier look {i}": sight for camera, sight in own.items()}
         return found
 
     def _sights(self, look: Look) -> dict[str, Sight]:
@@ -212,7 +211,7 @@ class SurfaceModel:
         places = self._on_table(sights, several=True)
         if len(look.supports):
             places += self._on_things(look.supports, sights, several=True)
-        return sorted(places, key=lambda place: -place.score)
+        return sorted(places, key=lambda place: -likelihood(self.surface, place))
 
     def _on_table(self, sights: Mapping[str, Sight], several: bool = False) -> list[Place]:
         ground = over_table(self.surface, self.backdrop.reach, (self.height,))
