@@ -4,73 +4,27 @@ import dataclasses
 
 import numpy as np
 import pytest
-import torch
-from tests.perception.drawn_world import DISTRACTOR, SHAPES, hand_camera, render
+from tests.perception.drawn_world import SHAPES, hand_camera, render
+from tests.perception.objects.surface.filmed import (
+    HOME,
+    MIDDLES,
+    demonstration,
+    looking_down,
+    moved,
+    views_at,
+)
 
 from lerobot_openspm.errors import MemoryFormatError
 from lerobot_openspm.geometry import se3
 from lerobot_openspm.geometry.camera import project
 from lerobot_openspm.perception.objects import store
-from lerobot_openspm.perception.objects.base import EarlierLook, Look, localise_all
+from lerobot_openspm.perception.objects.base import Look, localise_all
 from lerobot_openspm.perception.objects.kinds import learn_objects
 from lerobot_openspm.perception.objects.surface import model as model_module
 from lerobot_openspm.perception.objects.surface.compare import correlation
 from lerobot_openspm.perception.objects.surface.model import SurfaceModel
 from lerobot_openspm.perception.objects.surface.search import Place, _areas, _ranked
-from lerobot_openspm.perception.observation import Observation
-from lerobot_openspm.perception.pipeline import Perception
-from lerobot_openspm.types import ContactCue, DemonstrationScene, Hand, Moment, PoseEstimate
-
-HOME = (-0.05, 0.0, 0.45)
-MIDDLES = {"block": (0.02, -0.15, 0.0), "cup": (0.0, 0.15, 0.0), "distractor": (-0.02, 0.0, 0.0)}
-
-
-def looking_down(x, y, z, tilt=0.0):
-    """``T_world_ee`` of a hand whose camera looks down, leaning back by ``tilt`` radians."""
-    c, s = np.cos(tilt), np.sin(tilt)
-    axes = np.array([[0.0, -1.0, 0.0], [-c, 0.0, -s], [s, 0.0, -c]]).T
-    return se3.transform(axes, np.array([x, y, z]))
-
-
-def views_at(poses, T_world_ee):
-    return render(
-        [(SHAPES.get(name, DISTRACTOR), T) for name, T in poses.items()], None, hand_camera(T_world_ee)
-    )
-
-
-def demonstration(rng):
-    """The hand comes from one side to the cup, grasps it, and carries it over the block."""
-    poses = {
-        name: se3.from_yaw([x + dx, y + dy, 0.0], yaw)
-        for (name, (x, y, yaw)), (dx, dy) in zip(
-            MIDDLES.items(), rng.uniform(-0.012, 0.012, (3, 2)), strict=True
-        )
-    }
-    grasp = poses["cup"][:3, 3] + [0.03, 0.0, 0.05] + rng.normal(0, 0.002, 3)
-    release = poses["block"][:3, 3] + [0, 0, 0.12] + rng.normal(0, 0.002, 3)
-    cues = (ContactCue("cup", grasp, "grasp"), ContactCue("block", release, "release"))
-    places = [
-        (
-            *(rng.uniform(-0.25, 0.2), rng.uniform(-0.25, 0.25), rng.uniform(0.25, 0.45)),
-            rng.uniform(-0.5, 0.5),
-        )
-        for _ in range(16)
-    ]
-
-    def film():
-        moments = [Moment(views_at(poses, looking_down(*HOME)), frozenset())]
-        for place in places:
-            seen = views_at(poses, looking_down(*place))
-            moments.append(Moment({"hand": seen["hand"]}, frozenset()))
-        return moments
-
-    return DemonstrationScene(views_at(poses, looking_down(*HOME)), cues, None, film)
-
-
-@pytest.fixture(scope="module")
-def models():
-    rng = np.random.default_rng(1)
-    return learn_objects([demonstration(rng) for _ in range(6)], np.random.default_rng(0)).models
+from lerobot_openspm.types import Moment
 
 
 def test_what_hardly_moves_and_was_filmed_is_known_by_its_surface(models):
@@ -89,10 +43,6 @@ def test_its_points_lie_where_its_walls_and_its_top_are(models, name, height, ra
     points = model.surface.coloured + np.array([0, 0, model.height])
     assert np.percentile(points[:, 2], 95) == pytest.approx(height, abs=0.01)
     assert model.surface.radius == pytest.approx(radius, abs=0.012)
-
-
-def moved(x, y, yaw):
-    return {"block": se3.from_yaw([x, y, 0.0], yaw), "distractor": se3.from_yaw([-0.18, 0.17, 0.0], 0.0)}
 
 
 @pytest.mark.parametrize(
@@ -221,88 +171,6 @@ def test_it_is_followed_from_where_it_is_expected(models):
     again = model.localise(look)
     assert again.status == "found"
     assert float(se3.distance(first.T_world_obj, again.T_world_obj)) < 0.006
-
-
-def from_nearby(scene):
-    """Views of a hand right above a corner of the block; the arm hides everything from the fixed cameras."""
-    views = views_at(scene, looking_down(*(scene["block"][:2, 3] + [0.03, 0.03]), 0.13))
-    return views, {name: np.full(view.image.shape[:2], name != "hand") for name, view in views.items()}
-
-
-def test_where_a_look_from_nearby_shows_a_part_earlier_looks_tell_the_place(models):
-    model, scene = models["block"], moved(0.12, 0.12, 0.3)
-    first = Look(views_at(scene, looking_down(*HOME)))
-    T = model.localise(first).T_world_obj
-    views, hidden = from_nearby(scene)
-    nudged = se3.from_yaw([0.006, -0.006, 0.0], 0.0) @ T
-    off = []
-    for before in ((), (EarlierLook(first, {"block": T}),)):
-        look = Look(views, hidden=hidden, expected={"block": nudged}, before=before)
-        off.append(float(se3.distances(model.localise(look).T_world_obj, T)[0]))
-    assert off[1] < 0.003 < off[0]
-
-
-def test_earlier_looks_do_not_hold_back_what_has_moved(models):
-    model, scene = models["block"], moved(0.12, 0.12, 0.3)
-    first = Look(views_at(scene, looking_down(*HOME)))
-    T = model.localise(first).T_world_obj
-    before = (EarlierLook(first, {"block": T}),)
-    for x, yaw in ((0.015, 0.0), (0.008, 0.0), (0.0, 0.25)):
-        now = views_at(moved(0.12 + x, 0.12, 0.3 + yaw), looking_down(0.0, 0.1, 0.35))
-        found = model.localise(Look(now, expected={"block": T}, before=before))
-        alone = model.localise(Look(now, expected={"block": T}))
-        assert found.status == "found"
-        metres, radians = se3.distances(found.T_world_obj, alone.T_world_obj)
-        assert metres < 0.004
-        assert radians < 0.1
-
-
-def test_the_first_look_and_the_last_ones_from_elsewhere_are_remembered():
-    perception = Perception(None, 0.08)
-    places = [(0.0, 0.0), (0.0, 0.0), (0.1, 0.0), (0.2, 0.0), (0.2, 0.4), (0.3, 0.4), (0.3, 0.4)]
-    looks = [Look(views_at({}, looking_down(x, 0.0, 0.4, tilt))) for x, tilt in places]
-    found = PoseEstimate("found", np.eye(4), np.eye(4), 1.0)
-    missed = dataclasses.replace(found, status="not_found")
-    perception.remember(looks[-1], {"cup": missed})
-    assert perception.before == ()
-    for look in looks:
-        look = dataclasses.replace(look, before=perception.before)
-        perception.remember(look, {"cup": found, "block": missed})
-    kept = [one.look.views for one in perception.before]
-    assert [views["hand"] for views in kept] == [looks[i].views["hand"] for i in (0, 3, 4, 5)]
-    assert [len(views) for views in kept] == [len(looks[0].views), 1, 1, 1]
-    assert all(one.poses.keys() == {"cup"} and not one.look.before for one in perception.before)
-
-
-def test_earlier_looks_are_handed_on_and_tell_nothing_of_what_was_displaced(models):
-    class Known:
-        perception, simulator_objects = "demonstrations", ()
-
-        def __init__(self):
-            self.cameras = {name: view.camera for name, view in views_at({}, looking_down(*HOME)).items()}
-            self.looks, self.objects = [], {"cup": self, "block": self}
-
-        def localise(self, look):
-            self.looks.append(look)
-            return PoseEstimate("found", np.eye(4), 1e-6 * np.eye(4), 1.0)
-
-        points, on_things = np.zeros((0, 3)), False
-
-    known = Known()
-    perception = Perception(known, 0.08)
-    for i, displaced in enumerate(((), (), ("cup",))):
-        T_world_ee = looking_down(0.1 * i, 0.0, 0.4)
-        views = views_at(moved(0.12, 0.12, 0.0), T_world_ee)
-        images = {
-            name: torch.as_tensor(view.image.transpose(2, 0, 1).copy()).float() / 255
-            for name, view in views.items()
-        }
-        observation = Observation("", np.zeros(8), Hand(T_world_ee, 0.08), images, None)
-        perception.detect(observation, ["cup", "block"], {}, float(i), displaced=displaced)
-    told = [[sorted(one.poses) for one in look.before] for look in known.looks if len(look.views) > 1]
-    both, block = ["block", "cup"], ["block"]
-    assert told == [[], [], [both], [both], [block, block], [block, block]]
-    assert [sorted(one.poses) for one in perception.before] == [block, block, block]
 
 
 def test_pictures_that_tell_a_place_vaguely_are_no_evidence(models):

@@ -1,0 +1,95 @@
+"""What stands still is followed by earlier looks from elsewhere too."""
+
+import dataclasses
+
+import numpy as np
+import torch
+from tests.perception.objects.surface.filmed import HOME, looking_down, moved, views_at
+
+from lerobot_openspm.geometry import se3
+from lerobot_openspm.perception.objects.base import EarlierLook, Look
+from lerobot_openspm.perception.observation import Observation
+from lerobot_openspm.perception.pipeline import Perception
+from lerobot_openspm.types import Hand, PoseEstimate
+
+
+def from_nearby(scene):
+    """Views of a hand right above a corner of the block; the arm hides everything from the fixed cameras."""
+    views = views_at(scene, looking_down(*(scene["block"][:2, 3] + [0.03, 0.03]), 0.13))
+    return views, {name: np.full(view.image.shape[:2], name != "hand") for name, view in views.items()}
+
+
+def test_where_a_look_from_nearby_shows_a_part_earlier_looks_tell_the_place(models):
+    model, scene = models["block"], moved(0.12, 0.12, 0.3)
+    first = Look(views_at(scene, looking_down(*HOME)))
+    T = model.localise(first).T_world_obj
+    views, hidden = from_nearby(scene)
+    nudged = se3.from_yaw([0.006, -0.006, 0.0], 0.0) @ T
+    off = []
+    for before in ((), (EarlierLook(first, {"block": T}),)):
+        look = Look(views, hidden=hidden, expected={"block": nudged}, before=before)
+        off.append(float(se3.distances(model.localise(look).T_world_obj, T)[0]))
+    assert off[1] < 0.003 < off[0]
+
+
+def test_earlier_looks_do_not_hold_back_what_has_moved(models):
+    model, scene = models["block"], moved(0.12, 0.12, 0.3)
+    first = Look(views_at(scene, looking_down(*HOME)))
+    T = model.localise(first).T_world_obj
+    before = (EarlierLook(first, {"block": T}),)
+    for x, yaw in ((0.015, 0.0), (0.008, 0.0), (0.0, 0.25)):
+        now = views_at(moved(0.12 + x, 0.12, 0.3 + yaw), looking_down(0.0, 0.1, 0.35))
+        found = model.localise(Look(now, expected={"block": T}, before=before))
+        alone = model.localise(Look(now, expected={"block": T}))
+        assert found.status == "found"
+        metres, radians = se3.distances(found.T_world_obj, alone.T_world_obj)
+        assert metres < 0.004
+        assert radians < 0.1
+
+
+def test_the_first_look_and_the_last_ones_from_elsewhere_are_remembered():
+    perception = Perception(None, 0.08)
+    places = [(0.0, 0.0), (0.0, 0.0), (0.1, 0.0), (0.2, 0.0), (0.2, 0.4), (0.3, 0.4), (0.3, 0.4)]
+    looks = [Look(views_at({}, looking_down(x, 0.0, 0.4, tilt))) for x, tilt in places]
+    found = PoseEstimate("found", np.eye(4), np.eye(4), 1.0)
+    missed = dataclasses.replace(found, status="not_found")
+    perception.remember(looks[-1], {"cup": missed})
+    assert perception.before == ()
+    for look in looks:
+        look = dataclasses.replace(look, before=perception.before)
+        perception.remember(look, {"cup": found, "block": missed})
+    kept = [one.look.views for one in perception.before]
+    assert [views["hand"] for views in kept] == [looks[i].views["hand"] for i in (0, 3, 4, 5)]
+    assert [len(views) for views in kept] == [len(looks[0].views), 1, 1, 1]
+    assert all(one.poses.keys() == {"cup"} and not one.look.before for one in perception.before)
+
+
+def test_earlier_looks_are_handed_on_and_tell_nothing_of_what_was_displaced(models):
+    class Known:
+        perception, simulator_objects = "demonstrations", ()
+
+        def __init__(self):
+            self.cameras = {name: view.camera for name, view in views_at({}, looking_down(*HOME)).items()}
+            self.looks, self.objects = [], {"cup": self, "block": self}
+
+        def localise(self, look):
+            self.looks.append(look)
+            return PoseEstimate("found", np.eye(4), 1e-6 * np.eye(4), 1.0)
+
+        points, on_things = np.zeros((0, 3)), False
+
+    known = Known()
+    perception = Perception(known, 0.08)
+    for i, displaced in enumerate(((), (), ("cup",))):
+        T_world_ee = looking_down(0.1 * i, 0.0, 0.4)
+        views = views_at(moved(0.12, 0.12, 0.0), T_world_ee)
+        images = {
+            name: torch.as_tensor(view.image.transpose(2, 0, 1).copy()).float() / 255
+            for name, view in views.items()
+        }
+        observation = Observation("", np.zeros(8), Hand(T_world_ee, 0.08), images, None)
+        perception.detect(observation, ["cup", "block"], {}, float(i), displaced=displaced)
+    told = [[sorted(one.poses) for one in look.before] for look in known.looks if len(look.views) > 1]
+    both, block = ["block", "cup"], ["block"]
+    assert told == [[], [], [both], [both], [block, block], [block, block]]
+    assert [sorted(one.poses) for one in perception.before] == [block, block, block]
