@@ -9,6 +9,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from lerobot_openspm.control.spatial_relations import choose, choose_as_shown, contradicts
+from lerobot_openspm.geometry import se3
 from lerobot_openspm.geometry.se3 import Array
 from lerobot_openspm.memory.compose import Candidate
 from lerobot_openspm.types import PoseEstimate, Reference
@@ -65,6 +66,8 @@ class Grounding:
         said: By name, where the instruction says that the object is.
         shown: By name, where demonstrations show what stood; for objects that their landmark cannot tell.
         surfaces: Landmarks that are as wide as the scene: nothing is far from them.
+        feet: By name, the middle ``(3,)`` of what an object stands on in its frame, metres; its frame's
+            origin where it is not named.
         elsewhere: By name, where the only one that the last look brought should be, but plainly is not.
     """
 
@@ -73,6 +76,7 @@ class Grounding:
         default_factory=dict[str, Sequence[Mapping[str, Array]]]
     )
     surfaces: frozenset[str] = frozenset()
+    feet: Mapping[str, Array] = field(default_factory=dict[str, Array])
     elsewhere: dict[str, Reference] = field(default_factory=dict[str, Reference])
     _told: set[str] = field(default_factory=set[str])
     _not_meant: dict[str, tuple[Array, ...]] = field(default_factory=dict[str, tuple[Array, ...]])
@@ -121,7 +125,10 @@ class Grounding:
             return self._unless_elsewhere(name, estimate, object_poses)
         candidates = (estimate.T_world_obj, *estimate.others)
         landmarks = {mark: T for mark, T in object_poses.items() if mark != name}
-        index = choose(self.said[name], candidates, landmarks) if name in self.said else None
+        index = None
+        if name in self.said:
+            standing = [self._foot(name, T) for T in candidates]
+            index = choose(self.said[name], standing, self._feet_of(landmarks))
         if index is None and name in self.shown:
             index = choose_as_shown(name, candidates, landmarks, self.shown[name])
         if index is None:
@@ -139,7 +146,7 @@ class Grounding:
         if estimate.status != "found" or name not in self.said or name in self._told:
             return estimate
         landmarks = {k: T for k, T in object_poses.items() if k != name and k not in self.surfaces}
-        if contradicts(self.said[name], estimate.T_world_obj, landmarks):
+        if contradicts(self.said[name], self._foot(name, estimate.T_world_obj), self._feet_of(landmarks)):
             self.elsewhere[name] = self.said[name]
             return replace(estimate, status="not_found")
         self._told.add(name)
@@ -152,6 +159,13 @@ class Grounding:
             return replace(estimate, status="not_found")
         status = "ambiguous" if len(left) > 1 and estimate.status == "ambiguous" else "found"
         return replace(estimate, status=status, T_world_obj=left[0], others=tuple(left[1:]))
+
+    def _foot(self, name: str, T_world_obj: Array) -> Array:
+        """The pose ``(4, 4)`` at the middle of what an object stands on."""
+        return T_world_obj @ se3.transform(np.eye(3), self.feet[name]) if name in self.feet else T_world_obj
+
+    def _feet_of(self, object_poses: Mapping[str, Array]) -> dict[str, Array]:
+        return {name: self._foot(name, T) for name, T in object_poses.items()}
 
     def _is_another(self, name: str, T_world_obj: Array) -> bool:
         apart = [float(np.linalg.norm(T[:2, 3] - T_world_obj[:2, 3])) for T in self._not_meant[name]]

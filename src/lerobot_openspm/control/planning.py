@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 
 import numpy as np
 
@@ -85,6 +86,15 @@ class PlanningContext:
         needed = [name for one in entries for name in (*one.objects, *pushed_by_landmark(one).values())]
         return [*needed, *(self.points if len(self.points) <= MOST_IN_A_SCENE else ())]
 
+    @cached_property
+    def feet(self) -> dict[str, Array]:
+        """The middle ``(3,)`` of what each object stands on in its frame, where its shape is known."""
+        feet: dict[str, Array] = {}
+        for name, points in self.points.items():
+            low, high = np.percentile(points, (5, 95), axis=0)
+            feet[name] = np.array([*(low + high)[:2] / 2, low[2]])
+        return feet
+
     @property
     def surfaces(self) -> dict[str, Array]:
         """The table under its names, at the middle of where the hand was in the demonstrations."""
@@ -124,6 +134,10 @@ class PlanningContext:
             return first, []
         first = replace(first, stance=find_stance(self.robot, T_world_ee))
         points, crowded = self._points(object_poses), list[tuple[Plan, dict[str, int]]]()
+        if unseen := sorted(set(self.points) - set(points)):
+            logger.info(
+                "%r: does not keep clear of what is not found: %s", first.entry.language, ", ".join(unseen)
+            )
         for entry in (one.entry for one in ranked[:MAX_TRIED]):
             if any(name not in object_poses for name in entry.objects):
                 continue

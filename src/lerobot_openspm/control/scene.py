@@ -64,7 +64,7 @@ class SceneState:
     def __init__(self, context: PlanningContext):
         self._context = context
         self.tracker = Tracker(context.yaw_periods, TrackerSettings())
-        self.grounding = Grounding(surfaces=frozenset(context.surfaces))
+        self.grounding = Grounding(surfaces=frozenset(context.surfaces), feet=context.feet)
         self.detections = Detections({}, {})
         self.altered: set[str] = set()
         self._step = -1

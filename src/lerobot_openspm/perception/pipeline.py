@@ -120,9 +120,9 @@ class Perception:
         look = look_at(sound, list(known), self.segmenter, hidden, expected, told_apart, self.before)
         estimates = localise_all(known, look)
         self.remember(look, {name: one for name, one in estimates.items() if name not in displaced})
-        if not self._has_compared:  # only at the first look, before anything moves
+        if not self._has_compared and not faults:  # once, as soon as all cameras show something
             self._has_compared = True
-            faults = faults or disagreeing_cameras(look, known, estimates)
+            faults = disagreeing_cameras(look, known, estimates)
         return Detections(estimates, faults)
 
     def remember(self, look: Look, estimates: Mapping[str, PoseEstimate]) -> None:

@@ -209,6 +209,11 @@ class KnownObject(Protocol):
         ...
 
     @property
+    def patches(self) -> KnownObject | None:
+        """What finds it where it stood in the demonstrations; None of an object that is moved about."""
+        ...
+
+    @property
     def symmetry(self) -> Symmetry | None:
         """How its shape turns into itself, whatever its colours do; None if it does not, or is not known."""
         ...

@@ -24,6 +24,7 @@ from lerobot_openspm.perception.objects.surface import model as model_module
 from lerobot_openspm.perception.objects.surface.compare import correlation
 from lerobot_openspm.perception.objects.surface.model import SurfaceModel
 from lerobot_openspm.perception.objects.surface.search import Place, _areas, _ranked
+from lerobot_openspm.perception.objects.surface.sight import Surface
 from lerobot_openspm.types import Moment
 
 
@@ -71,6 +72,8 @@ def test_what_lies_on_its_side_is_not_found_and_said_to_have_tipped(models):
     cup = se3.transform(on_its_side, np.array([0.0, 0.12, 0.04]))
     found = models["cup"].localise(Look(views_at({"cup": cup}, looking_down(*HOME))))
     assert (found.status, found.tipped) == ("not_found", True)
+    told = models["cup"].localise(Look(views_at({"cup": cup}, looking_down(*HOME)), told_apart=("cup",)))
+    assert (told.status, told.tipped) == ("not_found", True)
     away = models["cup"].localise(Look(views_at(moved(0.12, 0.12, 0.0), looking_down(*HOME))))
     assert (away.status, away.tipped) == ("not_found", False)
 
@@ -109,6 +112,12 @@ def test_of_what_words_tell_apart_every_one_is_found(models):
         assert place == pytest.approx(T[:2, 3] + away, abs=0.008)
 
 
+def test_two_of_a_kind_where_neither_was_shown_are_both_found_without_words(models):
+    cups = [(SHAPES["cup"], se3.from_yaw(place, 0.0)) for place in ([0.12, 0.12, 0.0], [-0.1, -0.12, 0.0])]
+    views = render(cups, None, hand_camera(looking_down(*HOME)))
+    assert len(models["cup"].localise(Look(views)).others) == 1
+
+
 def test_colours_vary_together_with_what_is_expected():
     rng = np.random.default_rng(0)
     expected = np.repeat(rng.uniform(40, 60, (50, 1, 3)), 2, axis=1).astype(np.float32)
@@ -140,10 +149,10 @@ def test_where_it_stood_in_the_demonstrations_its_patches_are_believed(models):
     assert np.array_equal(found.T_world_obj, near.T_world_obj)
 
 
-@pytest.mark.parametrize(("radius", "first"), [(0.05, np.pi / 2), (0.15, 0.0)])
-def test_another_direction_counts_less_of_a_large_object(models, radius, first):
+@pytest.mark.parametrize(("is_large", "first"), [(False, np.pi / 2), (True, 0.0)])
+def test_another_direction_counts_less_of_a_large_object(models, is_large, first):
     surface = dataclasses.replace(models["block"].surface)
-    surface.__dict__["radius"] = radius
+    surface.__dict__["is_large"] = is_large
     turned, shown = (
         Place(np.array([0.0, 0.0, 0.0, yaw]), score) for yaw, score in ((np.pi / 2, 0.6), (0, 0.55))
     )
@@ -151,10 +160,10 @@ def test_another_direction_counts_less_of_a_large_object(models, radius, first):
         assert _ranked(surface, places)[0].pose[3] == first
 
 
-@pytest.mark.parametrize(("radius", "status"), [(0.05, "ambiguous"), (0.15, "found")])
-def test_a_rival_in_another_direction_makes_a_large_object_less_doubtful(models, radius, status):
+@pytest.mark.parametrize(("is_large", "status"), [(False, "ambiguous"), (True, "found")])
+def test_a_rival_in_another_direction_makes_a_large_object_less_doubtful(models, is_large, status):
     model = dataclasses.replace(models["block"], surface=dataclasses.replace(models["block"].surface))
-    model.surface.__dict__["radius"] = radius
+    model.surface.__dict__["is_large"] = is_large
     look = Look(views_at(moved(0.12, 0.12, 0.0), looking_down(*HOME)))
     shown, turned = (
         Place(np.array([x, 0.12, model.height, yaw]), 0.97 * model.typical_agreement)
@@ -271,6 +280,18 @@ def test_the_shape_tells_by_what_an_object_turns_into_itself(models):
     assert middle == pytest.approx(usual[:2, 3], abs=models["block"].surface.spacing)
 
 
+@pytest.mark.parametrize("has_knob", [False, True])
+def test_a_square_plate_is_not_round(has_knob):
+    x, y = (at.ravel() for at in np.meshgrid(*2 * [np.arange(-0.1, 0.101, 0.007)]))
+    plate = np.stack([x, y, np.zeros_like(x)], -1)
+    knob = plate[np.hypot(x, y) < 0.04] + [0.15, 0.0, 0.0]
+    points = np.concatenate([plate, knob]) if has_knob else plate
+    colours = np.full((len(points), 2, 3), 60.0, np.float32)
+    surface = Surface(points, np.tile([0.0, 0.0, 1.0], (len(points), 1)), colours, 0.007)
+    assert (surface.symmetry is None) == has_knob
+    assert not surface.is_round
+
+
 def test_a_shape_that_was_seen_from_one_side_is_told_by_all_its_points(models):
     surface = models["cup"].surface
     is_behind = surface.points[:, 0] < surface.middle[0]
@@ -280,7 +301,8 @@ def test_a_shape_that_was_seen_from_one_side_is_told_by_all_its_points(models):
 
 def test_of_large_objects_cameras_see_other_sides_elsewhere(models):
     small = models["block"].surface
-    large = dataclasses.replace(small, points=3 * small.points)
+    large, flat = (dataclasses.replace(small, points=small.points * size) for size in (4, (4, 4, 1)))
+    assert [one.is_large for one in (small, large, flat)] == [False, True, False]
     places = np.array([[0.1, 0.1, 0.0], [0.2, 0.1, 0.0], [0.4, 0.1, 0.0], [0.1, -0.1, 0.0]])
     assert list(_areas(small, places)) == [0, 0, 0, 0]
     alike = _areas(large, places)

@@ -79,6 +79,11 @@ class BoxModel:
         return self.size * GRID
 
     @property
+    def patches(self) -> None:
+        """See :class:`lerobot_openspm.perception.objects.base.KnownObject`."""
+        return None
+
+    @property
     def symmetry(self) -> Symmetry:
         """See :class:`lerobot_openspm.perception.objects.base.KnownObject`."""
         return Symmetry(np.zeros(2), 0.0 if self.yaw_period == 0 else np.pi)

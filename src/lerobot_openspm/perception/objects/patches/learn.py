@@ -244,9 +244,9 @@ def _claimed(trail: _Trail, scenes: Sequence[DemonstrationScene], known: Iterabl
     """Whether a trail follows an object that is known by patches already."""
     size = float(np.nanmedian(np.linalg.norm(trail.motion, axis=1)))
     for model in known:
-        if not isinstance(model, PatchModel):
+        if model.patches is None:
             continue
-        found = [model.localise(Look(scene.views)) for scene in scenes]
+        found = [model.patches.localise(Look(scene.views)) for scene in scenes]
         points = np.stack(
             [one.T_world_obj[:2, 3] if one.status == "found" else np.full(2, np.nan) for one in found]
         )

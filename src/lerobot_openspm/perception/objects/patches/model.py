@@ -68,6 +68,11 @@ class PatchModel:
         return np.zeros((0, 3))
 
     @property
+    def patches(self) -> PatchModel:
+        """Itself: only what hardly moves is known by patches."""
+        return self
+
+    @property
     def symmetry(self) -> None:
         """None: patches have no shape."""
         return None

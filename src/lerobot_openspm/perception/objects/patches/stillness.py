@@ -14,7 +14,6 @@ import numpy as np
 from scipy.stats import chi2
 
 from lerobot_openspm.perception.objects.base import KnownObject
-from lerobot_openspm.perception.objects.patches.model import PatchModel
 from lerobot_openspm.types import ContactCue, DemonstrationScene
 
 # The hand's target moves with the object; if its standard deviation along an axis is below this, patches do.
@@ -36,7 +35,7 @@ def hardly_moving(
         known: Other objects, which are known by patches where they hardly moved.
     """
     told = {name: p for name in names if (p := _hardly_moves(scenes, name)) is not None}
-    before = [float(isinstance(model, PatchModel)) for model in known if model.name not in names]
+    before = [float(model.patches is not None) for model in known if model.name not in names]
     found = {}
     for name in names:
         others = [*before, *(p for other, p in told.items() if other != name)]

@@ -117,6 +117,11 @@ class ShapeModel:
         return self.yaw_centre + steps * halfwidth
 
     @property
+    def patches(self) -> None:
+        """See :class:`lerobot_openspm.perception.objects.base.KnownObject`."""
+        return None
+
+    @property
     def symmetry(self) -> Symmetry | None:
         """See :class:`lerobot_openspm.perception.objects.base.KnownObject`."""
         is_one_way = self.yaw_period >= 2 * np.pi

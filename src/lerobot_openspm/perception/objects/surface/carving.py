@@ -39,6 +39,7 @@ class Frame:
         foreground: Pixels ``(H, W)`` that show an object, or the robot.
         hidden: Pixels ``(H, W)`` that show the hand in its own camera; None in others.
         standing: Poses ``T_world_obj`` ``(4, 4)`` of the objects that stand where they stood at first.
+        is_untouched: Whether all of them do, so that nothing in the hand is in sight.
     """
 
     camera: str
@@ -46,6 +47,7 @@ class Frame:
     foreground: Mask
     hidden: Mask | None
     standing: Mapping[str, Array]
+    is_untouched: bool = True
     _colours: list[Float32] = field(default_factory=list[Float32])
 
     @property
@@ -80,6 +82,11 @@ class Frames:
     def distinct(self) -> list[Frame]:
         """One frame of each group."""
         return [self.frames[i] for i in self.groups[1]]
+
+    @property
+    def untouched(self) -> Frames:
+        """The frames in which nothing has moved yet."""
+        return Frames(self.name, [frame for frame in self.frames if frame.is_untouched])
 
     def __iter__(self) -> Iterator[Frame]:
         return iter(self.frames)

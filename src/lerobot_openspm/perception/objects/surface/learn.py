@@ -113,7 +113,8 @@ def _frames(
             standing = {name: T for name, T in poses.items() if name not in moment.moved}
             for camera, view in moment.views.items():
                 hidden = backdrop.hidden(camera, view)
-                frames.append(Frame(camera, view, backdrop.foreground(camera, view), hidden, standing))
+                foreground = backdrop.foreground(camera, view)
+                frames.append(Frame(camera, view, foreground, hidden, standing, not moment.moved))
     return frames
 
 
@@ -150,7 +151,8 @@ def build_surfaces(
     for _ in range(ROUNDS):
         depths = Depths(solids)
         solids = {
-            name: fill_silhouettes(own[name], carved[name], solid, depths) for name, solid in solids.items()
+            name: fill_silhouettes(own[name].untouched, carved[name], solid, depths, backdrop)
+            for name, solid in solids.items()
         }
     depths = Depths(solids)
     solids = {name: carve_by_colour(own[name], solid, depths) for name, solid in solids.items()}

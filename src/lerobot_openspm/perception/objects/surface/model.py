@@ -107,6 +107,11 @@ class SurfaceModel:
         return self.surface.coloured
 
     @property
+    def patches(self) -> PatchModel:
+        """See :class:`lerobot_openspm.perception.objects.base.KnownObject`."""
+        return self.near
+
+    @property
     def symmetry(self) -> Symmetry | None:
         """See :class:`lerobot_openspm.perception.objects.base.KnownObject`."""
         return self.surface.symmetry
@@ -130,7 +135,8 @@ class SurfaceModel:
             return near
         sights = self._sights(look)
         if self.name in look.told_apart and expected is None:
-            return self._estimate(look, sights, self._all_places(look, sights))
+            found = self._estimate(look, sights, self._all_places(look, sights))
+            return self._unless_tipped(look, sights, found)
         near_score = 0.0
         if near.status == "found":
             near_score = score_at(self.surface, sights, _pose(near.T_world_obj))
@@ -147,7 +153,7 @@ class SurfaceModel:
         if found.status == "found":
             return found
         if expected is None:
-            return replace(found, tipped=found.status == "not_found" and self._has_tipped(look, sights))
+            return self._unless_tipped(look, sights, found)
         # Where its patches cannot tell that it is gone, it may be hidden.
         return replace(found, visible=min(found.visible, near.visible))
 
@@ -228,12 +234,14 @@ class SurfaceModel:
             self.surface, sights, ground, self._yaws, Freedom(not self.surface.is_round, lifts=True), several
         )
 
-    def _has_tipped(self, look: Look, sights: Mapping[str, Sight]) -> bool:
-        """Whether it lies on the table."""
+    def _unless_tipped(self, look: Look, sights: Mapping[str, Sight], found: PoseEstimate) -> PoseEstimate:
+        """A first look's estimate, which says where there is none whether the object lies on the table."""
+        if found.status != "not_found":
+            return found
         sides, table = lying(self.surface), self.backdrop.table_height
         needed = (self.found_share + TIPPED_MORE) * self.typical_agreement
         told = partial(has_tipped, sides, sights, self.backdrop.reach, table, YAWS, needed)
-        return look.prepared((self.name, id(self), "tipped"), told)
+        return replace(found, tipped=look.prepared((self.name, id(self), "tipped"), told))
 
     @property
     def _yaws(self) -> tuple[float, ...]:

@@ -36,8 +36,8 @@ STARTS_PER_YAW, BEST_PER_YAW, FINALISTS, MANY = 6, 2, 3, 12
 # agreement counts this share; that of a large object this one, since what is seen of it is only a part.
 TURNED_RAD, TURNED_SHARE, LARGE_TURNED_SHARE = 0.4, 0.95, 0.88
 NUDGE_M = 0.006
-# Of an object with this radius a camera sees other sides in each area of this width, metres.
-LARGE_M, SEEN_ALIKE_M = 0.10, 0.25
+# Of a large object a camera sees other sides in each area of this width, metres.
+SEEN_ALIKE_M = 0.25
 # Heights at which something may stand on other things are so far apart, metres.
 RISE_STEP_M = 0.025
 # Two candidates nearer than this are one, metres.
@@ -94,26 +94,31 @@ def search(
     likely = _likely(surface, sights, ground)
     # Few points tell directions and places badly, so that the best places for each direction are looked at
     # more closely; most of them for the demonstrated one.
+    usual = MANY if surface.is_large else STARTS_PER_YAW
     starts = []
     for yaw in yaws:
-        count = MANY if several else BEST_PER_YAW if _is_turned(yaw) else STARTS_PER_YAW
-        starts.append(_distinct(_turned(surface, sights, likely, yaw, apart), apart, count)[:, :4])
+        count = MANY if several else BEST_PER_YAW if _is_turned(yaw) else usual
+        starts.append(
+            _distinct(_turned(surface, sights, likely, yaw, apart, max(count, usual)), apart, count)
+        )
     places = [
-        refine(surface, sights, pose, freedom, QUICK_POINTS, QUICK_STEPS) for pose in np.concatenate(starts)
+        refine(surface, sights, start[:4], freedom, QUICK_POINTS, QUICK_STEPS)
+        for start in np.concatenate(starts)
     ]
     places = _ranked(surface, places)
-    finalists = places[:FINALISTS]
-    if several:
-        for place in places[FINALISTS:]:
-            if all(np.linalg.norm(place.pose[:2] - one.pose[:2]) > apart for one in finalists):
-                finalists.append(place)
+    finalists = list[Place]()
+    for place in places:
+        elsewhere = all(np.linalg.norm(place.pose[:2] - one.pose[:2]) > apart for one in finalists)
+        turned = all(_apart(place.pose, one.pose, apart) for one in finalists)
+        if (elsewhere and several) or (turned and len(finalists) < FINALISTS):
+            finalists.append(place)
     finest = [refine(surface, sights, place.pose, freedom, FINE_POINTS, FINE_STEPS) for place in finalists]
     return _ranked(surface, finest)
 
 
 def likelihood(surface: Surface, place: Place) -> float:
     """Its agreement, which counts less where the object is turned otherwise than it was shown."""
-    turned = LARGE_TURNED_SHARE if surface.radius >= LARGE_M else TURNED_SHARE
+    turned = LARGE_TURNED_SHARE if surface.is_large else TURNED_SHARE
     return place.score * (turned if _is_turned(float(place.pose[3])) else 1.0)
 
 
@@ -191,8 +196,10 @@ def _likely(surface: Surface, sights: Mapping[str, Sight], places: Array) -> Arr
     return places[np.argsort(-like)[:kept]]
 
 
-def _turned(surface: Surface, sights: Mapping[str, Sight], places: Array, yaw: float, apart: float) -> Array:
-    """The best poses and their agreement ``(k, 5)`` at places ``(q, 3)``, for one direction."""
+def _turned(
+    surface: Surface, sights: Mapping[str, Sight], places: Array, yaw: float, apart: float, count: int
+) -> Array:
+    """Poses and their agreement ``(k, 5)`` around the best places of ``(q, 3)``, for one direction."""
     # The places are of the object's middle, which is not its frame's origin.
     offset = np.append(rotations(np.array([yaw]))[0][:2, :2] @ surface.middle, 0.0)
     poses = np.column_stack([places - offset, np.full(len(places), yaw)])
@@ -204,7 +211,7 @@ def _turned(surface: Surface, sights: Mapping[str, Sight], places: Array, yaw: f
         scores[areas == i] = agreement(coarse, sights, poses[areas == i], is_coarse=True)
     around = np.stack([[a * NUDGE_M, b * NUDGE_M, 0, 0] for a in (-1, 0, 1) for b in (-1, 0, 1)])
     found: list[Array] = []
-    for row in _distinct(np.column_stack([poses, scores, areas.astype(float)]), apart, STARTS_PER_YAW):
+    for row in _distinct(np.column_stack([poses, scores, areas.astype(float)]), apart, count):
         nudged = row[:4] + around
         found.append(np.column_stack([nudged, agreement(samples[int(row[5])], sights, nudged)]))
     return np.concatenate(found)
@@ -212,7 +219,7 @@ def _turned(surface: Surface, sights: Mapping[str, Sight], places: Array, yaw: f
 
 def _areas(surface: Surface, places: Array) -> NDArray[np.int64]:
     """Numbers ``(q,)`` of the areas of places ``(q, 3)`` in which a camera sees an object from one side."""
-    if surface.radius < LARGE_M:
+    if not surface.is_large:
         return np.zeros(len(places), np.int64)
     cells = np.floor(places[:, :2] / SEEN_ALIKE_M)
     return np.asarray(np.unique(cells, axis=0, return_inverse=True)[1], np.int64).ravel()

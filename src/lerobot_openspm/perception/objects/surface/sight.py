@@ -17,10 +17,14 @@ from lerobot_openspm.types import Mask, Symmetry, View
 
 # Pictures are smoothed by a Gaussian of so many pixels at least, if they are 256 wide.
 FINEST = 0.6
-# Turned about its middle, a round object agrees with itself this well, CIELAB and share.
-ROUND_COLOUR, ROUND_SHARE, ROUND_SPACINGS = 20.0, 0.52, 3.0
-# Turned about its middle, an object has the same shape if this share of its points comes this near to others.
-SAME_SHAPE_SHARE, SAME_SHAPE_SPACINGS = 0.7, 2.0
+# Turned about its middle, an object has the same shape if this share of its points comes this near to others,
+# and its outline as seen from above stays where it was, up to as much or to this share of the radius.
+SAME_SHAPE_SHARE, SAME_SHAPE_SPACINGS, SAME_OUTLINE_SHARE = 0.78, 2.0, 0.15
+OUTLINE_STEP_DEG = 10
+# It looks the same too if this share of them comes near to such as have colours like theirs, CIELAB.
+ROUND_SHARE, ROUND_SPACINGS, ROUND_COLOUR = 0.52, 3.0, 20.0
+# An object with this radius and this height is large, metres.
+LARGE_M = 0.10
 # Colours this far apart, CIELAB, are alike in the search over the table.
 LIKE_COARSE = 12.0
 
@@ -66,6 +70,12 @@ class Surface:
         return float(np.percentile(np.linalg.norm(self.coloured[:, :2] - self.middle, axis=1), 90))
 
     @cached_property
+    def is_large(self) -> bool:
+        """Whether it is wide and tall: a camera sees only a part of it, and another part from elsewhere."""
+        low, high = np.percentile(self.coloured[:, 2], (5, 95))
+        return min(self.radius, float(high - low)) >= LARGE_M
+
+    @cached_property
     def symmetry(self) -> Symmetry | None:
         """How its shape turns into itself, whatever its colours do; None if it does not."""
         for turn, others in ((0.0, (60, 90, 150, 180)), (np.pi / 2, (90, 180)), (np.pi, (180,))):
@@ -86,11 +96,21 @@ class Surface:
             # The middle that leaves the least distance between them.
             shift = np.mean(points[index] - turned, axis=0)[:2]
             at = at + np.append(np.linalg.solve(np.eye(2) - R[:2, :2], shift), 0.0)
-        return share, at[:2]
+        return share if self._has_same_outline(at[:2], degrees) else 0.0, at[:2]
+
+    def _has_same_outline(self, middle: Array, degrees: int) -> bool:
+        """Whether its convex outline from above, turned about a middle ``(2,)``, is the same."""
+        angles = np.deg2rad(np.arange(0, 360, OUTLINE_STEP_DEG))
+        along = (self.points[:, :2] - middle) @ np.stack([np.cos(angles), np.sin(angles)])
+        reach = np.percentile(along, 99.5, axis=0)
+        off = float(np.abs(np.roll(reach, degrees // OUTLINE_STEP_DEG) - reach).max())
+        return off < max(SAME_SHAPE_SPACINGS * self.spacing, SAME_OUTLINE_SHARE * self.radius)
 
     @cached_property
     def is_round(self) -> bool:
         """Whether it looks alike from all sides, so that its direction cannot be seen."""
+        if self.symmetry is None or self.symmetry.turn > 0:
+            return False
         has = np.isfinite(self.colours[:, 1, 0])
         points, colours = self.points[has], self.colours[has, 1]
         middle = np.append((points[:, :2].min(0) + points[:, :2].max(0)) / 2, 0.0)

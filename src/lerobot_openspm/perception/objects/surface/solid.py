@@ -19,7 +19,7 @@ from scipy.ndimage import binary_erosion, gaussian_filter, label
 
 from lerobot_openspm.geometry import se3
 from lerobot_openspm.geometry.se3 import Array
-from lerobot_openspm.perception.objects.surface.backdrop import Float32, sample
+from lerobot_openspm.perception.objects.surface.backdrop import Backdrop, Float32, sample
 from lerobot_openspm.perception.objects.surface.carving import Carved, Frame, Frames, silhouette
 from lerobot_openspm.perception.objects.surface.relief import disagreement
 from lerobot_openspm.types import Mask
@@ -30,6 +30,8 @@ FILLED_SHARE, MIN_FILLED = 0.5, 2
 INCONSISTENT = 14.0
 # So often at most; what is behind a cell that was taken out is looked at next.
 SWEEPS = 12
+# A piece that stands by itself is the object's if it has this share of the cells of the largest one.
+PIECE_SHARE = 0.1
 # A camera sees a cell that is at most this many cells behind the nearest one.
 DEPTH_CELLS = 1.5
 
@@ -106,14 +108,17 @@ def solid_under(top: NDArray[np.int64], carved: Carved) -> Solid:
     return Solid(carved.x, carved.z, carved.solid & (np.arange(len(carved.z)) <= top[..., None]))
 
 
-def fill_silhouettes(frames: Frames, carved: Carved, solid: Solid, depths: Depths) -> Solid:
+def fill_silhouettes(
+    frames: Frames, carved: Carved, solid: Solid, depths: Depths, backdrop: Backdrop
+) -> Solid:
     """Raise a solid to where pictures show something that no object's surface explains.
 
     Args:
-        frames: The frames in which the object stands.
+        frames: The frames in which the object stands and nothing is in the hand.
         carved: The space that it may take.
         solid: What of it is filled so far.
         depths: The surfaces of all objects, this one too.
+        backdrop: What no object is. What is seen beyond the table may be anything.
     """
     columns: Mask = np.any(solid.filled, axis=-1)
     top = np.where(columns, solid.filled.shape[2] - 1 - solid.filled[..., ::-1].argmax(-1), -1)
@@ -122,7 +127,7 @@ def fill_silhouettes(frames: Frames, carved: Carved, solid: Solid, depths: Depth
     points = carved.points[above]
     seen, unexplained = np.zeros(len(points)), np.zeros(len(points))
     for frame in frames.distinct:
-        explained = depths.covered(frame)
+        explained = depths.covered(frame) | backdrop.beyond(frame.view)
         rows, cols, _, inside = frame.look(se3.apply(frame.standing[frames.name], points))
         seen += inside
         unexplained += inside & frame.foreground[rows, cols] & ~explained[rows, cols]
@@ -142,15 +147,24 @@ def carve_by_colour(frames: Frames, solid: Solid, depths: Depths) -> Solid:
         filled = solid.filled.copy()
         filled[solid.surface] &= ~gone
         solid = replace(solid, filled=filled)
-    return replace(solid, filled=_largest_piece(solid.filled))
+    return replace(solid, filled=_standing_pieces(solid.filled))
 
 
-def _largest_piece(filled: Mask) -> Mask:
-    """The largest connected piece of some cells ``(n, n, m)``."""
+def _standing_pieces(filled: Mask) -> Mask:
+    """The largest connected piece of some cells ``(n, n, m)``, and others that stand on the table.
+
+    A thin part that joins them, as a knob to a stove, may be too thin for cells.
+    """
     pieces, count = cast(Any, label)(filled)
     if count < 2:
         return filled
-    return np.asarray(pieces == 1 + int(np.bincount(pieces.ravel())[1:].argmax()))
+    sizes = np.bincount(pieces.ravel(), minlength=count + 1)
+    sizes[0] = 0
+    stands = np.zeros(count + 1, bool)
+    stands[np.unique(pieces[..., 0])] = True
+    kept = stands & (sizes >= PIECE_SHARE * sizes.max())
+    kept[sizes.argmax()] = True
+    return np.asarray(kept[pieces])
 
 
 def colours_of(frames: Frames, solid: Solid, depths: Depths) -> list[tuple[Frame, Float32]]:
