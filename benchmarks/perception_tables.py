@@ -70,12 +70,21 @@ def _cost(result: Quoted) -> str:
     cost = result["cost"]
     found, one, twenty = cost["perception"], cost["filter_us_1_object"], cost["filter_us_20_objects"]
     first, followed = found["first_ms"], found["followed_ms"]
+    moved = ""
+    if elsewhere := cost.get("moved"):
+        anew, again = elsewhere["first_ms"], elsewhere["followed_ms"]
+        moved = (
+            f" Where things have changed places it takes {anew['median']:.0f} ms ({anew['p99']:.0f}), where "
+            f"{elsewhere['found']} are found, and {again['median']:.0f} ms ({again['p99']:.0f}) when they "
+            "are followed with all looks that are remembered."
+        )
     return (
         f"{result['episodes']} episodes. A look for {found['objects']} objects in {found['views']} views of "
         f"256 pixels takes {first['median']:.1f} ms (median; p99 {first['p99']:.1f}) at the start of an "
         f"episode, where {found['found']} of them are found and the cameras are compared, and "
-        f"{followed['median']:.1f} ms ({followed['p99']:.1f}) when they are followed; a step of the filter "
-        f"takes {one['median']:.0f} us for one object and {twenty['median']:.0f} us for twenty; one thread."
+        f"{followed['median']:.1f} ms ({followed['p99']:.1f}) when they are followed.{moved} A step of the "
+        f"filter takes {one['median']:.0f} us for one object and {twenty['median']:.0f} us for twenty; one "
+        "thread."
     )
 
 

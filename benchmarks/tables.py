@@ -43,7 +43,8 @@ NOTES = {
     "parts, one after another, with 300 steps for each part.",
     "two_bowls": "No demonstration shows two bowls; which one is meant is told from where the objects are.",
     "anywhere": "Every object stands within 25 cm of the table's middle at any yaw, beside two distractors "
-    "of the colours of bowl and box and a second object of the kind, from the usual demonstrations. A layout "
+    "of the colours of bowl and box and a second object of the kind, or a second bowl where the task is a "
+    "drawer or a stove, from the usual demonstrations. A layout "
     "is used only if some camera shows half of each of the two objects of the same kind, and the scripted "
     "expert reaches the goal in it; else another one is drawn.",
 }

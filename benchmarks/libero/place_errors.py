@@ -73,6 +73,11 @@ def _of_kind(name: str, poses: Mapping[str, Array], models: Mapping[str, KnownOb
     return [one[name] for one in named if one]
 
 
+def several_of_a_kind(poses: Mapping[str, Array], models: Mapping[str, KnownObject]) -> list[str]:
+    """The known names that fit several things in a scene, which instructions tell apart by words."""
+    return [name for name in models if len(_of_kind(name, poses, models)) > 1]
+
+
 def is_right(row: Row) -> bool:
     """Whether an estimate is near the truth, and turned as that is where its yaw is known."""
     return row.get("mm", np.inf) < 1000 * NEAR_M and (row["deg"] is None or row["deg"] < np.rad2deg(NEAR_RAD))

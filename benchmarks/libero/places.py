@@ -11,7 +11,7 @@ from __future__ import annotations
 import functools
 import json
 import time
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -21,7 +21,7 @@ from benchmarks.calls import watched
 from benchmarks.episodes import LazyImages
 from benchmarks.harness import Row, measured_folder, resume
 from benchmarks.libero.evaluate import kept_simulator, move_hand
-from benchmarks.libero.place_errors import judged, not_known, summary
+from benchmarks.libero.place_errors import judged, not_known, several_of_a_kind, summary
 from benchmarks.libero.variants import exchanged
 from benchmarks.results import run, write
 from benchmarks.stages import DEMOS, LIBERO, DatasetOption, dataset
@@ -46,7 +46,7 @@ from lerobot_openspm.perception.pipeline import Perception
 from lerobot_openspm.training import dataset_processor, memory_of
 from lerobot_openspm.types import Hand, PoseEstimate
 
-FIRST_SEED = TUNING_SEED_START + 600_000
+FIRST_SEED, FIRST_TUNING_SEED = 20_000, TUNING_SEED_START + 600_000
 # LIBERO at times draws two things into each other, and one is thrown off: it still moves after half a second.
 STILL_M, STILL_STEPS, REDRAWN = 0.002, 10, 1000
 LEARNED = "learned.json"
@@ -64,6 +64,7 @@ class PlacesConfig:
         dataset: The demonstrations; recorded if not given.
         output: Folder for what is measured; outputs/bench/NAME if not given.
         workers: Scenes at a time, each in a process of its own; a single one stays in this process.
+        tuning: Take scenes of tuning seeds; nothing is published then.
     """
 
     suite: str = SUITE
@@ -73,10 +74,16 @@ class PlacesConfig:
     dataset: DatasetOption = field(default_factory=DatasetOption)
     output: str | None = None
     workers: int = 2
+    tuning: bool = False
 
     def __post_init__(self) -> None:
         if self.suite not in OBJECTS:
             raise ValueError(f"suite is {self.suite!r}, expected one of {', '.join(OBJECTS)}")
+
+    @property
+    def first_seed(self) -> int:
+        """The first scene's seed."""
+        return FIRST_TUNING_SEED if self.tuning else FIRST_SEED
 
     @property
     def simulator(self) -> str:
@@ -134,9 +141,9 @@ def learn(root: Path, folder: Path) -> dict[str, Any]:
 def look_at_scene(config: PlacesConfig, folder: Path, task: str, number: int) -> Row:
     """Draw a scene, look once for everything that the hand touched, and compare with the simulator."""
     memory, frames = _memory(folder)
-    simulator, seed = draw(task, FIRST_SEED + number, config.exchanged)
-    estimates, spent_s = look(memory, simulator)
+    simulator, seed = draw(task, config.first_seed + number, config.exchanged)
     poses = simulator.object_poses()
+    estimates, spent_s = look(memory, simulator, several_of_a_kind(poses, memory.objects))
     found = {
         name: not_known(name, poses, memory.objects)
         if T is None or name not in estimates
@@ -174,8 +181,13 @@ def is_still(simulator: LiberoSimulator) -> bool:
     return all(np.linalg.norm(after[name][:3, 3] - T[:3, 3]) < STILL_M for name, T in before.items())
 
 
-def look(memory: Memory, simulator: LiberoSimulator) -> tuple[Mapping[str, PoseEstimate], float]:
-    """A first look for all objects of a memory, and the processor's seconds that it took."""
+def look(
+    memory: Memory, simulator: LiberoSimulator, told_apart: Collection[str]
+) -> tuple[Mapping[str, PoseEstimate], float]:
+    """A first look for all objects of a memory, and the processor's seconds that it took.
+
+    Of the names that words tell apart every one is sought.
+    """
     if memory.layouts is None:
         raise OpenSPMError("the memory does not say how its robot's state is laid out; mine it again")
     layout, state = memory.layouts[0], simulator.state().astype(float)
@@ -183,12 +195,13 @@ def look(memory: Memory, simulator: LiberoSimulator) -> tuple[Mapping[str, PoseE
     images = dict(LazyImages(LiberoWorld(simulator), tuple(memory.cameras)))
     seen = Observation(simulator.instruction, state, hand, images, None)
     perception, begin = Perception(memory, OpenSPMConfig().hand_radius_m), time.process_time()
-    return perception.detect(seen, list(memory.objects), {}, 0.0).estimates, time.process_time() - begin
+    found = perception.detect(seen, list(memory.objects), {}, 0.0, told_apart).estimates
+    return found, time.process_time() - begin
 
 
 def main(config: PlacesConfig) -> dict[str, Any]:
     """Do what is missing, write and return the result."""
-    name = f"places_{config.suite}{'_exchanged' * config.exchanged}"
+    name = f"places_{config.suite}{'_exchanged' * config.exchanged}{'_tuning' * config.tuning}"
     root = config.demonstrations()
     files = [root / "meta/info.json", root / SUMMARY_FILE]
     output = Path(config.output or f"outputs/bench/{name}")
@@ -199,8 +212,8 @@ def main(config: PlacesConfig) -> dict[str, Any]:
     rows = resume(folder / "scenes.jsonl", jobs, look_at_scene, config.workers)
     for told in learned["objects"].values():
         del told["T_sim_obj"]
-    measured = {"seed": FIRST_SEED, "n": len(rows), "learned": learned, **summary(rows)}
-    return write(name, measured, config.workers)
+    measured = {"seed": config.first_seed, "n": len(rows), "learned": learned, **summary(rows)}
+    return measured if config.tuning else write(name, measured, config.workers)
 
 
 if __name__ == "__main__":

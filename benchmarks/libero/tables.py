@@ -66,6 +66,7 @@ PLACES: Columns = {
     "Median, mm": "position_mm_median",
     "95th percentile, mm": "position_mm_p95",
     "Median yaw, degrees": "yaw_deg_median",
+    "All of several": lambda row: f"{row['several']['all_within_10_mm']} of {row['several']['n']}",
     "Reported where there is none": lambda row: f"{row['absent']['reported']} of {row['absent']['n']}",
 }
 
@@ -218,7 +219,8 @@ def _places(result: Quoted) -> str:
     note = (
         f"All that the hand touched in {learned['episodes']} demonstrations, and in how many it took hold of "
         "it. Seeded scenes that none of them shows; the hand is somewhere else in each. Shares are of the "
-        "scenes that hold the thing, whether it was learned or not; of several of a kind the nearest counts. "
+        "scenes that hold the thing, whether it was learned or not; of several of a kind the nearest counts, "
+        "and their column says in how many scenes each of them is within 10 mm. "
         f"{percent(sure)} of {sure['n']} estimates with a confidence above 0.95 are within 10 mm and 10 "
         f"degrees. Learning the objects took {learned['learn_objects_s']:.0f} s of the "
         f"{learned['seconds']:.0f} s of mining. A first look at all of them takes {spent['median']:.0f} ms "

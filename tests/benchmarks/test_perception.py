@@ -54,7 +54,7 @@ def test_a_first_look_is_timed_with_the_comparison_of_the_cameras_and_a_followin
     noise = torch.rand(3, 64, 64, generator=torch.Generator().manual_seed(0))
     hand = Hand(np.eye(4), 0.04)
     observation = Observation("task", np.zeros(8), hand, {"front": noise, "side": noise}, None)
-    told = look_ms(policy, observation, 3)
+    told = look_ms(policy, [observation], 3)
     assert {key: told[key] for key in ("views", "objects", "found")} == {"views": 2, "objects": 3, "found": 3}
     assert told["first_ms"]["median"] >= 0
     sought = {name: known.sought for name, known in memory.objects.items()}

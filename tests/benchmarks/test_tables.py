@@ -144,7 +144,12 @@ def test_first_looks_anywhere_are_told_beside_success_and_so_is_which_layouts_ar
 
 
 def test_every_thing_that_was_touched_has_a_row_whether_it_was_learned_or_not(results):
-    told = {"found": RATE, "within_10_mm": RATE, "absent": {"n": 3, "reported": 1}}
+    told = {
+        "found": RATE,
+        "within_10_mm": RATE,
+        "absent": {"n": 3, "reported": 1},
+        "several": {"n": 2, "all_within_10_mm": 1},
+    }
     errors = {"position_mm_median": 2.0, "position_mm_p95": 5.0, "yaw_deg_median": None}
     objects = {"milk": {"grasped": 30, "learned": "shape"}, "basket": {"grasped": 0, "learned": None}}
     put(
@@ -156,7 +161,10 @@ def test_every_thing_that_was_touched_has_a_row_whether_it_was_learned_or_not(re
         first_look_cpu_ms={"median": 140.0, "p95": 180.0},
     )
     text = tables.results_page()
-    assert "| milk | shape | 30 | 50.0 % | 50.0 % | 15.0 to 85.0 % | 4 | 2.0 | 5.0 | - | 1 of 3 |" in text
+    assert (
+        "| milk | shape | 30 | 50.0 % | 50.0 % | 15.0 to 85.0 % | 4 | 2.0 | 5.0 | - | 1 of 2 | 1 of 3 |"
+        in text
+    )
     assert "| basket | not learned | 0 |" in text
     assert "took 80 s of the 200 s of mining" in text
 

@@ -244,6 +244,22 @@ def test_once_it_is_told_it_may_be_carried_away():
     assert look(grounding, seen(at(-0.8, 0.3))).status == "found"
 
 
+@pytest.mark.parametrize("foot", [np.zeros(3), np.array([0.06, -0.04, -0.3])])
+def test_words_are_told_by_what_things_stand_on_wherever_their_frames_are(foot):
+    # One bowl stands on the rack's shelf, the other one beside it and nearer to the rack's frame.
+    on, beside = se3.from_yaw([0.3, 0.3, 0.05], 0.0), at(0.3, 0.18)
+    rack = RACK @ se3.transform(np.eye(3), -foot)
+    grounding = Grounding({"bowl": Reference("on", ("rack",))}, feet={"rack": foot})
+    meant = grounding.sort_out({"bowl": seen(beside, on), "rack": seen(rack)}, {})["bowl"]
+    np.testing.assert_array_equal(meant.T_world_obj, on)
+
+
+def test_feet_are_the_middle_of_the_lowest_points():
+    corners = np.stack(np.meshgrid([0.1, 0.3], [-0.1, 0.1], [-0.2, 0.5], indexing="ij"), -1).reshape(-1, 3)
+    context = dataclasses.replace(CONTEXT, points={"rack": corners})
+    np.testing.assert_allclose(context.feet["rack"], [0.2, 0.0, -0.2])
+
+
 def test_nothing_is_far_from_the_table():
     grounding = Grounding({"bowl": Reference("on", ("table",))}, surfaces=frozenset(CONTEXT.surfaces))
     assert look(grounding, seen(at(2.0, 0.0)), CONTEXT.surfaces).status == "found"

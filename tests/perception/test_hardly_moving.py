@@ -1,5 +1,6 @@
 """Whether an object hardly moves is a matter of evidence: two or three scenes that agree are little of it."""
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -10,6 +11,9 @@ from tests.perception.drawn_world import demonstration, draw_poses
 from lerobot_openspm.perception.objects.kinds import learn_objects
 from lerobot_openspm.perception.objects.patches.model import PatchModel
 from lerobot_openspm.perception.objects.patches.stillness import hardly_moving
+from lerobot_openspm.perception.objects.surface.backdrop import Backdrop, Colour
+from lerobot_openspm.perception.objects.surface.model import SurfaceModel
+from lerobot_openspm.perception.objects.surface.sight import Surface
 from lerobot_openspm.types import ContactCue, DemonstrationScene
 
 # How far to either side of the middle objects stand, along both axes.
@@ -64,9 +68,16 @@ def patches(name: str) -> PatchModel:
     return PatchModel(name, (), 0.0, 1.0)
 
 
-def test_what_is_known_already_tells_how_it_is_here():
+def surface(name: str) -> SurfaceModel:
+    shape = Surface(np.zeros((1, 3)), np.ones((1, 3)), np.zeros((1, 2, 3), np.float32), 0.004)
+    backdrop = Backdrop(Colour(np.zeros(3), np.eye(3)), 0.0, np.array([[-1.0, -1.0], [1.0, 1.0]]))
+    return SurfaceModel(name, shape, backdrop, 0.0, 0.9, 0.3, patches(name))
+
+
+@pytest.mark.parametrize("known_by", [patches, surface])
+def test_what_is_known_already_tells_how_it_is_here(known_by: Callable[[str], PatchModel | SurfaceModel]):
     once = scenes({"rack": NEAR_M}, touches=1)
-    still = [patches(name) for name in ("bowl", "plate", "stove")]
+    still = [known_by(name) for name in ("bowl", "plate", "stove")]
     moved = [model(name) for name in ("bowl", "plate", "stove")]
     assert hardly_moving(["rack"], once, still)["rack"] == pytest.approx(0.8)
     assert hardly_moving(["rack"], once, moved)["rack"] == pytest.approx(0.2)

@@ -101,16 +101,37 @@ def test_a_wrong_calibration_is_reported_before_anything_moves(
     policy: OpenSPMPolicy, env: TabletopEnv, camera: str, kind: str
 ):
     env.reset(seed=SEEDS[0])
-    memory, key = policy.require_memory(), f"observation.images.{camera}"
-    turn = Rotation.from_rotvec(np.deg2rad([3.0, 0.0, 0.0])).as_matrix()
-    T_cam_off = se3.transform(np.eye(3), [0.02, 0, 0]) if kind == "2 cm" else se3.transform(turn, np.zeros(3))
-    off = replace(memory.cameras[key], T_mount_cam=memory.cameras[key].T_mount_cam @ T_cam_off)
-    policy.memory = replace(memory, cameras={**memory.cameras, key: off})
+    key = spoil_calibration(policy, camera, kind)
     state = hold_still(policy, env)
     assert state.status is Status.CAMERA_FAULT
     faults = policy.episodes[0].controller.scene.detections.faults
     assert "views disagree: it shows objects " in faults[key].reason
     assert "views disagree" in state.refusal
+
+
+def test_a_wrong_calibration_is_reported_when_a_camera_that_was_dark_at_first_works(
+    policy: OpenSPMPolicy, env: TabletopEnv
+):
+    observation, _ = env.reset(seed=SEEDS[0])
+    spoil_calibration(policy, "side", "2 cm")
+    dark = {**observation["pixels"], "front": np.zeros((SIZE, SIZE, 3), np.uint8)}
+    with torch.inference_mode():
+        policy.select_action(batch_of([frame_of(env, {**observation, "pixels": dark})]))
+        for _ in range(STEPS):
+            policy.select_action(batch_of([frame_of(env, observation)]))
+    state = policy.episodes[0].controller.state
+    assert state.status is Status.CAMERA_FAULT
+    assert "views disagree" in state.refusal
+
+
+def spoil_calibration(policy: OpenSPMPolicy, camera: str, kind: str) -> str:
+    """Set a camera's pose off by 2 cm or by 3 degrees; its key."""
+    memory, key = policy.require_memory(), f"observation.images.{camera}"
+    turn = Rotation.from_rotvec(np.deg2rad([3.0, 0.0, 0.0])).as_matrix()
+    T_cam_off = se3.transform(np.eye(3), [0.02, 0, 0]) if kind == "2 cm" else se3.transform(turn, np.zeros(3))
+    off = replace(memory.cameras[key], T_mount_cam=memory.cameras[key].T_mount_cam @ T_cam_off)
+    policy.memory = replace(memory, cameras={**memory.cameras, key: off})
+    return key
 
 
 @pytest.mark.parametrize("seed", SEEDS)

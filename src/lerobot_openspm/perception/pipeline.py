@@ -73,6 +73,7 @@ class Perception:
     _watch: CameraWatch = field(default_factory=CameraWatch)
     _has_looked: bool = False
     _has_compared: bool = False
+    _comparable: dict[str, KnownObject] = field(default_factory=dict[str, KnownObject])
     _labelled: set[str] = field(default_factory=set[str])
 
     def detect(
@@ -120,9 +121,11 @@ class Perception:
         look = look_at(sound, list(known), self.segmenter, hidden, expected, told_apart, self.before)
         estimates = localise_all(known, look)
         self.remember(look, {name: one for name, one in estimates.items() if name not in displaced})
-        if not self._has_compared and not faults:  # once, as soon as all cameras show something
-            self._has_compared = True
-            faults = disagreeing_cameras(look, known, estimates)
+        if not self._has_compared:  # once, as soon as all cameras are sound, by what is sought until then
+            self._comparable |= known
+            if not faults:
+                self._has_compared = True
+                faults = disagreeing_cameras(look, self._comparable, estimates)
         return Detections(estimates, faults)
 
     def remember(self, look: Look, estimates: Mapping[str, PoseEstimate]) -> None:

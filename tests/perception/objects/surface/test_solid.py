@@ -6,9 +6,14 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 from lerobot_openspm.geometry import se3
 from lerobot_openspm.geometry.camera import Camera, ray_directions
-from lerobot_openspm.perception.objects.surface.backdrop import learn_backdrop
-from lerobot_openspm.perception.objects.surface.carving import Frame, Frames
-from lerobot_openspm.perception.objects.surface.solid import Depths, Solid, carve_by_colour
+from lerobot_openspm.perception.objects.surface.backdrop import Backdrop, Colour, learn_backdrop
+from lerobot_openspm.perception.objects.surface.carving import Carved, Frame, Frames
+from lerobot_openspm.perception.objects.surface.solid import (
+    Depths,
+    Solid,
+    carve_by_colour,
+    fill_silhouettes,
+)
 from lerobot_openspm.types import View
 
 CELL = 0.01
@@ -75,6 +80,29 @@ def test_what_pictures_disagree_about_is_taken_out_down_to_where_they_agree():
     assert (np.abs(heights - 4) <= 2).mean() > 0.85
 
 
+@pytest.mark.parametrize(("reach_m", "layers"), [(1.0, 17), (0.05, 2)])
+def test_a_solid_rises_to_what_pictures_show_above_it_but_not_to_what_is_beyond_the_table(reach_m, layers):
+    # Two layers are filled, and the pictures show a small plate at the height of the seventeenth.
+    texture = np.full((4, 4, 3), 90)
+    frames = []
+    for place in PLACES:
+        view, shown = picture(looking_down(*place), 16.5 * CELL, texture, CELL)
+        frames.append(Frame("hand", view, shown, None, {"mat": np.eye(4)}))
+    space = block(4, 17)
+    solid = Solid(space.x, space.z, space.filled & (np.arange(19) < 2))
+    area = reach_m * np.array([[-1.0, -1.0], [1.0, 1.0]]) + (reach_m < 1) * 0.5
+    backdrop = Backdrop(Colour(np.zeros(3), np.eye(3)), 0.0, area)
+    carved = Carved(space.x, space.z, space.filled)
+    filled = fill_silhouettes(Frames("mat", frames), carved, solid, Depths({"mat": solid}), backdrop).filled
+    assert filled.sum(-1).max() == layers
+
+
+def test_only_frames_in_which_nothing_has_moved_are_untouched():
+    view, shown = picture(looking_down(*PLACES[0]), 0.0, np.zeros((1, 1, 3)), CELL)
+    frames = [Frame("hand", view, shown, None, {}, is_untouched) for is_untouched in (True, False)]
+    assert Frames("mat", frames).untouched.frames == frames[:1]
+
+
 def test_every_surface_is_drawn_once_a_picture_and_the_nearest_counts(monkeypatch):
     drawn = []
     draw = Solid.depth
@@ -93,7 +121,7 @@ def test_every_surface_is_drawn_once_a_picture_and_the_nearest_counts(monkeypatc
     assert sorted(drawn) == ["high", "low"]
 
 
-def test_only_the_largest_piece_is_kept():
+def test_a_single_cell_is_no_part():
     solid = block(6, 2)
     alone = solid.filled.copy()
     alone[0, 0, 0] = True
@@ -101,6 +129,19 @@ def test_only_the_largest_piece_is_kept():
     frames = Frames("block", [Frame("hand", view, shown, None, {"block": np.eye(4)})])
     kept = carve_by_colour(frames, Solid(solid.x, solid.z, alone), Depths({}))
     assert_array_equal(kept.filled, solid.filled)
+
+
+@pytest.mark.parametrize("stands", [True, False])
+def test_a_part_that_stands_beside_the_largest_piece_is_kept(stands):
+    solid = block(12, 2)
+    knob = np.pad(solid.filled, ((0, 8), (0, 8), (0, 4)))
+    knob[-6:-1, -6:-1, (0 if stands else 3) : (2 if stands else 5)] = True
+    x = (np.arange(len(knob)) - len(knob) / 2) * CELL
+    both = Solid(x, CELL * (np.arange(knob.shape[2]) + 0.5), knob)
+    view, shown = picture(looking_down(*PLACES[0]), 0.0, np.zeros((1, 1, 3)), CELL)
+    frames = Frames("stove", [Frame("hand", view, shown, None, {"stove": np.eye(4)})])
+    kept = carve_by_colour(frames, both, Depths({})).filled
+    assert kept[-6:-1, -6:-1].any() == stands
 
 
 @pytest.mark.parametrize("height", [-0.004, 0.0, 0.011])
