@@ -164,7 +164,7 @@ class PoseEstimate:
 
     Attributes:
         status: ``"ambiguous"`` when two places explain the images equally well; the pose is the better one.
-        T_world_obj: Upright pose ``(4, 4)``: origin at the footprint's centre on the support plane.
+        T_world_obj: Upright pose ``(4, 4)``: its frame as it was learned, z is up.
         covariance: ``(4, 4)`` over x, y, z in metres and yaw in radians.
         confidence: From 0 to 1; 1 is how well the object is typically found in its demonstrations.
         visible: Share of the object that the best view shows and the hand does not hide, at its place if it

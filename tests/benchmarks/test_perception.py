@@ -67,6 +67,24 @@ def test_a_first_look_is_timed_with_the_comparison_of_the_cameras_and_a_followin
     assert looks - 3 * firsts == sought["d"].count((2, True)) == firsts - 1
 
 
+def test_what_is_followed_is_timed_after_all_other_looks():
+    camera = Camera(64, 64, 60.0, 60.0, 31.5, 31.5, "world", np.eye(4))
+    memory = Memory(dict.fromkeys(("front", "side"), camera))
+    policy: Any = SimpleNamespace(
+        require_memory=lambda: memory, config=SimpleNamespace(hand_radius_m=0.05), segmenter=None
+    )
+    noise = torch.rand(2, 3, 64, 64, generator=torch.Generator().manual_seed(0))
+    first, last = (
+        Observation("task", np.zeros(8), Hand(np.eye(4), 0.04), {"front": one}, None) for one in noise
+    )
+    counts = []
+    for observations in ([first], [first, last], [first, last, first]):
+        memory.objects["d"].sought.clear()
+        look_ms(policy, observations, 3)
+        counts.append(memory.objects["d"].sought.count((1, True)))
+    assert np.diff(counts).tolist() == [1, 1]
+
+
 @pytest.mark.slow
 def test_perception_is_measured(
     checkpoint: Path, tiny_dataset: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch

@@ -254,7 +254,7 @@ def test_words_are_told_by_what_things_stand_on_wherever_their_frames_are(foot):
     np.testing.assert_array_equal(meant.T_world_obj, on)
 
 
-def test_feet_are_the_middle_of_the_lowest_points():
+def test_feet_are_the_middle_at_the_lowest_height():
     corners = np.stack(np.meshgrid([0.1, 0.3], [-0.1, 0.1], [-0.2, 0.5], indexing="ij"), -1).reshape(-1, 3)
     context = dataclasses.replace(CONTEXT, points={"rack": corners})
     np.testing.assert_allclose(context.feet["rack"], [0.2, 0.0, -0.2])

@@ -106,6 +106,7 @@ def search(
         for start in np.concatenate(starts)
     ]
     places = _ranked(surface, places)
+    # Most of the best places are one; what differs from it in place or direction may be meant.
     finalists = list[Place]()
     for place in places:
         elsewhere = all(np.linalg.norm(place.pose[:2] - one.pose[:2]) > apart for one in finalists)
