@@ -105,7 +105,7 @@ def two_sub_tasks():
 def test_the_hand_rises_turned_as_it_grasped_also_where_it_puts_unturned():
     poses = {name: se3.from_yaw([*place, 0.0], 0.0) for name, place in PLACES.items()}
     shown = entry(key_poses=pick_and_place(), object_poses=poses)
-    turns = {0: Turn("bowl", poses["bowl"], np.zeros(2), np.deg2rad(120), puts_turned=False)}
+    turns = {0: Turn("bowl", poses["bowl"], np.zeros(2), np.deg2rad(120), put="as_shown")}
     plain = transfer(shown, poses, {}, HOME, turns=turns)
     middle = (poses["bowl"][:2, 3] + poses["plate"][:2, 3]) / 2
     higher, crossed = lifted(shown, plain, HOME, {"post": pillar(*middle, 0.4)}, RADIUS)

@@ -12,7 +12,7 @@ from tests.memory.builders import entry, hand_pose, key_pose, robot
 from lerobot_openspm.control import feasibility
 from lerobot_openspm.control.feasibility import MAX_JUMP_RAD, TransferLimits, find_stance
 from lerobot_openspm.control.plan import Plan
-from lerobot_openspm.control.transfer import RETREAT_M
+from lerobot_openspm.control.transfer import RETREAT_M, transfer
 from lerobot_openspm.geometry import se3
 from lerobot_openspm.geometry.arm import load_arm
 from lerobot_openspm.memory.compose import Candidate
@@ -39,17 +39,19 @@ def chosen(context, poses, home):
     return context.choose(context.rank([candidate], poses, home), poses, home)
 
 
-def test_a_grasp_that_the_joints_cannot_reach_is_turned_about_a_round_object(panda):
-    # The last joint may turn by less, so that the hand cannot; the bowl looks alike from all sides.
+@pytest.mark.parametrize("turn", [0.0, np.pi / 2])
+def test_a_hand_that_the_joints_cannot_turn_so_far_is_turned_about_the_object(panda, turn):
+    # The last joint may turn by less, so that the hand cannot.
     *joints, last = panda.joints
     stiff = replace(panda, joints=(*joints, replace(last, limits=np.array([-0.5, 1.5]))))
-    context, poses, home = scene(stiff, np.deg2rad(90))
+    context, poses, home = scene(stiff, np.deg2rad(90), turn=turn)
     plan = Plan(context.entries[0], poses, home)
     assert not plan.followed(context)[1]
     _, (problem,) = replace(plan, stance=find_stance(context.robot, home)).followed(context)
     assert "beyond what the arm's joints reach" in problem
     plan, problems = chosen(context, poses, home)
-    assert plan.turned != 0
+    # What is round is grasped as it was shown, and put down with the hand as it is.
+    assert (plan.turned == 0, plan.put) == ((True, "kept") if turn == 0 else (False, "turned"))
     assert problems == plan.followed(context)[1] == []
 
 
@@ -62,27 +64,43 @@ def test_grasps_are_turned_by_what_the_shape_allows(panda, turn, expected):
         context = replace(context, symmetries={})
     ways = Plan(context.entries[0], poses, home).turns(context)
     assert_allclose(np.rad2deg([way.turned for way in ways]), expected)
-    assert all(way.puts_turned for way in ways)
+    assert all(way.put == "turned" for way in ways)
 
 
-def test_what_is_round_is_put_as_it_was_shown_where_the_hand_would_turn_too_far():
+def middle_at(targets, index, bowl):
+    """Where the hand has the bowl's axis ``(1, 3)`` at a key pose."""
+    grasp = next(one for one in targets if one.key_pose.phase == "grasp")
+    return se3.apply(targets[index].T_world_ee @ se3.inverse(grasp.T_world_ee) @ bowl, np.zeros((1, 3)))
+
+
+def test_what_is_round_is_put_with_the_hand_as_it_is_where_it_would_turn_too_far():
     # The plate lies turned by nearly half a turn from how it lay, seen from the bowl.
     context, poses, home = scene(None, 0.0)
     poses["plate"] = poses["plate"] @ se3.from_yaw(np.zeros(3), 3.0)
     plan, problems = chosen(context, poses, home)
     assert problems == []
-    assert not plan.puts_turned
-    own, shown = plan.targets(context), Plan(plan.entry, poses, home).targets(context)
-    (grasp, place), (shown_grasp, shown_place) = ((one[2], one[5]) for one in (own, shown))
-    assert_allclose(place.T_world_ee, shown_place.T_world_ee)
+    assert (plan.turned, plan.put) == (0, "kept")
+    own, turned = plan.targets(context), Plan(plan.entry, poses, home).targets(context)
+    (grasp, place), (turned_grasp, turned_place) = ((one[2], one[5]) for one in (own, turned))
     assert se3.distances(grasp.T_world_ee, place.T_world_ee)[1] < MAX_JUMP_RAD
-    assert se3.distances(shown_grasp.T_world_ee, shown_place.T_world_ee)[1] > MAX_JUMP_RAD
-    # The bowl's axis is where the hand would have brought it.
-    middles = [
-        se3.apply(put.T_world_ee @ se3.inverse(held.T_world_ee) @ poses["bowl"], np.zeros((1, 3)))
-        for held, put in ((grasp, place), (shown_grasp, shown_place))
-    ]
-    assert_allclose(*middles, atol=1e-9)
+    assert se3.distances(turned_grasp.T_world_ee, turned_place.T_world_ee)[1] > MAX_JUMP_RAD
+    assert_allclose(*(middle_at(one, 5, poses["bowl"]) for one in (own, turned)), atol=1e-9)
+
+
+@pytest.mark.parametrize("grasp", [0.0, 0.5])
+@pytest.mark.parametrize(
+    ("put", "turns_with"), [("turned", (True, True)), ("as_shown", (False, True)), ("kept", (True, False))]
+)
+def test_what_is_round_is_put_with_the_hand_turned_in_three_ways(grasp, put, turns_with):
+    context, poses, home = scene(None, 0.0)
+    plan = Plan(context.entries[0], poses, home)
+    poses["plate"] = plan.entry.object_poses["plate"] @ se3.from_yaw(np.zeros(3), 2.0)
+    way = replace(plan, turned=grasp, put=put)
+    own, shown = way.targets(context), transfer(plan.entry, plan.entry.object_poses, {}, home)
+    for i, turn in ((2, grasp), (5, np.dot(turns_with, (grasp, 2.0)))):
+        R = own[i].T_world_ee[:3, :3] @ shown[i].T_world_ee[:3, :3].T
+        assert_allclose(R, se3.from_yaw(np.zeros(3), turn)[:3, :3], atol=1e-9)
+    assert_allclose(*(middle_at(one, 5, poses["bowl"]) for one in (own, plan.targets(context))), atol=1e-9)
 
 
 def test_a_grasp_within_reach_stays_as_shown(panda):

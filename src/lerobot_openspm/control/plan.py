@@ -13,6 +13,7 @@ from lerobot_openspm.control.pushes import pushed_by_landmark
 from lerobot_openspm.control.transfer import (
     HALF_TURN,
     RETREAT_M,
+    Put,
     Target,
     Turn,
     as_shown,
@@ -51,7 +52,7 @@ class Plan:
         T_world_ee: The hand's pose ``(4, 4)`` where the plan begins.
         turned: How far the hand is turned about the axis of objects that it grasps, which turn into
             themselves by that, radians.
-        puts_turned: Whether it is turned where it puts them too.
+        put: How it is turned where it puts them.
         is_half_turned: Whether the hand is turned by half a turn about its approach axis.
         stance: The arm's joint angles ``(n,)`` where the plan begins; None where they are not known, and
             reach is not checked by them.
@@ -62,7 +63,7 @@ class Plan:
     object_poses: Mapping[str, Array]
     T_world_ee: Array
     turned: float = 0.0
-    puts_turned: bool = True
+    put: Put = "turned"
     is_half_turned: bool = False
     stance: Array | None = None
     retreat_m: float = RETREAT_M
@@ -77,11 +78,9 @@ class Plan:
         entry = self.entry if last is None else self.entry.until(last)
         object_poses = as_shown(entry, self.object_poses, context.symmetries)
         turns = {
-            sub_task: Turn(
-                name, object_poses[name], context.symmetries[name].middle, self.turned, self.puts_turned
-            )
+            sub_task: Turn(name, object_poses[name], context.symmetries[name].middle, self.turned, self.put)
             for sub_task, name in self.symmetric_grasps(context).items()
-            if self.turned and name in object_poses
+            if (self.turned or self.put != "turned") and name in object_poses
         }
         # Which pose of a symmetric object is meant is told by the hand as it was demonstrated.
         T_world_ee = self.T_world_ee @ HALF_TURN if self.is_half_turned else self.T_world_ee
@@ -97,15 +96,18 @@ class Plan:
     def turns(self, context: PlanningContext) -> list[Plan]:
         """The plan with its grasps turned as the objects' shapes allow, the least first; as it is at first.
 
-        What is round is put down as it was shown too, the hand being turned only where it grasps.
+        What is round is put down as it was shown too, the hand being turned only where it grasps, and with
+        the hand as it grasped it, where the landmark is turned.
         """
         least = [context.symmetries[name].turn for name in self.symmetric_grasps(context).values()]
-        ways: list[Plan] = [self]
-        for radians in TURNS:
-            if radians and least and all(turn == 0 or _is_multiple(radians, turn) for turn in least):
-                ways.append(replace(self, turned=radians))
-                ways += [replace(self, turned=radians, puts_turned=False)] if not any(least) else []
-        return ways
+        puts: tuple[Put, ...] = ("turned",) if any(least) else ("turned", "as_shown", "kept")
+        turns = [
+            radians
+            for radians in TURNS
+            if least and all(turn == 0 or _is_multiple(radians, turn) for turn in least)
+        ]
+        ways = [replace(self, turned=radians, put=put) for radians in turns for put in puts]
+        return [self, *(way for way in ways if way.turned or way.put == "kept")]
 
     def followed(self, context: PlanningContext) -> tuple[Plan, list[str]]:
         """The plan, backing off as far as the arm reaches, and what keeps the hand from following it."""

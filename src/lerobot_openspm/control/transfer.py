@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Literal
 
 import numpy as np
 
@@ -20,6 +21,9 @@ RETREAT_M = 0.06
 LEVEL_M = 0.02
 # Of the hand about its approach axis, the z axis of its frame.
 HALF_TURN = se3.from_yaw(np.zeros(3), np.pi)
+# How the hand is turned where it puts an object down: as where it grasped it, not at all, or so that it turns
+# on the way there as it did in the demonstration, however the landmark is turned.
+Put = Literal["turned", "as_shown", "kept"]
 
 
 @dataclass(frozen=True)
@@ -31,14 +35,14 @@ class Turn:
         T_world_obj: Where it stands ``(4, 4)``.
         middle: Where its axis is, x and y ``(2,)`` in its frame, metres.
         radians: How far the hand is turned about the axis.
-        puts_turned: Whether it is turned where it puts the object too; of a round one either will do.
+        put: How it is turned where it puts the object; of a round one any will do.
     """
 
     name: str
     T_world_obj: Array
     middle: Array
     radians: float
-    puts_turned: bool = True
+    put: Put = "turned"
 
 
 @dataclass(frozen=True)
@@ -138,7 +142,7 @@ def transfer(
         push = path if pose.phase == "push" and is_straight else None
         targets.append(Target(before, pose, _is_precise(entry, i), axis, push))
     for sub_task, turn in (turns or {}).items():
-        targets = _turned(targets, sub_task, turn)
+        targets = _turned(targets, sub_task, turn, entry.object_poses)
     for sub_task, amount in (gone or {}).items():
         targets = _gone_on(targets, sub_task, amount)
     if targets and entry.key.sub_tasks[-1].operation == "put":
@@ -146,27 +150,44 @@ def transfer(
     return tuple(targets) + _retreat(targets, retreat_m)
 
 
-def _turned(targets: Sequence[Target], sub_task: int, turn: Turn) -> list[Target]:
+def _turned(targets: Sequence[Target], sub_task: int, turn: Turn, shown: Mapping[str, Array]) -> list[Target]:
     """Key poses that grasp an object turned about its axis, and put it where they would have put it.
 
     The hand turns about the axis where it stands, and from the grasp on where the hand has carried it to.
+
+    Args:
+        targets: The key poses as they are.
+        sub_task: Those of this sub-task are turned.
+        turn: What is turned, and how far.
+        shown: Poses ``T_world_obj`` ``(4, 4)`` of the objects in the demonstration.
     """
     turned = list(targets)
     T_ee_obj: Array | None = None
-    axis = turn.T_world_obj
+    axis, radians, is_put = turn.T_world_obj, turn.radians, False
     for i, target in enumerate(targets):
         pose = target.key_pose
         if pose.sub_task != sub_task:
             continue
-        if pose.phase in ARRIVING and pose.anchor.place != turn.name and not turn.puts_turned:
-            break
+        if pose.phase in ARRIVING and pose.anchor.place != turn.name and not is_put:
+            radians, is_put = _put_radians(turn, target, shown), True
         if T_ee_obj is not None and pose.phase != "retreat":
             axis = target.T_world_ee @ T_ee_obj
         if pose.phase == "grasp" and T_ee_obj is None:
             T_ee_obj = se3.inverse(target.T_world_ee) @ turn.T_world_obj
         point = se3.apply(axis, np.array([[*turn.middle, 0.0]]))[0]
-        turned[i] = replace(target, T_world_ee=turn_about(point[:2], turn.radians) @ target.T_world_ee)
+        turned[i] = replace(target, T_world_ee=turn_about(point[:2], radians) @ target.T_world_ee)
     return turned
+
+
+def _put_radians(turn: Turn, target: Target, shown: Mapping[str, Array]) -> float:
+    """How far the hand is turned where it first arrives at the place that it puts an object in."""
+    if turn.put == "turned":
+        return turn.radians
+    anchor = target.key_pose.anchor
+    if turn.put == "as_shown" or any(name not in shown for name in anchor.objects):
+        return 0.0
+    T_shown = transfer_pose(anchor.frame(shown), target.key_pose.T_obj_ee)
+    return turn.radians - float(se3.yaw_of(target.T_world_ee @ se3.inverse(T_shown)))
 
 
 def half_turned(targets: Sequence[Target]) -> tuple[Target, ...]:

@@ -25,6 +25,9 @@ MOST_COMPARED = 6
 # The first look is remembered and so many of the last ones, each from where the hand's camera was so far from
 # where it was before, metres, or turned by so much, radians.
 MOST_REMEMBERED, ELSEWHERE_M, ELSEWHERE_RAD = 3, 0.05, 0.3
+# What was sought in vain is not sought again until pictures, made smaller by this, differ somewhere by so
+# many levels of 255.
+CHANGED_PX, CHANGED_LEVELS = 8, 6.0
 # The hand and the arm behind it as balls along the hand's approach axis: from its fingertips this far back.
 TIP_M, BACK_M, BALLS = 0.01, -0.30, 12
 # The fingers are slimmer than what carries them; they end here.
@@ -55,6 +58,30 @@ class KnownWorld(Protocol):
         ...
 
 
+@dataclass(frozen=True)
+class InVain:
+    """Objects that were sought all over the pictures and not found clearly.
+
+    Attributes:
+        pictures: What was searched by camera, small.
+        told_apart: Objects that words told from others of their kind.
+        estimates: What came of it, by object.
+    """
+
+    pictures: Mapping[str, Array] = field(default_factory=dict[str, Array])
+    told_apart: frozenset[str] = frozenset()
+    estimates: Mapping[str, PoseEstimate] = field(default_factory=dict[str, PoseEstimate])
+
+    def still(
+        self, pictures: Mapping[str, Array], told_apart: Collection[str], names: Collection[str]
+    ) -> dict[str, PoseEstimate]:
+        """The estimates of some objects that still hold, as far as pictures have not changed."""
+        is_same = self.told_apart == frozenset(told_apart) and self.pictures.keys() == pictures.keys()
+        if not is_same or any(_differ(pictures[camera], own) for camera, own in self.pictures.items()):
+            return {}
+        return {name: one for name, one in self.estimates.items() if name in names}
+
+
 @dataclass
 class Perception:
     """What one environment looks through.
@@ -64,12 +91,14 @@ class Perception:
         hand_radius_m: Radius of the hand, which hides what is behind it.
         segmenter: Finds the masks of objects that were learned from a segmenter's; None if none were.
         before: Looks that are remembered, the oldest first.
+        in_vain: What the last search did not find.
     """
 
     memory: KnownWorld
     hand_radius_m: float
     segmenter: Segmenter | None = None
     before: tuple[EarlierLook, ...] = ()
+    in_vain: InVain = field(default_factory=InVain)
     _watch: CameraWatch = field(default_factory=CameraWatch)
     _has_looked: bool = False
     _has_compared: bool = False
@@ -119,7 +148,7 @@ class Perception:
         known = {name: self.memory.objects[name] for name in names if name in self.memory.objects}
         self.before = tuple(one.without(displaced) for one in self.before)
         look = look_at(sound, list(known), self.segmenter, hidden, expected, told_apart, self.before)
-        estimates = localise_all(known, look)
+        estimates = self._localise(known, look)
         self.remember(look, {name: one for name, one in estimates.items() if name not in displaced})
         if not self._has_compared:  # once, as soon as all cameras are sound, by what is sought until then
             self._comparable |= known
@@ -127,6 +156,20 @@ class Perception:
                 self._has_compared = True
                 faults = disagreeing_cameras(look, self._comparable, estimates)
         return Detections(estimates, faults)
+
+    def _localise(self, known: Mapping[str, KnownObject], look: Look) -> dict[str, PoseEstimate]:
+        """Find objects, but do not search again for what the same pictures did not show before."""
+        unseen = known.keys() - look.expected.keys()
+        pictures = {camera: _small(view) for camera, view in look.views.items()} if unseen else {}
+        still = self.in_vain.still(pictures, look.told_apart, unseen)
+        found = localise_all({name: one for name, one in known.items() if name not in still}, look)
+        estimates = {name: still.get(name) or found[name] for name in known}
+        missed = {name: found[name] for name in unseen & found.keys() if found[name].status != "found"}
+        if still:
+            self.in_vain = replace(self.in_vain, estimates={**self.in_vain.estimates, **missed})
+        else:
+            self.in_vain = InVain(pictures, frozenset(look.told_apart), missed)
+        return estimates
 
     def remember(self, look: Look, estimates: Mapping[str, PoseEstimate]) -> None:
         """Keep a look that found something, from elsewhere than the last one that was kept.
@@ -175,6 +218,17 @@ def disagreeing_cameras(
         }
     # What such a camera shows was never usable.
     return {camera: Fault(reason, float("inf")) for camera, reason in disagreements(places).items()}
+
+
+def _small(view: View) -> Array:
+    """A view's picture, much smaller: what is left does not change by noise."""
+    height, width = (max(1, size // CHANGED_PX) for size in view.image.shape[:2])
+    return np.asarray(cv2.resize(view.image, (width, height), interpolation=cv2.INTER_AREA), float)
+
+
+def _differ(picture: Array, other: Array) -> bool:
+    """Whether two small pictures show something else somewhere."""
+    return picture.shape != other.shape or bool(np.abs(picture - other).max() > CHANGED_LEVELS)
 
 
 def _is_elsewhere(look: Look, before: Look) -> bool:

@@ -25,6 +25,7 @@ from lerobot_openspm.perception.objects.surface.search import (
     Place,
     covariance_at,
     likelihood,
+    middles_apart,
     over_supports,
     over_table,
     refine,
@@ -260,7 +261,7 @@ class SurfaceModel:
         best = places[0]
         share = best.score / self.typical_agreement
         apart = max(SAME_PLACE_M, OVERLAP_SHARE * self.surface.radius)
-        rivals = [one for one in places[1:] if np.linalg.norm(one.pose[:2] - best.pose[:2]) > apart]
+        rivals = [one for one in places[1:] if middles_apart(self.surface, one, best) > apart]
         likely = likelihood(self.surface, best)
         is_rivalled = any(likelihood(self.surface, one) > RIVAL_SHARE * likely for one in rivals)
         is_raised = best.pose[2] > self.height + LIFTED_M / 2

@@ -109,7 +109,7 @@ def search(
     # Most of the best places are one; what differs from it in place or direction may be meant.
     finalists = list[Place]()
     for place in places:
-        elsewhere = all(np.linalg.norm(place.pose[:2] - one.pose[:2]) > apart for one in finalists)
+        elsewhere = all(middles_apart(surface, place, one) > apart for one in finalists)
         turned = all(_apart(place.pose, one.pose, apart) for one in finalists)
         if (elsewhere and several) or (turned and len(finalists) < FINALISTS):
             finalists.append(place)
@@ -121,6 +121,11 @@ def likelihood(surface: Surface, place: Place) -> float:
     """Its agreement, which counts less where the object is turned otherwise than it was shown."""
     turned = LARGE_TURNED_SHARE if surface.is_large else TURNED_SHARE
     return place.score * (turned if _is_turned(float(place.pose[3])) else 1.0)
+
+
+def middles_apart(surface: Surface, place: Place, other: Place) -> float:
+    """How far apart a surface's middle is at two places, metres; its frame may lie far from that."""
+    return float(np.linalg.norm(surface.middle_at(place.pose) - surface.middle_at(other.pose)))
 
 
 def _ranked(surface: Surface, places: Sequence[Place]) -> list[Place]:

@@ -58,6 +58,10 @@ class Surface:
         """Horizontal middle ``(2,)`` of the coloured points."""
         return _middle(self.coloured)
 
+    def middle_at(self, pose: Array) -> Array:
+        """Where its horizontal middle is ``(2,)`` at a pose (x, y, z, yaw)."""
+        return se3.apply(se3.from_yaw(pose[:3], float(pose[3])), np.array([[*self.middle, 0.0]]))[0, :2]
+
     @cached_property
     def palette(self) -> Float32:
         """Weighted CIELAB ``(k, 3)`` of its colours, one for each that is :data:`LIKE_COARSE` from others."""
