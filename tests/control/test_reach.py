@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
-from tests.control.test_controller import planning_context
+from tests.control.test_controller import HAND, Perception, controller, observe, planning_context, watch
 from tests.geometry.test_arm import LIBERO
 from tests.memory.builders import entry, hand_pose, key_pose, robot
 
@@ -17,7 +17,7 @@ from lerobot_openspm.geometry import se3
 from lerobot_openspm.geometry.arm import load_arm
 from lerobot_openspm.memory.compose import Candidate
 from lerobot_openspm.memory.entry import Anchor, Axis
-from lerobot_openspm.types import Symmetry
+from lerobot_openspm.types import Hand, Symmetry
 
 
 @pytest.fixture
@@ -196,3 +196,41 @@ def test_a_drawer_that_cannot_be_opened_all_the_way_is_refused(panda):
     context, _, _ = scene(panda, 0.0)
     _, (problem,) = chosen(replace(context, entries=(shown,)), poses, hand_pose(-0.22, -0.01, 1.177))
     assert "(open at cabinet)" in problem
+
+
+# By half a turn the hand would turn further than is allowed at once.
+@pytest.mark.parametrize(
+    ("turn", "tracking", "expected"),
+    [(0.0, True, 90), (0.0, False, 90), (np.pi / 2, True, 90), (np.pi, True, 0), (None, True, 0)],
+)
+def test_a_grasp_that_the_hand_is_kept_from_is_tried_again_from_another_side(turn, tracking, expected):
+    shown, symmetries = entry(), {} if turn is None else {"bowl": Symmetry(np.zeros(2), turn)}
+    perception = Perception(shown.object_poses)
+    one = controller(shown, symmetries=symmetries, tracking=tracking)
+    observe(one, HAND, perception)
+    grasp = next(i for i, target in enumerate(one.executor.targets) if target.key_pose.phase == "grasp")
+    before = one.executor.targets[grasp].T_world_ee
+    held_up = se3.transform(before[:3, :3], before[:3, 3] + [0.0, 0.0, 0.03])
+    one.executor.begin(one.executor.targets, HAND, grasp - 1)
+    for _ in range(300):
+        watch(one, perception, Hand(held_up, HAND.opening), 1)
+        if one.state.attempts:
+            break
+    assert one.state.attempts == 1
+    turned = float(se3.distances(one.executor.targets[grasp].T_world_ee, before)[1])
+    assert_allclose(np.rad2deg(turned), expected, atol=1e-4)
+
+
+def test_a_grasp_that_missed_is_tried_again_as_it_was():
+    shown = entry()
+    perception, one = (
+        Perception(shown.object_poses),
+        controller(shown, symmetries={"bowl": Symmetry(np.zeros(2), 0.0)}),
+    )
+    observe(one, HAND, perception)
+    grasp = next(i for i, target in enumerate(one.executor.targets) if target.key_pose.phase == "grasp")
+    before = one.executor.targets[grasp].T_world_ee
+    one.executor.begin(one.executor.targets, HAND, grasp + 1)
+    watch(one, perception, Hand(before, 0.0), 1)
+    assert one.state.attempts == 1
+    assert_allclose(one.executor.targets[grasp].T_world_ee, before, atol=1e-9)

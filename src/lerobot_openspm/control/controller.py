@@ -282,6 +282,8 @@ class EpisodeController:
         is_in_hand = is_carrying and not executor.has_lost_grip(hand)
         index = executor.way_index() if is_in_hand else executor.contact_index()
         state.plan = replace(state.plan, T_world_ee=hand.T_world_ee)
+        if executor.was_kept_from_grasping(hand):
+            state.plan = self._context.otherwise(state.plan)
         if not self._is_tracking:
             self._begin(index, hand)
             return None

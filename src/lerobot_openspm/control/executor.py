@@ -215,6 +215,13 @@ class Executor:
             return False
         return hand.opening < HELD_SHARE * grasped.opening
 
+    def was_kept_from_grasping(self, hand: Hand) -> bool:
+        """Whether the present key pose leads to a grasp and the hand does not get there."""
+        present = self.present.key_pose
+        ahead = (one.key_pose for one in self.targets[self.state.index :])
+        is_to_grasp = any(one.phase == "grasp" and one.sub_task == present.sub_task for one in ahead)
+        return is_to_grasp and present.phase == "approach" and not self.has_lost_grip(hand)
+
     def followed_sub_tasks(self) -> set[int]:
         """The sub-tasks whose drawer or knob went all the way, once the plan is done.
 

@@ -34,6 +34,8 @@ logger = logging.getLogger(__name__)
 MAX_TRIED = 3
 # The hand is in much more of other objects if it is in so many times as many points of them.
 MUCH_MORE = 2
+# A grasp that the hand was kept from is tried again turned by this much at least, radians.
+OTHERWISE_RAD = np.deg2rad(85)
 # A memory that knows more objects than this knows several scenes, and not all objects are looked for.
 MOST_IN_A_SCENE = 20
 
@@ -145,7 +147,8 @@ class PlanningContext:
             if crowded and not self._mean_the_same(entry, crowded[0][0].entry):
                 continue
             for is_half_turned in (False, True):
-                found = self._turned(replace(first, entry=entry, is_half_turned=is_half_turned), points)
+                plan = replace(first, entry=entry, is_half_turned=is_half_turned)
+                found = self._clearest(plan.turns(self), points)
                 if found is not None and not found[1]:
                     return found[0], []
                 crowded += [found] if found is not None else []
@@ -159,30 +162,42 @@ class PlanningContext:
     def _mean_the_same(self, entry: MemoryEntry, other: MemoryEntry) -> bool:
         return means_the_same(entry.key.sub_tasks, other.key.sub_tasks, self.names.lexicon)
 
-    def _turned(self, plan: Plan, points: Mapping[str, Array]) -> tuple[Plan, dict[str, int]] | None:
-        """A plan with its grasps turned by the least with which the arm can follow it clear of other objects.
+    def otherwise(self, plan: Plan) -> Plan:
+        """A plan that grasps from another side, where the arm can follow it so; else the plan itself."""
+        ways = [
+            way
+            for way in plan.turns(self)
+            if abs(float(se3.wrap_angle(way.turned - plan.turned))) > OTHERWISE_RAD
+        ]
+        found = self._clearest(ways, self._points(plan.object_poses))
+        return plan if found is None else found[0]
 
-        Where that is not to be had, they are turned only if the hand is in much less of them then. None where
-        the arm cannot follow it at all.
+    def _clearest(
+        self, turned: Sequence[Plan], points: Mapping[str, Array]
+    ) -> tuple[Plan, dict[str, int]] | None:
+        """The first of some plans with which the arm can follow it clear of other objects.
+
+        Where that is not to be had, the first one, unless the hand is in much less of them with another. None
+        where the arm can follow none.
 
         Args:
-            plan: As it is.
+            turned: A plan with its grasps turned, see :meth:`Plan.turns`.
             points: Points ``(n, 3)`` in the world of the objects that were found, by name.
 
         Returns:
             The plan, and how much of what the hand is in, see :func:`crowding`.
         """
-        turning, ways = plan.symmetric_grasps(self), list[tuple[Plan, dict[str, int]]]()
-        for turned in plan.turns(self):
-            targets = turned.targets(self)
-            if not turned.check(self, targets):
-                ways.append((turned, crowding(turned.entry, targets, points, self.hand_radius_m)))
+        ways = list[tuple[Plan, dict[str, int]]]()
+        for plan in turned:
+            targets = plan.targets(self)
+            if not plan.check(self, targets):
+                ways.append((plan, crowding(plan.entry, targets, points, self.hand_radius_m)))
         least = min(map(_amount, ways), default=0)
-        for turned, inside in sorted(ways, key=lambda way: _amount(way) > MUCH_MORE * least):
-            reaching, miss = turned.backing_off(self)
+        for plan, inside in sorted(ways, key=lambda way: _amount(way) > MUCH_MORE * least):
+            reaching, miss = plan.backing_off(self)
             if miss is None:
                 return reaching, inside
-            if miss.target.key_pose.sub_task not in turning:
+            if miss.target.key_pose.sub_task not in plan.symmetric_grasps(self):
                 return None  # turning the grasps leaves it where it is
         return None
 
