@@ -172,6 +172,21 @@ def test_a_rival_in_another_direction_makes_a_large_object_less_doubtful(models,
     assert model._estimate(look, model._sights(look), [shown, turned]).status == status
 
 
+@pytest.mark.parametrize(("same", "status"), [("middle", "found"), ("origin", "ambiguous")])
+def test_places_are_told_apart_by_the_middle_of_what_stands_there(models, same, status):
+    # The frame lies 15 cm beside the block.
+    model = models["block"]
+    surface = dataclasses.replace(model.surface, points=model.surface.points + np.array([0.15, 0.0, 0.0]))
+    model = dataclasses.replace(model, surface=surface)
+    shown = np.array([-0.03, 0.12, model.height, 0.0])
+    turned = np.array([*shown[:3], np.pi])
+    if same == "middle":
+        turned[:2] += surface.middle_at(shown) - surface.middle_at(turned)
+    look = Look(views_at(moved(0.12, 0.12, 0.0), looking_down(*HOME)))
+    places = [Place(pose, 0.97 * model.typical_agreement) for pose in (shown, turned)]
+    assert model._estimate(look, model._sights(look), places).status == status
+
+
 def test_it_is_followed_from_where_it_is_expected(models):
     model, scene = models["block"], moved(0.12, 0.12, 0.3)
     first = model.localise(Look(views_at(scene, looking_down(*HOME))))
