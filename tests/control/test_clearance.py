@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 from tests.control.test_controller import HAND, Perception, controller, observe
+from tests.control.test_going_back import ON_PLATE
 from tests.control.test_reach import chosen, scene
 from tests.memory.builders import entry, hand_pose, pick_and_place
 
@@ -274,3 +275,44 @@ def test_a_way_that_cannot_be_lifted_is_gone_straight_and_that_is_said(caplog):
     (record,) = caplog.records
     assert "the post may be in the way" in record.getMessage()
     assert "outside the demonstrated workspace" in record.getMessage()
+
+
+def overhang(beside, height):
+    """A board over the plate that ends ``beside`` metres from its middle, on the side of negative x."""
+    x, y = np.meshgrid(np.linspace(-0.2, beside, 30), np.linspace(-0.1, 0.1, 20))
+    return np.column_stack([x.ravel(), y.ravel(), np.full(x.size, height)])
+
+
+def disc(radius=0.05):
+    angles = np.linspace(0, 2 * np.pi, 24)
+    return np.column_stack([radius * np.cos(angles), radius * np.sin(angles), np.zeros(24)])
+
+
+@pytest.mark.parametrize(("height", "is_in_the_way"), [(0.15, True), (0.01, False), (0.6, False)])
+def test_what_a_load_comes_down_through_is_in_its_way(height, is_in_the_way):
+    context, poses, home = scene(None, 0.0)
+    targets = Plan(context.entries[0], poses, home).targets(context)
+    points = {
+        "bowl": se3.apply(poses["bowl"], disc()),
+        "board": se3.apply(poses["plate"], overhang(0.1, height)),
+    }
+    found = crowding(context.entries[0], targets, points, 0.01)
+    assert ("board" in found) == is_in_the_way
+    assert "board" not in crowding(context.entries[0], targets, {"board": points["board"]}, 0.01)
+
+
+@pytest.mark.parametrize(("beside", "metres"), [(-0.09, 0.0), (-0.035, 0.02), (0.2, 0.0)])
+def test_a_load_is_put_down_beside_what_overhangs_its_place_no_further_than_counts_as_there(beside, metres):
+    context, poses, home = scene(None, 0.0)
+    shown = replace(context.entries[0], outcomes=(ON_PLATE,))
+    points = {"bowl": disc(), "board": overhang(beside, 0.15)}
+    context = replace(context, entries=(shown,), points=points, hand_radius_m=0.01, symmetries={})
+    poses = poses | {"board": poses["plate"]}
+    plan, problems = chosen(context, poses, home)
+    assert problems == []
+    assert np.hypot(*plan.aside) == pytest.approx(metres)
+    straight = replace(plan, aside=(0.0, 0.0)).targets(context)
+    for target, before in zip(plan.targets(context), straight, strict=True):
+        is_put = target.key_pose.phase in ("pre-place", "place", "release", "retreat")
+        aside = [*plan.aside, 0.0] if is_put else np.zeros(3)
+        assert_allclose(target.T_world_ee[:3, 3] - before.T_world_ee[:3, 3], aside, atol=1e-12)

@@ -29,6 +29,8 @@ SHORTEST_M = 0.03
 CLEARANCE_M = 0.03
 # ... and passes beside it at this many times its radius: a hand is wider across its fingers than on average.
 BESIDE = 1.5
+# What is put down comes straight down over this height, metres.
+FROM_ABOVE_M = 0.35
 # So many places of a way are compared with what stands about.
 STEPS = 24
 # Where the fingers close and open, the hand is beside objects.
@@ -160,6 +162,8 @@ def crowding(
 ) -> dict[str, int]:
     """How many points of other objects are inside the hand where it takes hold and lets go.
 
+    Also those that what it carries comes down through, where it is put.
+
     Args:
         entry: What is to be executed.
         targets: Its key poses in the scene.
@@ -181,6 +185,9 @@ def crowding(
                 if own is not None and np.linalg.norm(other.mean(0) - own.mean(0)) < SAME_THING_M:
                     continue
                 inside = int(_inside(se3.apply(se3.inverse(T), other), radius).sum())
+                if own is not None and pose.phase == "release" and standing.is_held:
+                    down = se3.apply(T @ se3.inverse(standing.T_world_grasp), own)
+                    inside += int(_over(down, other).sum())
                 found[name] = found.get(name, 0) + inside
         standing.pass_by(pose, T, entry)
     return {name: found[name] for name in points if found.get(name, 0) >= NOISE_POINTS}
@@ -191,6 +198,14 @@ def _inside(points: Array, radius: float) -> NDArray[np.bool_]:
     x, y, z = np.abs(points[:, 0]), np.abs(points[:, 1]), points[:, 2]
     parts = [(x < a * radius) & (y < b * radius) & (z > low) & (z < high) for a, b, low, high in PARTS]
     return np.any(parts, axis=0)
+
+
+def _over(load: Array, points: Array) -> NDArray[np.bool_]:
+    """Which points ``(n, 3)`` are in the way of a load ``(m, 3)`` that comes down to where it is put."""
+    low, high = load.min(0), load.max(0)
+    apart = np.linalg.norm(points[:, :2] - (low + high)[:2] / 2, axis=1)
+    height = points[:, 2] - low[2]
+    return (apart < (high - low)[:2].max() / 2) & (height > CLEARANCE_M) & (height < FROM_ABOVE_M)
 
 
 def _raised(pose: MemoryKeyPose, rise: float) -> MemoryKeyPose:

@@ -86,7 +86,7 @@ class EpisodeController:
             What has to be looked for at the same moment; None if nothing more.
         """
         try:
-            moved = self.scene.take_in(detections, hand)
+            moved = self.scene.take_in(detections, hand, self.executor.feels_grip(hand))
         except InstructionError as error:
             return self._refuse(error)
         self._check_cameras()

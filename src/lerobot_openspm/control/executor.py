@@ -28,6 +28,9 @@ MAX_CORRECTIONS, MAX_ATTEMPTS = 8, 3
 HELD_SHARE = 0.4
 # Where the demonstration's fingers stood further apart than this share of open, they held something.
 HOLDING_SHARE = 0.03
+# A hand that is held up this little above the place of what it carries, and this little beside, after so many
+# corrections, lets go there, metres.
+DROP_M, BESIDE_M, HELD_UP_CORRECTIONS = 0.06, 0.02, 3
 # A handle that has come along for less than this share of its way was not in the fingers.
 LEAST_TRAVEL = 0.05
 
@@ -147,10 +150,25 @@ class Executor:
             # A hand that is held up short of a key pose it only passes by goes on to the next one.
             self._enter(self.state.index + 1, hand)
             return False
+        if self._is_held_up_from_below(hand):
+            logger.info("letting go here: what is carried is held up from below")
+            self._enter(self.state.index + 1, hand)
+            return False
         if not is_used_up:
             return False
         metres, radians = se3.distances(hand.T_world_ee, self.present.T_world_ee)
         return self.try_again(f"it stays {1000 * metres:.1f} mm and {radians:.3f} rad away")
+
+    def _is_held_up_from_below(self, hand: Hand) -> bool:
+        """Whether what the hand carries to its place does not get lower, a little above that place."""
+        approach, present = self.approach, self.present
+        if present.key_pose.phase != "place" or not approach.is_blocked or self.has_lost_grip(hand):
+            return False
+        if approach.corrections <= HELD_UP_CORRECTIONS or self.state.index + 1 == len(self.targets):
+            return False
+        above = hand.T_world_ee[:3, 3] - present.T_world_ee[:3, 3]
+        is_letting_go = self.targets[self.state.index + 1].key_pose.phase == "release"
+        return is_letting_go and bool(0 < above[2] < DROP_M and np.hypot(*above[:2]) < BESIDE_M)
 
     def next_action(self, hand: Hand) -> Array | None:
         """The next canonical action ``(7,)``, or None when a chunk is needed (:meth:`query`)."""
@@ -202,18 +220,29 @@ class Executor:
 
     def has_lost_grip(self, hand: Hand) -> bool:
         """Whether the fingers closed further than the demonstration's did around the object."""
+        felt = self._felt_opening()
+        return felt is not None and hand.opening < HELD_SHARE * felt
+
+    def feels_grip(self, hand: Hand) -> bool:
+        """Whether the fingers are as far apart as the demonstration's were around the object."""
+        felt = self._felt_opening()
+        return felt is not None and hand.opening >= HELD_SHARE * felt
+
+    def _felt_opening(self) -> float | None:
+        """How far apart the demonstration's fingers were around what is held now, metres.
+
+        None where nothing is, or where it is too thin to be felt.
+        """
         if not self.strategy.feels_fingers or self.state.index == 0:
-            return False
+            return None
         before, now = self.targets[self.state.index - 1].key_pose, self.present.key_pose
         passed = [one.key_pose for one in self.targets[: self.state.index]]
         grasped = next((p for p in reversed(passed) if p.phase in ("grasp", "release", "push")), None)
         if not (before.closed and now.closed) or now.phase == "push":
-            return False
+            return None
         if grasped is None or grasped.phase != "grasp":  # an empty hand, closed to push
-            return False
-        if grasped.opening < HOLDING_SHARE * self._robot.open_width:
-            return False
-        return hand.opening < HELD_SHARE * grasped.opening
+            return None
+        return None if grasped.opening < HOLDING_SHARE * self._robot.open_width else grasped.opening
 
     def was_kept_from_grasping(self, hand: Hand) -> bool:
         """Whether the present key pose leads to a grasp and the hand does not get there."""

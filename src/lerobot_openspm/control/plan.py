@@ -18,6 +18,7 @@ from lerobot_openspm.control.transfer import (
     Turn,
     as_shown,
     half_turned,
+    put_aside,
     transfer,
 )
 from lerobot_openspm.geometry import se3
@@ -37,6 +38,9 @@ TURNS = tuple(
 )
 # How long a retreat of our own is, metres: the first of these that the arm reaches.
 RETREATS_M = (RETREAT_M, RETREAT_M / 2, 0.0)
+# Where something overhangs the place of what is carried, it is put down beside it by one of
+# these, metres, in one of so many directions.
+ASIDE_M, ASIDE_DIRECTIONS = (0.01, 0.02, 0.03), 12
 # Where an object is that was never seen.
 NOWHERE = se3.transform(np.eye(3), np.full(3, np.inf))
 
@@ -57,6 +61,7 @@ class Plan:
         stance: The arm's joint angles ``(n,)`` where the plan begins; None where they are not known, and
             reach is not checked by them.
         retreat_m: How far the hand backs off at the end of a demonstration that was cut before it did.
+        aside: How far beside its place what is carried is put down, x and y in the world, metres.
     """
 
     entry: MemoryEntry
@@ -67,6 +72,7 @@ class Plan:
     is_half_turned: bool = False
     stance: Array | None = None
     retreat_m: float = RETREAT_M
+    aside: tuple[float, float] = (0.0, 0.0)
 
     def targets(
         self,
@@ -86,6 +92,8 @@ class Plan:
         T_world_ee = self.T_world_ee @ HALF_TURN if self.is_half_turned else self.T_world_ee
         scene = object_poses, context.yaw_periods, T_world_ee
         targets = transfer(entry, *scene, gone, turns, self.retreat_m)
+        if any(self.aside):
+            targets = put_aside(targets, np.array(self.aside))
         return half_turned(targets) if self.is_half_turned else targets
 
     def symmetric_grasps(self, context: PlanningContext) -> dict[int, str]:
@@ -108,6 +116,17 @@ class Plan:
         ]
         ways = [replace(self, turned=radians, put=put) for radians in turns for put in puts]
         return [self, *(way for way in ways if way.turned or way.put == "kept")]
+
+    def asides(self) -> list[Plan]:
+        """The plan, putting down what is carried beside its place, no further than counts as there."""
+        most = min((one.tolerance_m for one in self.entry.served_outcomes), default=0.0)
+        yaws = np.linspace(0, 2 * np.pi, ASIDE_DIRECTIONS, endpoint=False)
+        return [
+            replace(self, aside=(metres * float(np.cos(yaw)), metres * float(np.sin(yaw))))
+            for metres in ASIDE_M
+            for yaw in yaws
+            if metres <= most
+        ]
 
     def followed(self, context: PlanningContext) -> tuple[Plan, list[str]]:
         """The plan, backing off as far as the arm reaches, and what keeps the hand from following it."""

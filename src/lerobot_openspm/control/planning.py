@@ -154,7 +154,9 @@ class PlanningContext:
                 crowded += [found] if found is not None else []
         if not crowded:
             return first.followed(self)
-        plan, inside = min(crowded, key=_amount)
+        plan, inside = min([*crowded, *self._beside(*min(crowded, key=_amount), points)], key=_amount)
+        if not inside:
+            return plan, []
         logger.warning("%r: the hand may touch the %s where it takes hold or lets go",
                        plan.entry.language, " and the ".join(inside))  # fmt: skip
         return plan, []
@@ -200,6 +202,22 @@ class PlanningContext:
             if miss.target.key_pose.sub_task not in plan.symmetric_grasps(self):
                 return None  # turning the grasps leaves it where it is
         return None
+
+    def _beside(
+        self, plan: Plan, inside: Mapping[str, int], points: Mapping[str, Array]
+    ) -> list[tuple[Plan, dict[str, int]]]:
+        """The plan that puts things down a little beside their place, if that is much clearer."""
+        ways = list[tuple[Plan, dict[str, int]]]()
+        for way in plan.asides():
+            targets = way.targets(self)
+            if not way.check(self, targets):
+                ways.append((way, crowding(way.entry, targets, points, self.hand_radius_m)))
+        for way in sorted(ways, key=_amount):
+            if MUCH_MORE * _amount(way) >= sum(inside.values()):
+                break
+            if way[0].miss(self, way[0].targets(self)) is None:
+                return [way]
+        return []
 
     def _points(self, object_poses: Mapping[str, Array]) -> dict[str, Array]:
         """Points ``(n, 3)`` in the world of the objects that were found and whose shape is known."""

@@ -95,8 +95,10 @@ class SceneState:
         displaced = frozenset(self.tracker.displaced)
         return LookRequest(tuple(names), expected, time_s, held, told_apart, displaced, back_to)
 
-    def take_in(self, detections: Detections, hand: Hand) -> frozenset[str]:
+    def take_in(self, detections: Detections, hand: Hand, is_felt: bool = False) -> frozenset[str]:
         """Take in what a look brought; the names of the objects that are somewhere else than before.
+
+        What the fingers feel in the hand, as `is_felt` says, is not believed to be seen elsewhere.
 
         Raises:
             InstructionError: The instruction tells like objects apart by a relation that is not known.
@@ -108,7 +110,7 @@ class SceneState:
         known = {**self._context.surfaces, **self.tracker.poses(hand.T_world_ee)}
         meant = self.grounding.sort_out(detections.estimates, known)
         self.detections = replace(detections, estimates=meant)
-        return self.tracker.look(meant, hand.T_world_ee, waited_s)
+        return self.tracker.look(meant, hand.T_world_ee, waited_s, is_felt)
 
     @property
     def has_just_looked(self) -> bool:

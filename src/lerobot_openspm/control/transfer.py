@@ -190,6 +190,21 @@ def _put_radians(turn: Turn, target: Target, shown: Mapping[str, Array]) -> floa
     return turn.radians - float(se3.yaw_of(target.T_world_ee @ se3.inverse(T_shown)))
 
 
+def put_aside(targets: Sequence[Target], aside: Array) -> tuple[Target, ...]:
+    """The same key poses, those that put something down shifted by x and y ``(2,)`` in the world, metres."""
+    arrived: set[int] = set()
+    shifted: list[Target] = []
+    for target in targets:
+        pose, T = target.key_pose, target.T_world_ee
+        if pose.phase in ARRIVING:
+            arrived.add(pose.sub_task)
+        if pose.sub_task in arrived:  # a hand that backs off does so from there
+            T_aside = se3.transform(T[:3, :3], T[:3, 3] + [*aside, 0.0])
+            target = replace(target, T_world_ee=T_aside)
+        shifted.append(target)
+    return tuple(shifted)
+
+
 def half_turned(targets: Sequence[Target]) -> tuple[Target, ...]:
     """The same key poses with the hand turned by half a turn about its approach axis.
 

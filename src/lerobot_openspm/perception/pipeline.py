@@ -172,16 +172,20 @@ class Perception:
         return estimates
 
     def remember(self, look: Look, estimates: Mapping[str, PoseEstimate]) -> None:
-        """Keep a look that found something, from elsewhere than the last one that was kept.
+        """Keep a look that found something, from elsewhere than the last one that was kept, or more than it.
 
         Of all but the first one only what the hand's cameras show: the others show the same again.
         """
         poses = {name: one.T_world_obj for name, one in estimates.items() if one.status == "found"}
-        if not poses or (self.before and not _is_elsewhere(look, self.before[-1].look)):
-            return
-        views = look.views if not self.before else _of_the_hand(look)
-        kept = EarlierLook(replace(look, views=views, before=()), poses)
-        self.before = (*self.before[:1], *(*self.before[1:], kept)[-MOST_REMEMBERED:])
+        before = self.before
+        if before and not _is_elsewhere(look, before[-1].look):
+            if not poses.keys() > before[-1].poses.keys():
+                return
+            before = before[:-1]
+        if poses:
+            views = _of_the_hand(look) if before else look.views
+            kept = EarlierLook(replace(look, views=views, before=()), poses)
+            self.before = (*before[:1], *(*before[1:], kept)[-MOST_REMEMBERED:])
 
     def _simulator_poses(self, observation: Observation, names: Sequence[str]) -> dict[str, PoseEstimate]:
         poses = observation.simulator_poses(self.memory.simulator_objects)

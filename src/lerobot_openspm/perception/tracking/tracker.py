@@ -146,7 +146,11 @@ class Tracker:
             track.belief = kalman.predict(track.belief, step)
 
     def look(
-        self, estimates: Mapping[str, PoseEstimate], T_world_ee: Array, waited_s: float
+        self,
+        estimates: Mapping[str, PoseEstimate],
+        T_world_ee: Array,
+        waited_s: float,
+        is_felt: bool = False,
     ) -> frozenset[str]:
         """Take in what was seen of the objects that were looked for.
 
@@ -154,6 +158,7 @@ class Tracker:
             estimates: One per object that was looked for.
             T_world_ee: The hand's pose ``(4, 4)``.
             waited_s: Seconds since the last look.
+            is_felt: Whether the fingers feel what they hold; then it is not elsewhere, whatever was seen.
 
         Returns:
             The objects that turned out to be somewhere else, those seen for the first time among them.
@@ -166,7 +171,7 @@ class Tracker:
                     self._begin(name, estimate.T_world_obj, estimate)
                     moved.add(name)
             elif self._is_seen(estimate):
-                if self._take(name, track, estimate, T_world_ee, waited_s):
+                if self._take(name, track, estimate, T_world_ee, waited_s, is_felt):
                     moved.add(name)
             else:
                 self._miss(track, estimate, T_world_ee, waited_s)
@@ -232,7 +237,13 @@ class Tracker:
         )
 
     def _take(
-        self, name: str, track: _Track, estimate: PoseEstimate, T_world_ee: Array, waited_s: float
+        self,
+        name: str,
+        track: _Track,
+        estimate: PoseEstimate,
+        T_world_ee: Array,
+        waited_s: float,
+        is_felt: bool,
     ) -> bool:
         """Update a track with a sure estimate; whether the object turned out to be elsewhere."""
         expected = _in_world(track.belief.T[0], track, T_world_ee)
@@ -252,6 +263,8 @@ class Tracker:
                 track.hidden = track.rivalled = track.doubted = track.covered = False
                 track.smoothed = self._smoothed(track.smoothed, belief.T[0])
                 return False
+        if track.held and is_felt:
+            return False
         rival, track.rival = T_world_obj if track.doubted else track.rival, T_world_obj
         if rival is None or np.linalg.norm(rival[:3, 3] - T_world_obj[:3, 3]) > self.settings.agree_m:
             track.missed_s += waited_s  # seen here and there, and not where it is taken to be

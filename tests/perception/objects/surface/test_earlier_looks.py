@@ -7,6 +7,7 @@ import torch
 from tests.perception.objects.surface.filmed import HOME, looking_down, moved, views_at
 
 from lerobot_openspm.geometry import se3
+from lerobot_openspm.geometry.camera import project
 from lerobot_openspm.perception.objects.base import EarlierLook, Look
 from lerobot_openspm.perception.observation import Observation
 from lerobot_openspm.perception.pipeline import Perception
@@ -45,6 +46,51 @@ def test_earlier_looks_do_not_hold_back_what_has_moved(models):
         metres, radians = se3.distances(found.T_world_obj, alone.T_world_obj)
         assert metres < 0.004
         assert radians < 0.1
+
+
+def behind_a_board(views, T):
+    """The views, a board of another colour standing before most of what is at a pose in the fixed cameras."""
+    covered = {}
+    for name, view in views.items():
+        image = view.image.copy()
+        if name != "hand":
+            uv, _ = project(view.camera, view.T_world_cam, T[:3, 3] + [0.0, 0.0, 0.03])
+            column, row = np.rint(uv).astype(int)
+            image[max(0, row - 40) : row + 40, max(0, column - 40) : column + 2] = (30, 160, 60)
+        covered[name] = dataclasses.replace(view, image=image)
+    return covered
+
+
+def test_what_a_fixed_camera_shows_no_less_of_than_when_it_was_found_is_still_there(models):
+    model, scene = models["block"], moved(0.12, 0.12, 0.3)
+    first = Look(behind_a_board(views_at(scene, looking_down(*HOME)), scene["block"]))
+    found = model.localise(first)
+    assert found.status == "found"
+    T = found.T_world_obj
+    before = (EarlierLook(first, {"block": T}),)
+    away = looking_down(0.12, -0.3, 0.2)  # the hand's camera does not show it any more
+    still = behind_a_board(views_at(scene, away), scene["block"])
+    gone = behind_a_board(views_at({}, away), scene["block"])
+    off = []
+    for views, earlier in ((still, before), (still, ()), (gone, before)):
+        seen = model.localise(Look(views, expected={"block": T}, before=earlier))
+        assert seen.status == "not_found"
+        off.append(float(np.linalg.norm(seen.T_world_obj[:3, 3] - T[:3, 3])))
+    # Without the earlier look it is sought elsewhere, and so is what is gone.
+    assert off[0] < 0.004 < min(off[1:])
+
+
+def test_a_look_that_finds_more_from_the_same_place_is_remembered_instead():
+    perception = Perception(None, 0.08)
+    looks = [Look(views_at({}, looking_down(0.0, 0.0, 0.4))) for _ in range(3)]
+    found = PoseEstimate("found", np.eye(4), np.eye(4), 1.0)
+    missed = dataclasses.replace(found, status="not_found")
+    for look, block in zip(looks, (missed, found, missed), strict=True):
+        perception.remember(look, {"cup": found, "block": block})
+    (kept,) = perception.before
+    assert kept.poses.keys() == {"cup", "block"}
+    assert kept.look.views["hand"] is looks[1].views["hand"]
+    assert kept.look.views.keys() == looks[1].views.keys()
 
 
 def test_the_first_look_and_the_last_ones_from_elsewhere_are_remembered():

@@ -145,7 +145,7 @@ class SurfaceModel:
                 return near
         if expected is not None:
             there = there or self._at(look, expected)
-            if there.confidence >= GONE_SHARE:
+            if there.confidence >= GONE_SHARE * self._shown_before(look, expected):
                 return _followed(there)
         places = self._anywhere(look, sights)
         if near_score > BETTER_SHARE * places[0].score:  # something may stand on it
@@ -190,6 +190,23 @@ class SurfaceModel:
                 own = self._sights(earlier.look)
                 found |= {f"{camera}, earlier look {i}": sight for camera, sight in own.items()}
         return found
+
+    def _shown_before(self, look: Look, T_expected: Array) -> float:
+        """The share of the typical agreement by fixed cameras when it was found where it is expected.
+
+        What stands before it hides as much of it from them now. 1 where there was no such look.
+        """
+        for earlier in look.before:
+            T = earlier.poses.get(self.name)
+            if T is None or np.linalg.norm(T[:3, 3] - T_expected[:3, 3]) >= STILL_M:
+                continue
+            fixed = {
+                k for k, view in earlier.look.views.items() if view.camera.mount != "ee"
+            } & look.views.keys()
+            sights = {k: sight for k, sight in self._sights(earlier.look).items() if k in fixed}
+            if sights:
+                return min(1.0, score_at(self.surface, sights, _pose(T)) / self.typical_agreement)
+        return 1.0
 
     def _sights(self, look: Look) -> dict[str, Sight]:
         """The views as surfaces are compared with them, prepared once for all objects."""
