@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 from tests.control.test_controller import HAND, Perception, controller, observe
-from tests.control.test_going_back import ON_PLATE
+from tests.control.test_going_back import KINDS, ON_PLATE, handle
 from tests.control.test_reach import chosen, scene
 from tests.memory.builders import entry, hand_pose, pick_and_place
 
@@ -237,7 +237,7 @@ def test_a_grasp_beside_another_object_is_turned_about_a_round_object(caplog):
     plan, problems = chosen(replace(context, symmetries={}), poses, home)
     assert (plan.turned, problems) == (0, [])
     (record,) = caplog.records
-    assert "the hand may touch the post where it takes hold or lets go" in record.getMessage()
+    assert "hand or load may touch the post where it takes hold or lets go" in record.getMessage()
 
 
 def test_where_another_entry_grasps_from_elsewhere_it_is_taken_if_it_means_the_same():
@@ -284,8 +284,9 @@ def overhang(beside, height):
 
 
 def disc(radius=0.05):
-    angles = np.linspace(0, 2 * np.pi, 24)
-    return np.column_stack([radius * np.cos(angles), radius * np.sin(angles), np.zeros(24)])
+    x, y = (axis.ravel() for axis in np.meshgrid(*[np.linspace(-radius, radius, 21)] * 2))
+    inside = np.hypot(x, y) <= radius
+    return np.column_stack([x, y, np.zeros_like(x)])[inside]
 
 
 @pytest.mark.parametrize(("height", "is_in_the_way"), [(0.15, True), (0.01, False), (0.6, False)])
@@ -301,7 +302,7 @@ def test_what_a_load_comes_down_through_is_in_its_way(height, is_in_the_way):
     assert "board" not in crowding(context.entries[0], targets, {"board": points["board"]}, 0.01)
 
 
-@pytest.mark.parametrize(("beside", "metres"), [(-0.09, 0.0), (-0.035, 0.02), (0.2, 0.0)])
+@pytest.mark.parametrize(("beside", "metres"), [(-0.12, 0.0), (-0.075, 0.01), (-0.07, 0.02), (0.2, 0.0)])
 def test_a_load_is_put_down_beside_what_overhangs_its_place_no_further_than_counts_as_there(beside, metres):
     context, poses, home = scene(None, 0.0)
     shown = replace(context.entries[0], outcomes=(ON_PLATE,))
@@ -316,3 +317,27 @@ def test_a_load_is_put_down_beside_what_overhangs_its_place_no_further_than_coun
         is_put = target.key_pose.phase in ("pre-place", "place", "release", "retreat")
         aside = [*plan.aside, 0.0] if is_put else np.zeros(3)
         assert_allclose(target.T_world_ee[:3, 3] - before.T_world_ee[:3, 3], aside, atol=1e-12)
+
+
+def test_a_handle_is_no_load():
+    cabinet = {"cabinet": np.eye(4)}
+    shown = handle(KINDS["slide"])
+    targets = transfer(shown, cabinet, {}, HOME)
+    points = {"cabinet": pillar(0.1, 0.0, 0.3), "vase": pillar(0.1, 0.0, 0.6)}
+    assert crowding(shown, targets, points, RADIUS) == crowding(
+        shown, targets, {"vase": points["vase"]}, RADIUS
+    )
+
+
+def test_what_was_put_aside_is_where_it_should_be_until_its_place_moves():
+    context, poses, home = scene(None, 0.0)
+    shown = replace(context.entries[0], outcomes=(ON_PLATE,))
+    plan = replace(Plan(shown, poses, home), aside=(0.02, 0.0))
+    ended = poses | {"bowl": se3.from_yaw([0.02, 0.0, 0.0], 0.0) @ poses["plate"]}
+    assert_allclose(plan.as_if_in_place(ended)["bowl"], poses["plate"], atol=1e-12)
+    assert_allclose(plan.as_if_in_place(ended)["plate"], poses["plate"], atol=1e-12)
+    for name, metres, aside in (("plate", 0.01, 0.02), ("plate", 0.05, 0.0), ("bowl", 0.05, 0.02)):
+        there = {name: se3.from_yaw([metres, 0.0, 0.0], 0.0) @ poses[name]}
+        followed = plan.following(there)
+        assert followed.aside == (aside, 0.0)
+        assert_allclose(followed.object_poses[name], there[name])

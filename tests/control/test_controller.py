@@ -262,7 +262,7 @@ def test_an_object_that_jumps_under_the_hand_is_approached_from_above_again():
 
 
 def test_the_landmark_that_jumps_does_not_send_a_held_object_back():
-    perception, one = Perception(entry().object_poses), controller()
+    perception, one = Perception(entry().object_poses), controller(thin())
     hand = grasping(one, perception)
     one.executor.begin(one.executor.targets, hand, 5)  # over the plate, on the way down
     perception.object_poses["plate"] = shifted(entry().object_poses["plate"], 0.10)
@@ -271,7 +271,7 @@ def test_the_landmark_that_jumps_does_not_send_a_held_object_back():
     assert one.executor.targets[4].key_pose.phase == "pre-place"
     assert one.scene.tracker.held == {"bowl"}, "it is still in the hand, and would be missed"
     perception.object_poses["bowl"] = shifted(entry().object_poses["bowl"], -0.12)
-    watch(one, perception, Hand(hand.T_world_ee, 0.0), 10)
+    watch(one, perception, hand, 10)
     assert one.scene.tracker.held == frozenset()
     assert one.state.index == 0
 

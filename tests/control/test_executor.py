@@ -234,19 +234,32 @@ def test_a_via_point_that_is_blocked_is_left_behind():
 
 
 @pytest.mark.parametrize(
-    ("above", "beside", "is_let_go"), [(0.03, 0.0, True), (0.03, 0.04, False), (0.09, 0.0, False)]
+    ("above", "beside", "turned", "is_let_go"),
+    [
+        (0.03, 0.0, 0.0, True),
+        (0.03, 0.04, 0.0, False),
+        (0.09, 0.0, 0.0, False),
+        (0.03, 0.0, 0.5, False),
+        (0.001, 0.0, 0.25, False),
+    ],
 )
-def test_what_is_held_up_from_below_a_little_above_its_place_is_let_go_there(above, beside, is_let_go):
+def test_what_is_held_up_from_below_a_little_above_its_place_is_let_go_there(
+    above, beside, turned, is_let_go
+):
     executor = make()
     place = executor.targets[5]
     assert place.key_pose.phase == "place"
-    T = se3.transform(place.T_world_ee[:3, :3], place.T_world_ee[:3, 3] + [beside, 0.0, above])
+    R = (se3.from_yaw(np.zeros(3), turned) @ place.T_world_ee)[:3, :3]
+    T = se3.transform(R, place.T_world_ee[:3, 3] + [beside, 0.0, above])
     world = World(T, stuck=lambda _: True)
     world.opening = world.held
     executor.begin(executor.targets, world.hand, 5)
     run(executor, world, until=lambda e: e.state.index != 5 or e.state.attempts == 1)
     assert (executor.state.index == 6) == is_let_go
     assert (executor.state.attempts == 0) == is_let_go
+    if is_let_go:
+        assert_allclose(executor.present.T_world_ee, T)
+        assert executor.present.key_pose.phase == "release"
 
 
 def test_empty_fingers_after_the_grasp_ask_for_another_try():

@@ -29,8 +29,9 @@ SHORTEST_M = 0.03
 CLEARANCE_M = 0.03
 # ... and passes beside it at this many times its radius: a hand is wider across its fingers than on average.
 BESIDE = 1.5
-# What is put down comes straight down over this height, metres.
-FROM_ABOVE_M = 0.35
+# What is put down comes straight down over this height, metres. What is this near to it, seen from above, is
+# in its way.
+FROM_ABOVE_M, OVER_M = 0.35, 0.01
 # So many places of a way are compared with what stands about.
 STEPS = 24
 # Where the fingers close and open, the hand is beside objects.
@@ -107,7 +108,11 @@ class Standing:
 
     def pass_by(self, pose: MemoryKeyPose, T_world_ee: Array, entry: MemoryEntry) -> None:
         """Take in that a key pose of an entry was met, with the hand at ``T_world_ee`` ``(4, 4)``."""
-        if pose.phase == "grasp":
+        own = [other.phase for other in entry.key_poses if other.sub_task == pose.sub_task]
+        is_handle = "open" in own or "turn" in own
+        if pose.phase == "grasp" and is_handle:
+            self.grasped, self.is_held = pose.anchor.place, False
+        elif pose.phase == "grasp":
             self.grasped, self.is_held, self.T_world_grasp = pose.anchor.place, True, T_world_ee
         elif pose.phase == "release" and self.is_held:
             self.is_held = False
@@ -185,7 +190,7 @@ def crowding(
                 if own is not None and np.linalg.norm(other.mean(0) - own.mean(0)) < SAME_THING_M:
                     continue
                 inside = int(_inside(se3.apply(se3.inverse(T), other), radius).sum())
-                if own is not None and pose.phase == "release" and standing.is_held:
+                if own is not None and standing.is_held and pose.phase == "release" and -T[2, 2] > UPRIGHT:
                     down = se3.apply(T @ se3.inverse(standing.T_world_grasp), own)
                     inside += int(_over(down, other).sum())
                 found[name] = found.get(name, 0) + inside
@@ -202,10 +207,9 @@ def _inside(points: Array, radius: float) -> NDArray[np.bool_]:
 
 def _over(load: Array, points: Array) -> NDArray[np.bool_]:
     """Which points ``(n, 3)`` are in the way of a load ``(m, 3)`` that comes down to where it is put."""
-    low, high = load.min(0), load.max(0)
-    apart = np.linalg.norm(points[:, :2] - (low + high)[:2] / 2, axis=1)
-    height = points[:, 2] - low[2]
-    return (apart < (high - low)[:2].max() / 2) & (height > CLEARANCE_M) & (height < FROM_ABOVE_M)
+    apart = np.linalg.norm(points[:, None, :2] - load[None, :, :2], axis=-1).min(1)
+    height = points[:, 2] - load[:, 2].min()
+    return (apart < OVER_M) & (height > CLEARANCE_M) & (height < FROM_ABOVE_M)
 
 
 def _raised(pose: MemoryKeyPose, rise: float) -> MemoryKeyPose:

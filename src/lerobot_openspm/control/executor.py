@@ -28,9 +28,9 @@ MAX_CORRECTIONS, MAX_ATTEMPTS = 8, 3
 HELD_SHARE = 0.4
 # Where the demonstration's fingers stood further apart than this share of open, they held something.
 HOLDING_SHARE = 0.03
-# A hand that is held up this little above the place of what it carries, and this little beside, after so many
-# corrections, lets go there, metres.
-DROP_M, BESIDE_M, HELD_UP_CORRECTIONS = 0.06, 0.02, 3
+# What is carried is held up from below where the hand is so far above its place, from and to, at most so far
+# beside it, metres, and turned by at most so much, radians, after more than so many corrections.
+RISEN_M, DROP_M, BESIDE_M, LEANING_RAD, HELD_UP_CORRECTIONS = 0.012, 0.06, 0.02, 0.3, 3
 # A handle that has come along for less than this share of its way was not in the fingers.
 LEAST_TRAVEL = 0.05
 
@@ -153,6 +153,7 @@ class Executor:
         if self._is_held_up_from_below(hand):
             logger.info("letting go here: what is carried is held up from below")
             self._enter(self.state.index + 1, hand)
+            self._approach_target(replace(self.present, T_world_ee=hand.T_world_ee))
             return False
         if not is_used_up:
             return False
@@ -166,9 +167,11 @@ class Executor:
             return False
         if approach.corrections <= HELD_UP_CORRECTIONS or self.state.index + 1 == len(self.targets):
             return False
+        if float(se3.distances(hand.T_world_ee, present.T_world_ee)[1]) > LEANING_RAD:
+            return False
         above = hand.T_world_ee[:3, 3] - present.T_world_ee[:3, 3]
         is_letting_go = self.targets[self.state.index + 1].key_pose.phase == "release"
-        return is_letting_go and bool(0 < above[2] < DROP_M and np.hypot(*above[:2]) < BESIDE_M)
+        return is_letting_go and bool(RISEN_M < above[2] < DROP_M and np.hypot(*above[:2]) < BESIDE_M)
 
     def next_action(self, hand: Hand) -> Array | None:
         """The next canonical action ``(7,)``, or None when a chunk is needed (:meth:`query`)."""

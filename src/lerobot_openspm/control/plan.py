@@ -39,8 +39,8 @@ TURNS = tuple(
 # How long a retreat of our own is, metres: the first of these that the arm reaches.
 RETREATS_M = (RETREAT_M, RETREAT_M / 2, 0.0)
 # Where something overhangs the place of what is carried, it is put down beside it by one of
-# these, metres, in one of so many directions.
-ASIDE_M, ASIDE_DIRECTIONS = (0.01, 0.02, 0.03), 12
+# these, metres, in one of so many directions; as long as the place has not moved by so much.
+ASIDE_M, ASIDE_DIRECTIONS, ASIDE_KEPT_M = (0.01, 0.02, 0.03), 12, 0.03
 # Where an object is that was never seen.
 NOWHERE = se3.transform(np.eye(3), np.full(3, np.inf))
 
@@ -127,6 +127,22 @@ class Plan:
             for yaw in yaws
             if metres <= most
         ]
+
+    def following(self, moved: Mapping[str, Array]) -> Plan:
+        """The plan with some objects elsewhere, at poses ``T_world_obj`` ``(4, 4)``.
+
+        Beside a place that has moved, things may stand otherwise.
+        """
+        ends = {name for one in self.entry.served_outcomes for name in one.anchor.objects} & moved.keys()
+        went = [se3.distance(moved[name], self.object_poses.get(name, NOWHERE)) for name in ends]
+        aside = self.aside if all(metres < ASIDE_KEPT_M for metres in went) else (0.0, 0.0)
+        return replace(self, object_poses={**self.object_poses, **moved}, aside=aside)
+
+    def as_if_in_place(self, object_poses: Mapping[str, Array]) -> dict[str, Array]:
+        """Object poses, what was put aside moved back by as much, as its outcome is told."""
+        back = se3.from_yaw(np.array([-self.aside[0], -self.aside[1], 0.0]), 0.0)
+        aside = {one.target for one in self.entry.served_outcomes}
+        return {name: back @ T if name in aside else T for name, T in object_poses.items()}
 
     def followed(self, context: PlanningContext) -> tuple[Plan, list[str]]:
         """The plan, backing off as far as the arm reaches, and what keeps the hand from following it."""

@@ -157,7 +157,7 @@ class PlanningContext:
         plan, inside = min([*crowded, *self._beside(*min(crowded, key=_amount), points)], key=_amount)
         if not inside:
             return plan, []
-        logger.warning("%r: the hand may touch the %s where it takes hold or lets go",
+        logger.warning("%r: hand or load may touch the %s where it takes hold or lets go",
                        plan.entry.language, " and the ".join(inside))  # fmt: skip
         return plan, []
 

@@ -192,11 +192,14 @@ def _put_radians(turn: Turn, target: Target, shown: Mapping[str, Array]) -> floa
 
 def put_aside(targets: Sequence[Target], aside: Array) -> tuple[Target, ...]:
     """The same key poses, those that put something down shifted by x and y ``(2,)`` in the world, metres."""
+    poses = [target.key_pose for target in targets]
+    grasped = {pose.sub_task: pose.anchor.place for pose in poses if pose.phase == "grasp"}
     arrived: set[int] = set()
     shifted: list[Target] = []
     for target in targets:
         pose, T = target.key_pose, target.T_world_ee
-        if pose.phase in ARRIVING:
+        # A hand that rises over what it grasped is not there yet, and a handle is put nowhere.
+        if pose.phase in ("pre-place", "place") and pose.anchor.place != grasped.get(pose.sub_task):
             arrived.add(pose.sub_task)
         if pose.sub_task in arrived:  # a hand that backs off does so from there
             T_aside = se3.transform(T[:3, :3], T[:3, 3] + [*aside, 0.0])

@@ -149,7 +149,8 @@ class Perception:
         self.before = tuple(one.without(displaced) for one in self.before)
         look = look_at(sound, list(known), self.segmenter, hidden, expected, told_apart, self.before)
         estimates = self._localise(known, look)
-        self.remember(look, {name: one for name, one in estimates.items() if name not in displaced})
+        found = {name: one for name, one in estimates.items() if name not in displaced}
+        self.remember(look, found, is_still=not displaced)
         if not self._has_compared:  # once, as soon as all cameras are sound, by what is sought until then
             self._comparable |= known
             if not faults:
@@ -171,15 +172,16 @@ class Perception:
             self.in_vain = InVain(pictures, frozenset(look.told_apart), missed)
         return estimates
 
-    def remember(self, look: Look, estimates: Mapping[str, PoseEstimate]) -> None:
-        """Keep a look that found something, from elsewhere than the last one that was kept, or more than it.
+    def remember(self, look: Look, estimates: Mapping[str, PoseEstimate], is_still: bool = True) -> None:
+        """Keep a look that found something, from elsewhere than the last one that was kept.
 
+        Or, as long as nothing was displaced, one that found more from the same place, instead of that one.
         Of all but the first one only what the hand's cameras show: the others show the same again.
         """
         poses = {name: one.T_world_obj for name, one in estimates.items() if one.status == "found"}
         before = self.before
         if before and not _is_elsewhere(look, before[-1].look):
-            if not poses.keys() > before[-1].poses.keys():
+            if not is_still or not poses.keys() > before[-1].poses.keys():
                 return
             before = before[:-1]
         if poses:

@@ -264,6 +264,7 @@ class Tracker:
                 track.smoothed = self._smoothed(track.smoothed, belief.T[0])
                 return False
         if track.held and is_felt:
+            track.rival = None
             return False
         rival, track.rival = T_world_obj if track.doubted else track.rival, T_world_obj
         if rival is None or np.linalg.norm(rival[:3, 3] - T_world_obj[:3, 3]) > self.settings.agree_m:

@@ -57,6 +57,9 @@ LIFTED_M = 0.02
 # Of the typical agreement around where an object is expected: from here on it is seen there; below that it
 # is gone; in between something may hide it.
 KEPT_SHARE, GONE_SHARE = 0.7, 0.4
+# Where other things stood before it when it was found, fixed cameras showed less of it, but at least this
+# share of the typical agreement. A camera that has this share of its points in the picture should show it.
+LEAST_SHOWN_SHARE, IN_VIEW_SHARE = 0.25, 0.5
 # That it is where it was expected needs less evidence, if the pictures tell its place as sharply as this:
 # from this share on nothing is in doubt. What tells it more vaguely than that is no evidence. Metres.
 SURE_SHARE, SHARP_M, VAGUE_M = 0.8, 0.004, 0.008
@@ -194,8 +197,13 @@ class SurfaceModel:
     def _shown_before(self, look: Look, T_expected: Array) -> float:
         """The share of the typical agreement by fixed cameras when it was found where it is expected.
 
-        What stands before it hides as much of it from them now. 1 where there was no such look.
+        What stands before it hides as much of it from them now. 1 where there was no such look, where they
+        showed too little of it to tell, and where a camera of the hand should show it now.
         """
+        hand = {name: view for name, view in look.views.items() if view.camera.mount == "ee"}
+        points = se3.apply(T_expected, self.surface.coloured)
+        if hand and Look(hand).seen_share(points) > IN_VIEW_SHARE:
+            return 1.0
         for earlier in look.before:
             T = earlier.poses.get(self.name)
             if T is None or np.linalg.norm(T[:3, 3] - T_expected[:3, 3]) >= STILL_M:
@@ -205,7 +213,8 @@ class SurfaceModel:
             } & look.views.keys()
             sights = {k: sight for k, sight in self._sights(earlier.look).items() if k in fixed}
             if sights:
-                return min(1.0, score_at(self.surface, sights, _pose(T)) / self.typical_agreement)
+                share = score_at(self.surface, sights, _pose(T)) / self.typical_agreement
+                return share if LEAST_SHOWN_SHARE < share < 1 else 1.0
         return 1.0
 
     def _sights(self, look: Look) -> dict[str, Sight]:
