@@ -336,6 +336,10 @@ def test_what_was_put_aside_is_where_it_should_be_until_its_place_moves():
     ended = poses | {"bowl": se3.from_yaw([0.02, 0.0, 0.0], 0.0) @ poses["plate"]}
     assert_allclose(plan.as_if_in_place(ended)["bowl"], poses["plate"], atol=1e-12)
     assert_allclose(plan.as_if_in_place(ended)["plate"], poses["plate"], atol=1e-12)
+    # What is pushed was not put aside.
+    pushed = replace(plan, entry=replace(shown, key_poses=shown.key_poses[3:]))
+    assert pushed.asides() == []
+    assert_allclose(pushed.as_if_in_place(ended)["bowl"], ended["bowl"])
     for name, metres, aside in (("plate", 0.01, 0.02), ("plate", 0.05, 0.0), ("bowl", 0.05, 0.02)):
         there = {name: se3.from_yaw([metres, 0.0, 0.0], 0.0) @ poses[name]}
         followed = plan.following(there)

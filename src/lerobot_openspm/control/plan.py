@@ -23,7 +23,7 @@ from lerobot_openspm.control.transfer import (
 )
 from lerobot_openspm.geometry import se3
 from lerobot_openspm.geometry.se3 import Array
-from lerobot_openspm.memory.entry import MemoryEntry, MemoryKeyPose, RetrievalKey
+from lerobot_openspm.memory.entry import MemoryEntry, MemoryKeyPose, Outcome, RetrievalKey
 from lerobot_openspm.types import SubTask
 
 if TYPE_CHECKING:
@@ -119,7 +119,7 @@ class Plan:
 
     def asides(self) -> list[Plan]:
         """The plan, putting down what is carried beside its place, no further than counts as there."""
-        most = min((one.tolerance_m for one in self.entry.served_outcomes), default=0.0)
+        most = min((one.tolerance_m for one in self._puts), default=0.0)
         yaws = np.linspace(0, 2 * np.pi, ASIDE_DIRECTIONS, endpoint=False)
         return [
             replace(self, aside=(metres * float(np.cos(yaw)), metres * float(np.sin(yaw))))
@@ -133,7 +133,7 @@ class Plan:
 
         Beside a place that has moved, things may stand otherwise.
         """
-        ends = {name for one in self.entry.served_outcomes for name in one.anchor.objects} & moved.keys()
+        ends = {name for one in self._puts for name in one.anchor.objects} & moved.keys()
         went = [se3.distance(moved[name], self.object_poses.get(name, NOWHERE)) for name in ends]
         aside = self.aside if all(metres < ASIDE_KEPT_M for metres in went) else (0.0, 0.0)
         return replace(self, object_poses={**self.object_poses, **moved}, aside=aside)
@@ -141,8 +141,14 @@ class Plan:
     def as_if_in_place(self, object_poses: Mapping[str, Array]) -> dict[str, Array]:
         """Object poses, what was put aside moved back by as much, as its outcome is told."""
         back = se3.from_yaw(np.array([-self.aside[0], -self.aside[1], 0.0]), 0.0)
-        aside = {one.target for one in self.entry.served_outcomes}
+        aside = {one.target for one in self._puts}
         return {name: back @ T if name in aside else T for name, T in object_poses.items()}
+
+    @property
+    def _puts(self) -> list[Outcome]:
+        """The outcomes of what is grasped and put somewhere; what is pushed is put nowhere."""
+        grasped = {(p.sub_task, p.anchor.place) for p in self.entry.key_poses if p.phase == "grasp"}
+        return [one for one in self.entry.served_outcomes if (one.sub_task, one.target) in grasped]
 
     def followed(self, context: PlanningContext) -> tuple[Plan, list[str]]:
         """The plan, backing off as far as the arm reaches, and what keeps the hand from following it."""

@@ -202,8 +202,7 @@ def put_aside(targets: Sequence[Target], aside: Array) -> tuple[Target, ...]:
         if pose.phase in ("pre-place", "place") and pose.anchor.place != grasped.get(pose.sub_task):
             arrived.add(pose.sub_task)
         if pose.sub_task in arrived:  # a hand that backs off does so from there
-            T_aside = se3.transform(T[:3, :3], T[:3, 3] + [*aside, 0.0])
-            target = replace(target, T_world_ee=T_aside)
+            target = replace(target, T_world_ee=se3.transform(T[:3, :3], T[:3, 3] + [*aside, 0.0]))
         shifted.append(target)
     return tuple(shifted)
 
