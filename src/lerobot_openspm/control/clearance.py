@@ -13,6 +13,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import KDTree
 
 from lerobot_openspm.control.transfer import Target
 from lerobot_openspm.geometry import se3
@@ -207,9 +208,13 @@ def _inside(points: Array, radius: float) -> NDArray[np.bool_]:
 
 def _over(load: Array, points: Array) -> NDArray[np.bool_]:
     """Which points ``(n, 3)`` are in the way of a load ``(m, 3)`` that comes down to where it is put."""
-    apart = np.linalg.norm(points[:, None, :2] - load[None, :, :2], axis=-1).min(1)
     height = points[:, 2] - load[:, 2].min()
-    return (apart < OVER_M) & (height > CLEARANCE_M) & (height < FROM_ABOVE_M)
+    low, high = load[:, :2].min(0) - OVER_M, load[:, :2].max(0) + OVER_M
+    over = (height > CLEARANCE_M) & (height < FROM_ABOVE_M)
+    over &= ((points[:, :2] > low) & (points[:, :2] < high)).all(1)
+    apart, _ = KDTree(load[:, :2]).query(points[over, :2])
+    over[over] = apart < OVER_M
+    return over
 
 
 def _raised(pose: MemoryKeyPose, rise: float) -> MemoryKeyPose:
