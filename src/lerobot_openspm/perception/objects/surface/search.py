@@ -270,8 +270,10 @@ def refine(
     """
     pose, score = np.array(pose, float), 0.0
     beside = [(a, b) for a in (-1, 0, 1) for b in (-1, 0, 1) if a or b]
+    samples, sampled_at = dict[str, Sample](), np.full(4, np.nan)
     for metres, radians in steps:
-        samples = samples_at(surface, sights, pose, count)
+        if (pose != sampled_at).any():  # what has not moved looks as before
+            samples, sampled_at = samples_at(surface, sights, pose, count), pose
         if not samples:
             return Place(pose, 0.0)
         moves = [np.zeros(4), *(np.array([a * metres, b * metres, 0.0, 0.0]) for a, b in beside)]
