@@ -2,7 +2,7 @@
 
 .DEFAULT_GOAL := setup
 .NOTPARALLEL:
-.PHONY: help setup egl demo figures tables libero libero-setup check test test-slow guard lint typecheck format clean
+.PHONY: help setup egl demo figures tables libero libero-setup check test test-all guard lint typecheck format clean
 
 # The demo's total time counts the set-up, so the clock starts before anything else does.
 STARTED_AT := $(shell date +%s)
@@ -60,10 +60,9 @@ check: lint test ## lint and test: what has to be green before a commit
 test: egl ## run the tests, without those marked slow, libero or gpu (PYTEST_ARGS=... adds arguments)
 	@OMP_NUM_THREADS=1 $(BIN)/python -m pytest $(TWO_PROCESSES) $(PYTEST_ARGS)
 
-# Properties run again here, on more examples than in the default tests.
-test-slow: egl ## run the slow tests, and let the properties explore (PYTEST_ARGS=--hypothesis-seed=0 repeats a run)
+test-all: egl ## run the slow tests too, and let the properties explore (PYTEST_ARGS=--hypothesis-seed=0 repeats a run)
 	@OMP_NUM_THREADS=1 HYPOTHESIS_PROFILE=explore $(BIN)/python -m pytest $(TWO_PROCESSES) \
-		-m "(slow or hypothesis) and not libero and not gpu" $(PYTEST_ARGS)
+		-m "not libero and not gpu" $(PYTEST_ARGS)
 
 guard: $(if $(filter libero,$(SUITE)),libero-setup,egl) ## record, train and run episodes of SUITE (tabletop or libero) from pixels; fails below the success floor
 	@$(BIN)/python -m benchmarks.guard --suite=$(SUITE)
