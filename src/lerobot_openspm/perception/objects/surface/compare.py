@@ -18,7 +18,6 @@ from scipy.spatial import KDTree
 from lerobot_openspm.geometry.se3 import Array
 from lerobot_openspm.perception.objects.surface.backdrop import Float32, pixels_of
 from lerobot_openspm.perception.objects.surface.carving import spread
-from lerobot_openspm.perception.objects.surface.relief import WEIGHTS
 from lerobot_openspm.perception.objects.surface.sight import FINEST, LIKE_COARSE, Sight, Surface
 from lerobot_openspm.types import Mask
 
@@ -106,11 +105,10 @@ def take_sample(surface: Surface, sight: Sight, pose: Array, count: int) -> Samp
     facing = ((world - T[:3, 3]) * (surface.normals @ R.T)).sum(1) < 0
     visible = np.zeros(len(world), bool)
     visible[inside] = depth[inside] <= drawn[rows - top, columns - left] + 1.5 * surface.spacing
-    visible &= facing & np.isfinite(surface.colours[:, 0, 0])
+    visible &= facing & surface.has_colour
     own = np.flatnonzero(visible)
     if len(own) < MIN_POINTS:
         return None
-    colours = surface.colours * WEIGHTS
     rim, edge = _rim(np.isfinite(drawn), radius, beyond, np.array([left, top]), count // 2, u[own], v[own])
     rays = np.stack(
         [(rim[:, 0] - camera.cx) / camera.fx, (rim[:, 1] - camera.cy) / camera.fy, np.ones(len(rim))], -1
@@ -118,8 +116,8 @@ def take_sample(surface: Surface, sight: Sight, pose: Array, count: int) -> Samp
     beside = (rays * depth[own[edge], None]) @ T[:3, :3].T + T[:3, 3]
     chosen = spaced(own, count)
     return Sample(
-        surface.points[chosen].astype(np.float32), colours[chosen].astype(np.float32),
-        ((beside - t) @ R).astype(np.float32), colours[own[edge]].astype(np.float32),
+        surface.points[chosen].astype(np.float32), surface.weighted[chosen].astype(np.float32),
+        ((beside - t) @ R).astype(np.float32), surface.weighted[own[edge]].astype(np.float32),
         min(1.0, len(own) / (WHOLE_SHARE * len(surface.coloured))), _octave(surface, sight, depth[own]),
         surface.pattern,
     )  # fmt: skip

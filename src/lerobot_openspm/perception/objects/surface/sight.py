@@ -49,9 +49,19 @@ class Surface:
     pattern: float = 1.0
 
     @cached_property
+    def has_colour(self) -> Mask:
+        """Which of the points have colours ``(n,)``."""
+        return np.isfinite(self.colours[:, 0, 0])
+
+    @cached_property
     def coloured(self) -> Array:
         """The points ``(n, 3)`` that have colours."""
-        return self.points[np.isfinite(self.colours[:, 0, 0])]
+        return self.points[self.has_colour]
+
+    @cached_property
+    def weighted(self) -> Float32:
+        """Its colours ``(n, 2, 3)`` as they are compared."""
+        return self.colours * WEIGHTS
 
     @cached_property
     def middle(self) -> Array:
@@ -65,7 +75,7 @@ class Surface:
     @cached_property
     def palette(self) -> Float32:
         """Weighted CIELAB ``(k, 3)`` of its colours, one for each that is :data:`LIKE_COARSE` from others."""
-        seen = (self.colours[np.isfinite(self.colours[:, 0, 0])] * WEIGHTS).reshape(-1, 3)
+        seen = self.weighted[self.has_colour].reshape(-1, 3)
         return np.unique(np.rint(seen / LIKE_COARSE), axis=0).astype(np.float32) * np.float32(LIKE_COARSE)
 
     @cached_property
