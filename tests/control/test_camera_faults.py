@@ -1,7 +1,7 @@
 """A camera that fails: gone without, then waited for, then given up."""
 
 import pytest
-from tests.control.test_controller import HAND, STEP_S, Perception, controller, observe, watch
+from tests.control.acting import HAND, STEP_S, Perception, controller, observe, watch
 from tests.memory.builders import entry
 
 from lerobot_openspm.control.scene import BLIND_S, GIVE_UP_S, LOOK_AGAIN_S

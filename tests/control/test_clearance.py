@@ -3,7 +3,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
-from tests.control.test_controller import HAND, Perception, controller, observe
+from tests.control.acting import HAND, Perception, controller, observe
 from tests.control.test_going_back import KINDS, ON_PLATE, handle
 from tests.control.test_reach import chosen, scene
 from tests.memory.builders import entry, hand_pose, pick_and_place

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
-from tests.control.test_controller import (
+from tests.control.acting import (
     HAND,
     LOOK_AGAIN_STEPS,
     Perception,

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
-from tests.control.test_controller import HAND, Perception, controller, observe, watch
+from tests.control.acting import HAND, Perception, controller, observe, watch
 from tests.memory.builders import entry, hand_pose, key_pose, pick_and_place
 
 from lerobot_openspm.control.scene import GIVE_UP_S

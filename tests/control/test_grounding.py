@@ -2,7 +2,7 @@ import dataclasses
 
 import numpy as np
 import pytest
-from tests.control.test_controller import HAND, Perception, controller, observe, planning_context
+from tests.control.acting import HAND, Perception, controller, observe, planning_context
 from tests.memory.builders import entry
 
 from lerobot_openspm.control.grounding import Grounding, demonstrations, references

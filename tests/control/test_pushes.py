@@ -6,7 +6,7 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose
-from tests.control.test_controller import HAND, Perception, controller, observe, shifted, watch
+from tests.control.acting import HAND, Perception, controller, observe, shifted, watch
 from tests.memory.builders import entry, hand_pose, key_pose, robot
 
 from lerobot_openspm.control.executor import MAX_ATTEMPTS, Executor
