@@ -10,10 +10,11 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import KDTree
+from scipy.spatial import KDTree  # pyright: ignore[reportMissingTypeStubs]
 
 from lerobot_openspm.control.transfer import Target
 from lerobot_openspm.geometry import se3
@@ -212,8 +213,8 @@ def _over(load: Array, points: Array) -> NDArray[np.bool_]:
     low, high = load[:, :2].min(0) - OVER_M, load[:, :2].max(0) + OVER_M
     over = (height > CLEARANCE_M) & (height < FROM_ABOVE_M)
     over &= ((points[:, :2] > low) & (points[:, :2] < high)).all(1)
-    apart, _ = KDTree(load[:, :2]).query(points[over, :2])
-    over[over] = apart < OVER_M
+    tree: Any = KDTree(load[:, :2])
+    over[over] = tree.query(points[over, :2])[0] < OVER_M
     return over
 
 
