@@ -302,6 +302,18 @@ def test_what_a_load_comes_down_through_is_in_its_way(height, is_in_the_way):
     assert "board" not in crowding(context.entries[0], targets, {"board": points["board"]}, 0.01)
 
 
+def test_a_load_of_many_points_is_compared_in_little_time_and_memory():
+    context, poses, home = scene(None, 0.0)
+    targets = Plan(context.entries[0], poses, home).targets(context)
+    points = {
+        "bowl": se3.apply(poses["bowl"], disc()),
+        "board": se3.apply(poses["plate"], overhang(0.1, 0.15)),
+    }
+    few = crowding(context.entries[0], targets, points, 0.01)
+    many = {name: np.tile(own, (200, 1)) for name, own in points.items()}
+    assert crowding(context.entries[0], targets, many, 0.01) == {"board": 200 * few["board"]}
+
+
 @pytest.mark.parametrize(("beside", "metres"), [(-0.12, 0.0), (-0.075, 0.01), (-0.07, 0.02), (0.2, 0.0)])
 def test_a_load_is_put_down_beside_what_overhangs_its_place_no_further_than_counts_as_there(beside, metres):
     context, poses, home = scene(None, 0.0)
