@@ -15,7 +15,7 @@ from typing import Any
 
 from benchmarks.libero.accuracy import accuracy
 from benchmarks.libero.evaluate import SEED, STATES, EvaluationConfig, evaluate, summary
-from benchmarks.libero.variants import PRO_SUITES
+from benchmarks.libero.variants import EXCHANGED, PRO_SUITES
 from benchmarks.results import run, write
 from benchmarks.stages import DEMOS, LIBERO, dataset, policy
 from lerobot_openspm.cli.pipeline import THREADS
@@ -29,7 +29,7 @@ class ProConfig:
         suite: libero_goal_swap, libero_goal_lan or libero_goal_object.
         states: Initial states a task, from the first on.
         task: A task's name, several with commas, or "all".
-        tuning: Take scenes of our own, drawn from tuning seeds, instead of LIBERO-PRO's.
+        tuning: Take exchanges of our own, drawn from tuning seeds, instead of LIBERO-PRO's.
     """
 
     suite: str = PRO_SUITES[0]
@@ -42,6 +42,8 @@ class ProConfig:
             raise ValueError(f"suite is {self.suite!r}, expected one of {', '.join(PRO_SUITES)}")
         if not 1 <= self.states <= STATES:
             raise ValueError(f"states must be 1 to {STATES}, got {self.states}")
+        if self.tuning and self.suite != EXCHANGED:
+            raise ValueError(f"tuning is for {EXCHANGED}, got {self.suite}")
 
 
 def main(config: ProConfig) -> dict[str, Any]:

@@ -21,7 +21,7 @@ from benchmarks.harness import Row, checkpoint_files, measured_folder, resume
 from benchmarks.libero import contacts, failures, pro_objects, variants
 from benchmarks.libero.contacts import Contacts, shares, task_objects
 from benchmarks.libero.failures import Grips, counts, failure_kind
-from benchmarks.libero.variants import exchanged, variant_file, variant_states
+from benchmarks.libero.variants import EXCHANGED, PRO_SUITES, exchanged, variant_file, variant_states
 from benchmarks.results import run
 from benchmarks.worlds import LIBERO_IMAGE_SIZE, LiberoWorld
 
@@ -68,6 +68,12 @@ class EvaluationConfig:
     tuning_seed: int = TUNING_SEED
     workers: int = 2
     execution: Execution | None = None
+
+    def __post_init__(self) -> None:
+        if self.suite not in (SUITE, *PRO_SUITES):
+            raise ValueError(f"suite is {self.suite!r}, expected one of {', '.join((SUITE, *PRO_SUITES))}")
+        if self.tuning and self.suite not in (SUITE, EXCHANGED):
+            raise ValueError(f"tuning scenes are drawn for {SUITE} and {EXCHANGED}, not for {self.suite}")
 
 
 def main(config: EvaluationConfig) -> dict[str, Any]:

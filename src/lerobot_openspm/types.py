@@ -239,7 +239,7 @@ class SubTask:
 
 @dataclass(frozen=True)
 class Fault:
-    """What is wrong with a camera, and seconds since its last usable image."""
+    """What is wrong with a camera, and seconds since its last usable image, infinite if it never gave one."""
 
     reason: str
     seconds: float

@@ -23,6 +23,7 @@ PLACED = re.compile(r"\(On (\w+) main_table_(\w+)\)")
     [
         ({"suite": "libero_goal"}, "suite is 'libero_goal'"),
         ({"states": 51}, "states must be 1 to 50, got 51"),
+        ({"suite": "libero_goal_lan", "tuning": True}, "tuning is for libero_goal_swap, got libero_goal_lan"),
     ],
 )
 def test_what_cannot_be_measured_is_refused_before_anything_is_learned(options, message):

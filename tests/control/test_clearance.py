@@ -3,7 +3,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
-from tests.control.acting import HAND, Perception, controller, observe
+from tests.control.acting import HAND, Perception, controller, observe, planning_context
 from tests.control.test_going_back import KINDS, ON_PLATE, handle
 from tests.control.test_reach import chosen, scene
 from tests.memory.builders import entry, hand_pose, pick_and_place
@@ -90,6 +90,20 @@ def test_an_empty_hand_comes_down_beyond_a_post_on_its_first_way():
     assert targets[0].key_pose.phase == "approach"
     assert_allclose(targets[0].T_world_ee[:2, 3], plain[0].T_world_ee[:2, 3])
     assert_allclose(targets[0].T_world_ee[2, 3], 0.25 + CLEARANCE_M)
+
+
+@pytest.mark.parametrize("is_half_turned", [False, True])
+def test_a_hand_that_begins_too_low_rises_where_it_is_and_crosses_at_one_height(is_half_turned):
+    low, post = hand_pose(-0.3, 0.0, 0.1), pillar(0.0, 0.0, 0.25)
+    poses = {name: se3.from_yaw([x, 0.0, 0.0], 0.7) for name, x in (("bowl", 0.2), ("plate", 0.4))}
+    context = planning_context(points={"post": post}, hand_radius_m=0.05)
+    plan = Plan(entry(), poses | {"post": np.eye(4)}, low, is_half_turned=is_half_turned)
+    plain = plan.targets(context)
+    rise, over, *rest = context.clear(plan).targets(context)
+    for one, below in ((rise, low), (over, plain[0].T_world_ee)):
+        assert_allclose(one.T_world_ee[:3, 3], [*below[:2, 3], 0.25 + CLEARANCE_M], atol=1e-9)
+        assert_allclose(one.T_world_ee[:3, :3], plain[0].T_world_ee[:3, :3], atol=1e-9)
+    assert_allclose([one.T_world_ee for one in rest], [one.T_world_ee for one in plain], atol=1e-9)
 
 
 PLACES = {"bowl": (-0.2, 0.2), "plate": (0.2, 0.0), "cup": (-0.2, -0.2), "tray": (0.2, 0.3)}
@@ -260,6 +274,17 @@ def test_where_another_entry_grasps_from_elsewhere_it_is_taken_if_it_means_the_s
         found = poses | {"post": place}
         plan, problems = context.choose(context.rank(both, found, home), found, home)
         assert (plan.entry.source, problems) == (taken, [])
+
+
+def test_what_is_out_of_reach_is_not_exchanged_for_another_thing():
+    shown, other = entry(), entry("put the mug on the plate")
+    context = planning_context(shown, other)
+    poses = {**shown.object_poses, "mug": shown.object_poses["bowl"], "bowl": se3.from_yaw([5.0, 0, 0], 0.0)}
+    both = [Candidate(one, 1.0, one, one.key.sub_tasks) for one in (shown, other)]
+    ranked = sorted(context.rank(both, poses, HOME), key=lambda one: one.entry is other)
+    plan, problems = context.choose(ranked, poses, HOME)
+    assert plan.entry is shown
+    assert problems
 
 
 def test_a_way_that_cannot_be_lifted_is_gone_straight_and_that_is_said(caplog):

@@ -153,8 +153,9 @@ def lifted(
             near = {grasped, *pose.anchor.objects, *(previous.anchor.objects if previous else ())}
             others = {name: own for name, own in standing.points.items() if name not in near}
             height, names = way.crossing(others, BESIDE * radius)
-            if previous and height > way.start[2]:
-                poses.append(_above(previous, height - way.start[2], pose))
+            if height > way.start[2]:
+                rise = height - way.start[2]
+                poses.append(_above(previous, rise, pose) if previous else _risen(pose, T, way.start, rise))
             if height > way.goal[2]:
                 poses.append(_raised(pose, height - way.goal[2]))
             crossed |= dict.fromkeys(names)
@@ -237,6 +238,14 @@ def _above(previous: MemoryKeyPose, rise: float, towards: MemoryKeyPose) -> Memo
         opening=towards.opening,
         confidence=towards.confidence,
     )
+
+
+def _risen(first: MemoryKeyPose, T_world_ee: Array, start: Array, rise: float) -> MemoryKeyPose:
+    """A key pose above the place ``(3,)`` where the hand begins, turned as at its first one ``(4, 4)``."""
+    R_world_anchor = T_world_ee[:3, :3] @ first.T_obj_ee[:3, :3].T
+    away = start + np.array([0.0, 0.0, rise]) - T_world_ee[:3, 3]
+    T = se3.transform(first.T_obj_ee[:3, :3], first.T_obj_ee[:3, 3] + R_world_anchor.T @ away)
+    return replace(first, T_obj_ee=T, n_steps=1, dwell=False, axis=None, covariance=None)
 
 
 def _below(T_world_ee: Array, points: Array | None) -> float:

@@ -17,7 +17,7 @@ from lerobot_openspm.control.feasibility import (
 )
 from lerobot_openspm.control.plan import Plan
 from lerobot_openspm.control.pushes import pushed_by_landmark
-from lerobot_openspm.control.transfer import as_shown
+from lerobot_openspm.control.transfer import as_shown, half_turned
 from lerobot_openspm.geometry import se3
 from lerobot_openspm.geometry.se3 import Array
 from lerobot_openspm.language.meaning import means_the_same
@@ -124,8 +124,8 @@ class PlanningContext:
         """The best entry that the arm can follow, its grasps turned by an object's symmetry if need be.
 
         The hand goes the other way round, by half a turn about its approach axis, where nothing else does.
-        Where it would be in other objects as it takes hold or lets go, grasps are turned too, and entries
-        that mean the same are tried.
+        Where it would be in other objects as it takes hold or lets go, grasps are turned too. Then the next
+        entries are tried, of those that mean the same.
 
         Returns:
             The plan, and what keeps the hand from following it, in words. Where none of the first entries
@@ -144,7 +144,7 @@ class PlanningContext:
         for entry in (one.entry for one in ranked[:MAX_TRIED]):
             if any(name not in object_poses for name in entry.objects):
                 continue
-            if crowded and not self._mean_the_same(entry, crowded[0][0].entry):
+            if not self._mean_the_same(entry, first.entry):
                 continue
             for is_half_turned in (False, True):
                 plan = replace(first, entry=entry, is_half_turned=is_half_turned)
@@ -233,7 +233,10 @@ class PlanningContext:
         Where the arm cannot follow the lifted ways, the plan stays as it is, and that is said.
         """
         points = self._points(plan.object_poses)
-        entry, crossed = lifted(plan.entry, plan.targets(self), plan.T_world_ee, points, self.hand_radius_m)
+        targets = plan.targets(self)
+        if plan.is_half_turned:  # key poses are kept as the hand was before
+            targets = half_turned(targets)
+        entry, crossed = lifted(plan.entry, targets, plan.T_world_ee, points, self.hand_radius_m)
         if not crossed:
             return plan
         higher, problems = replace(plan, entry=entry).followed(self)

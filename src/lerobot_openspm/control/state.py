@@ -29,7 +29,7 @@ class Status(StrEnum):
     NO_PROGRESS = "no_progress"  # attempts are used up
     OBJECT_LOST = "object_lost"  # what is needed now was seen before and is gone; looked for until it is back
     NOT_UNDERSTOOD = "not_understood"  # nothing in the memory is about the instruction
-    CAMERA_FAULT = "camera_fault"  # a camera gave no sound picture for too long
+    CAMERA_FAULT = "camera_fault"  # no sound picture of a camera for too long, or views that disagree
 
 
 _PLANNING = {Status.RUNNING, Status.OBJECT_NOT_FOUND, Status.INFEASIBLE}

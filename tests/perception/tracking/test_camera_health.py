@@ -1,10 +1,13 @@
 import numpy as np
 import pytest
+import torch
 
 from lerobot_openspm.geometry import se3
 from lerobot_openspm.geometry.camera import Camera
-from lerobot_openspm.perception.tracking.camera_health import CameraWatch, disagreements
-from lerobot_openspm.types import View
+from lerobot_openspm.perception.observation import Observation
+from lerobot_openspm.perception.pipeline import Perception
+from lerobot_openspm.perception.tracking.camera_health import MIN_COMMON, CameraWatch, disagreements
+from lerobot_openspm.types import Hand, PoseEstimate, View
 
 DOWN = np.diag([1.0, -1.0, -1.0])
 T_WORLD_CAM = se3.transform(DOWN, [0.0, 0.0, 1.0])  # looks down at the table
@@ -138,3 +141,48 @@ def test_of_several_like_objects_any_may_be_the_one_that_the_other_camera_shows(
     both = shown(1)
     both["bowl"].insert(0, np.array([0.5, 0.5]))
     assert disagreements({"front": both, "side": shown(2)}) == {}
+
+
+class Masked:
+    """An object that is found by a segmenter's masks alone."""
+
+    points, on_things = np.zeros((0, 3)), False
+
+    def __init__(self, name):
+        self.name, self.cameras = name, []
+
+    def localise(self, look):
+        look.instances_of(self.name)
+        self.cameras.append(sorted(look.views))
+        return PoseEstimate("found", np.eye(4), 1e-6 * np.eye(4), 1.0)
+
+
+class Segmenter:
+    def segment(self, views, phrases):
+        return {phrase: dict.fromkeys(views, ()) for phrase in phrases}
+
+
+class World:
+    perception, simulator_objects = "demonstrations", ()
+
+    def __init__(self):
+        self.cameras = dict.fromkeys(("front", "side"), CAMERA)
+        self.objects = {name: Masked(name) for name in NAMES[:4]}
+
+
+def observed(**levels):
+    images = {
+        camera: torch.as_tensor(view(seed, level=levels.get(camera)).image.transpose(2, 0, 1).copy()) / 255
+        for seed, camera in enumerate(("front", "side"))
+    }
+    return Observation("", np.zeros(8), Hand(hand(), 0.08), images, None)
+
+
+@pytest.mark.parametrize("asked", [NAMES[1:3], NAMES[1:4]])
+def test_views_are_compared_by_what_the_segmenter_was_asked_for(asked):
+    world = World()
+    perception = Perception(world, 0.08, Segmenter())
+    perception.detect(observed(front=0), NAMES[:2], {}, 0.0)  # one camera is dark
+    assert perception.detect(observed(), asked, {}, 0.1).faults == {}
+    compared = {name for name, one in world.objects.items() if ["front"] in one.cameras}
+    assert compared == (set(asked) if len(asked) >= MIN_COMMON else set())

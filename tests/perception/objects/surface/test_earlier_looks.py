@@ -5,7 +5,8 @@ import dataclasses
 import numpy as np
 import torch
 from numpy.testing import assert_allclose
-from tests.perception.objects.surface.filmed import HOME, looking_down, moved, views_at
+from tests.perception.drawn_world import SHAPES, hand_camera, render
+from tests.perception.objects.surface.filmed import HOME, MIDDLES, looking_down, moved, views_at
 
 from lerobot_openspm.geometry import se3
 from lerobot_openspm.geometry.camera import project
@@ -49,7 +50,7 @@ def test_earlier_looks_do_not_hold_back_what_has_moved(models):
         assert radians < 0.1
 
 
-def behind_a_board(views, T):
+def behind_a_board(views, T, edge=-3):
     """The views, a board of another colour standing before most of what is at a pose in the fixed cameras."""
     covered = {}
     for name, view in views.items():
@@ -57,7 +58,7 @@ def behind_a_board(views, T):
         if name != "hand":
             uv, _ = project(view.camera, view.T_world_cam, T[:3, 3] + [0.0, 0.0, 0.03])
             column, row = np.rint(uv).astype(int)
-            image[max(0, row - 40) : row + 40, max(0, column - 40) : column - 3] = (30, 160, 60)
+            image[max(0, row - 40) : row + 40, max(0, column - 40) : column + edge] = (30, 160, 60)
         covered[name] = dataclasses.replace(view, image=image)
     return covered
 
@@ -79,6 +80,20 @@ def test_what_a_fixed_camera_shows_no_less_of_than_when_it_was_found_is_still_th
         off.append(float(np.linalg.norm(seen.T_world_obj[:3, 3] - T[:3, 3])))
     # Without the earlier look it is sought elsewhere, and so is what is gone.
     assert off[0] < 0.003 < min(off[1:])
+
+
+def test_a_hidden_one_of_two_alike_is_not_where_the_other_one_stands(models):
+    model, scene = models["block"], moved(0.12, 0.12, 0.3)
+    T = model.localise(Look(views_at(scene, looking_down(*HOME)))).T_world_obj
+    other = se3.from_yaw([*MIDDLES["block"][:2], 0.0], 0.0)  # where blocks stood in the demonstrations
+    both = [(SHAPES["block"], scene["block"]), (SHAPES["block"], other)]
+    views = render(both, None, hand_camera(looking_down(0.3, -0.3, 0.2)))
+    views = behind_a_board(views, scene["block"], edge=-5)
+    alone = model.localise(Look(views, expected={"block": T}))
+    assert_allclose(alone.T_world_obj[:2, 3], other[:2, 3], atol=0.01)
+    told = model.localise(Look(views, expected={"block": T}, told_apart={"block"}))
+    assert (told.status, told.visible) == ("not_found", 0.0)
+    assert_allclose(told.T_world_obj[:2, 3], T[:2, 3], atol=0.01)
 
 
 def test_what_the_hand_alone_has_found_is_seen_to_be_gone(models):

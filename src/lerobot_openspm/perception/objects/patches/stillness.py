@@ -62,7 +62,7 @@ def _hardly_moves(scenes: Sequence[DemonstrationScene], name: str) -> float | No
 
 
 def places_of(cues: Iterable[ContactCue]) -> list[list[ContactCue]]:
-    """Hints grouped by the place on the object that they touch."""
+    """Contact cues grouped by the place on the object that they touch."""
     groups: dict[tuple[str, str], list[ContactCue]] = {}
     for cue in cues:
         groups.setdefault((cue.kind, cue.place), []).append(cue)

@@ -31,8 +31,8 @@ DETAIL_SHARE = 0.5
 BLOCKED_WEIGHT, BLOCKED_EVIDENCE = 0.5, 0.1
 # What the colours going on around the silhouette cost.
 RIM_COST = 0.6
-# A surface may end this share of its points' distance before the object does; the rim lies so many pixels,
-# from and to, beyond that.
+# An object may reach beyond its outermost points by this share of their distance. The rim, which has to look
+# otherwise than the object, begins and ends so many pixels outside of that.
 BEYOND, RIM_PX = 1.0, (0, 2)
 # What colours that do not vary over the object as expected cost, if they are to vary by much more than this.
 PATTERN_COST, PATTERN_STD, PATTERN_BLOCKED = 0.6, 3.0, 0.3

@@ -242,7 +242,7 @@ def _agreements(surface: Surface, standing: FirstSights, backdrop: Backdrop) -> 
 
 def _best_on_table(surface: Surface, sights: Mapping[str, Sight], backdrop: Backdrop, height: float) -> float:
     """How well the best place on the table agrees, for a frame at a world z, turned anyhow."""
-    ground = over_table(surface, backdrop.reach, (height,))
+    ground = over_table(surface, backdrop.reach, height)
     return search(surface, sights, ground, YAWS, Freedom(turns=True))[0].score
 
 

@@ -144,12 +144,16 @@ class SurfaceModel:
         near_score = 0.0
         if near.status == "found":
             near_score = score_at(self.surface, sights, _pose(near.T_world_obj))
-            if near_score >= BELIEVED_SHARE * self.typical_agreement:
-                return near
+        is_near = near_score >= BELIEVED_SHARE * self.typical_agreement
+        # Of two alike, another one may stand where this one was shown.
+        if is_near and (expected is None or self.name not in look.told_apart):
+            return near
         if expected is not None:
             there = there or self._at(look, expected)
             if there.confidence >= GONE_SHARE * self._shown_before(look, expected):
                 return _followed(there)
+        if is_near:
+            return near
         places = self._anywhere(look, sights)
         if near_score > BETTER_SHARE * places[0].score:  # something may stand on it
             return replace(near, confidence=min(near.confidence, near_score / self.typical_agreement))
@@ -247,7 +251,7 @@ class SurfaceModel:
         return sorted(places, key=lambda place: -likelihood(self.surface, place))
 
     def _on_table(self, sights: Mapping[str, Sight], several: bool = False) -> list[Place]:
-        ground = over_table(self.surface, self.backdrop.reach, (self.height,))
+        ground = over_table(self.surface, self.backdrop.reach, self.height)
         return search(self.surface, sights, ground, self._yaws, self._freedom, several)
 
     def _on_things(self, supports: Array, sights: Mapping[str, Sight], several: bool = False) -> list[Place]:

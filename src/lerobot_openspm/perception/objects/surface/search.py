@@ -31,6 +31,8 @@ CORE_SHARE = 0.7
 AROUND_SHARE, AROUND_COST = 1.8, 0.5
 # Of all places these, where most looks like the object, are compared in every direction.
 KEPT_PLACES, MIN_PLACES, MAX_PLACES = 0.3, 600, 2000
+# Places that are refined for the demonstrated direction and for each other one, how many of them are refined
+# finely, and how many for each direction where several of a kind are sought.
 STARTS_PER_YAW, BEST_PER_YAW, FINALISTS, MANY = 6, 2, 3, 12
 # All demonstrations show an object turned alike. Turned otherwise by more than this many radians, its
 # agreement counts this share; that of a large object this one, since what is seen of it is only a part.
@@ -149,9 +151,9 @@ def _distinct(scored: Array, metres: float, count: int) -> Array:
     return np.array(chosen)
 
 
-def over_table(surface: Surface, area: Array, heights: Sequence[float]) -> Array:
-    """Places ``(q, 3)`` all over an area, least and largest x and y ``(2, 2)``, to be searched."""
-    axes = [*(np.arange(low, high, _step(surface)) for low, high in area.T), np.asarray(heights)]
+def over_table(surface: Surface, area: Array, height: float) -> Array:
+    """Places ``(q, 3)`` at a height all over an area, least and largest x and y ``(2, 2)``, for a search."""
+    axes = [*(np.arange(low, high, _step(surface)) for low, high in area.T), np.array([height])]
     return np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 3)
 
 

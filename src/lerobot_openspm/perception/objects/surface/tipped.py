@@ -48,7 +48,7 @@ def has_tipped(
         needed: The agreement from which on it is taken to lie there.
     """
     for side in sides:
-        ground = over_table(side, area, (table_height,))
+        ground = over_table(side, area, table_height)
         if search(side, sights, ground, yaws, Freedom(turns=True))[0].score >= needed:
             return True
     return False
