@@ -239,7 +239,10 @@ class SubTask:
 
 @dataclass(frozen=True)
 class Fault:
-    """What is wrong with a camera, and seconds since its last usable image, infinite if it never gave one."""
+    """What is wrong with a camera, and seconds since its last usable image.
+
+    They are infinite for a camera that disagrees with others: nothing that it shows was ever usable.
+    """
 
     reason: str
     seconds: float

@@ -51,6 +51,18 @@ def log(config: EvaluationConfig) -> Path:
     return Path(config.output) / "episodes.jsonl"
 
 
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"suite": "libero_goal_swop"}, "suite is 'libero_goal_swop', expected one of libero_goal, "),
+        ({"suite": "libero_goal_object", "tuning": True}, "not for libero_goal_object"),
+    ],
+)
+def test_scenes_that_there_are_none_of_are_refused(options, message):
+    with pytest.raises(ValueError, match=message):
+        EvaluationConfig("checkpoint", "episodes", **options)
+
+
 def test_every_task_and_state_is_run_once(config, ran):
     episodes = evaluate(config)
     assert ran == [(task, state) for task in TASKS for state in (0, 1)]

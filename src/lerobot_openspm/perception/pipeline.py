@@ -102,7 +102,7 @@ class Perception:
     _watch: CameraWatch = field(default_factory=CameraWatch)
     _has_looked: bool = False
     _has_compared: bool = False
-    _comparable: set[str] = field(default_factory=set[str])
+    _comparable: dict[str, None] = field(default_factory=dict[str, None])
     _labelled: set[str] = field(default_factory=set[str])
 
     def detect(
@@ -152,12 +152,12 @@ class Perception:
         found = {name: one for name, one in estimates.items() if name not in displaced}
         self.remember(look, found, is_still=not displaced)
         if not self._has_compared:  # once, as soon as all cameras are sound, by what is sought until then
-            self._comparable |= known.keys()
+            self._comparable |= dict.fromkeys(known)
             if not faults:
                 self._has_compared = True
                 # What is found by masks is compared where the segmenter was asked for it.
-                wanted = self._comparable & look.instances.keys() if look.instances else self._comparable
-                comparable = {name: self.memory.objects[name] for name in sorted(wanted)}
+                wanted = [name for name in self._comparable if not look.instances or name in look.instances]
+                comparable = {name: self.memory.objects[name] for name in wanted}
                 faults = disagreeing_cameras(look, comparable, estimates)
         return Detections(estimates, faults)
 
