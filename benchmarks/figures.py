@@ -100,11 +100,16 @@ CALIBRATION = (
 NOISE = (*ALONG, *_benchmarks("measurement_noise"))
 # As `make libero` types it.
 LIBERO_GOAL = "--demos=10 --states=50 --tasks=0-9"
-# Scenes of each task: 50 of each of three, and 10 of each of ten.
+# Scenes of each task: 50 of each of three, and 10 of each of ten. With other kinds than all, the same scenes.
 PLACES = {
     "libero_spatial": "--suite=libero_spatial",
     "libero_object": "--suite=libero_object",
+    "libero_goal": "--suite=libero_goal --scenes=10",
+    "libero_goal_patches": "--suite=libero_goal --scenes=10 --kinds=patches",
+    "libero_goal_shape": "--suite=libero_goal --scenes=10 --kinds=shape",
     "libero_goal_exchanged": "--suite=libero_goal --exchanged=true --scenes=10",
+    "libero_goal_exchanged_patches": "--suite=libero_goal --exchanged=true --scenes=10 --kinds=patches",
+    "libero_goal_exchanged_shape": "--suite=libero_goal --exchanged=true --scenes=10 --kinds=shape",
 }
 NEW_TASKS = (
     "open_the_middle_drawer_of_the_cabinet",

@@ -104,12 +104,13 @@ def _spread(values: Sequence[float | None]) -> dict[str, float | None]:
 
 
 def summary(rows: Sequence[Row]) -> dict[str, Any]:
-    """Per object, and how many of all estimates that are said to be sure are right."""
+    """Per object and of all together, and how many of all estimates that are said to be sure are right."""
     names = dict.fromkeys(name for row in rows for name in row["objects"])
     every = [one for row in rows for one in row["objects"].values()]
     sure = [one for one in every if one["found"] and one["confidence"] > SURE]
     return {
         "found": {name: of_object([row["objects"][name] for row in rows]) for name in names},
+        "all": of_object(every),
         "sure": rate(sum(map(is_right, sure)), len(sure)),
         "sure_and_wrong": [
             [name, row["task"], row["seed"], one.get("mm"), one.get("deg")]

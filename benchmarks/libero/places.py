@@ -15,6 +15,7 @@ from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
+from unittest.mock import patch
 
 import numpy as np
 from benchmarks.calls import watched
@@ -41,6 +42,7 @@ from lerobot_openspm.memory.memory import Memory
 from lerobot_openspm.mining import objects as mining_objects
 from lerobot_openspm.mining.dataset import dataset_metadata
 from lerobot_openspm.mining.objects import contact_cues
+from lerobot_openspm.perception.objects.kinds import KINDS
 from lerobot_openspm.perception.observation import Observation
 from lerobot_openspm.perception.pipeline import Perception
 from lerobot_openspm.training import dataset_processor, memory_of
@@ -60,6 +62,7 @@ class PlacesConfig:
         suite: libero_goal, libero_spatial or libero_object.
         exchanged: Whether things change places in the scenes, see `variants`.
         demos: Demonstrations a task to learn from.
+        kinds: Of objects that are asked to learn, several with commas, or "all".
         scenes: Of each task, all from the same seeds.
         dataset: The demonstrations; recorded if not given.
         output: Folder for what is measured; outputs/bench/NAME if not given.
@@ -70,6 +73,7 @@ class PlacesConfig:
     suite: str = SUITE
     exchanged: bool = False
     demos: int = DEMOS
+    kinds: str = "all"
     scenes: int = 50
     dataset: DatasetOption = field(default_factory=DatasetOption)
     output: str | None = None
@@ -79,6 +83,18 @@ class PlacesConfig:
     def __post_init__(self) -> None:
         if self.suite not in OBJECTS:
             raise ValueError(f"suite is {self.suite!r}, expected one of {', '.join(OBJECTS)}")
+        if unknown := [kind for kind in self.asked() if kind not in KINDS]:
+            raise ValueError(f"there are no kinds {unknown}, expected all or some of {', '.join(KINDS)}")
+
+    def asked(self) -> list[str]:
+        """Names of the kinds that are asked to learn."""
+        return list(KINDS) if self.kinds == "all" else self.kinds.split(",")
+
+    @property
+    def name(self) -> str:
+        """The figure's name."""
+        kinds = "" if self.kinds == "all" else "_" + "_".join(self.asked())
+        return f"places_{self.suite}{'_exchanged' * self.exchanged}{kinds}{'_tuning' * self.tuning}"
 
     @property
     def first_seed(self) -> int:
@@ -101,8 +117,8 @@ class PlacesConfig:
         return root
 
 
-def learn(root: Path, folder: Path) -> dict[str, Any]:
-    """Mine a memory of all demonstrations; what is learned of each thing that the hand touched.
+def learn(root: Path, folder: Path, kinds: Collection[str]) -> dict[str, Any]:
+    """Mine a memory of all demonstrations with these kinds of objects; what is learned of each touched thing.
 
     Returns:
         ``objects`` by name; ``seconds`` that all of mining took, and ``learn_objects_s``, the part of it in
@@ -117,7 +133,8 @@ def learn(root: Path, folder: Path) -> dict[str, Any]:
     )
     processor = dataset_processor(dataset_metadata("local/places", str(root)), options)
     begin = time.monotonic()
-    with watched(mining_objects, "learn_objects") as learning_s:
+    asked = {kind: KINDS[kind] for kind in KINDS if kind in kinds}
+    with patch.dict(KINDS, asked, clear=True), watched(mining_objects, "learn_objects") as learning_s:
         mined = processor.mine()
     memory, seconds = memory_of(mined, options), time.monotonic() - begin
     write_memory(memory, folder)
@@ -201,19 +218,20 @@ def look(
 
 def main(config: PlacesConfig) -> dict[str, Any]:
     """Do what is missing, write and return the result."""
-    name = f"places_{config.suite}{'_exchanged' * config.exchanged}{'_tuning' * config.tuning}"
     root = config.demonstrations()
     files = [root / "meta/info.json", root / SUMMARY_FILE]
-    output = Path(config.output or f"outputs/bench/{name}")
-    folder = measured_folder(output, files, [config.suite, str(config.exchanged)], __file__)
-    learned = learn(root, folder)
+    output = Path(config.output or f"outputs/bench/{config.name}")
+    options = [config.suite, str(config.exchanged), *config.asked()]
+    folder = measured_folder(output, files, options, __file__)
+    learned = learn(root, folder, config.asked())
     tasks = find_suite(config.simulator).tasks("all")
     jobs = {f"{task} {i}": (config, folder, task, i) for task in tasks for i in range(config.scenes)}
     rows = resume(folder / "scenes.jsonl", jobs, look_at_scene, config.workers)
     for told in learned["objects"].values():
         del told["T_sim_obj"]
-    measured = {"seed": config.first_seed, "n": len(rows), "learned": learned, **summary(rows)}
-    return measured if config.tuning else write(name, measured, config.workers)
+    about = {"seed": config.first_seed, "n": len(rows), "exchanged": config.exchanged, "kinds": config.kinds}
+    measured = {**about, "learned": learned, **summary(rows)}
+    return measured if config.tuning else write(config.name, measured, config.workers)
 
 
 if __name__ == "__main__":

@@ -89,6 +89,7 @@ def test_shares_are_of_the_scenes_that_hold_a_thing_and_sure_ones_of_all():
     whole = summary(
         [{"task": "t", "seed": i, "look_cpu_ms": 10, "objects": {"milk": r}} for i, r in enumerate(rows)]
     )
+    assert whole["all"] == object_row
     assert (whole["sure"]["success"], whole["sure"]["n"]) == (0.5, 2)
     assert whole["sure_and_wrong"] == [["milk", "t", 1, 4.0, 15.0]]
     assert whole["first_look_cpu_ms"] == {"median": 10.0, "p95": 10.0}
@@ -121,3 +122,11 @@ def test_every_thing_that_the_hand_touched_is_in_a_scenes_row(tmp_path: Path, mo
 def test_another_suite_is_refused_by_name():
     with pytest.raises(ValueError, match="expected one of libero_goal, libero_spatial, libero_object"):
         PlacesConfig("libero_90")
+
+
+def test_kinds_are_named_by_the_figure_and_unknown_ones_refused():
+    assert PlacesConfig(exchanged=True).name == "places_libero_goal_exchanged"
+    some = PlacesConfig(exchanged=True, kinds="patches,shape")
+    assert some.name == "places_libero_goal_exchanged_patches_shape"
+    with pytest.raises(ValueError, match=r"no kinds \['sphere'\], expected all or some of surface, patches"):
+        PlacesConfig(kinds="patches,sphere")

@@ -90,6 +90,24 @@ def test_readme_has_a_row_for_what_was_measured_alone(results):
     assert ("tabletop", "success") in MARK.findall(rows[0])
 
 
+def test_kinds_of_objects_are_compared_line_by_line(results):
+    bowl = {"learned": "patches", "touched": 3, "grasped": 3}
+    for kinds, found in (("all", RATE), ("shape", {"success": None, "n": 0, "interval": [0.0, 1.0]})):
+        put(
+            results,
+            "places_libero_goal" + "_shape" * (kinds == "shape"),
+            n=4, kinds=kinds, exchanged=False, sure=RATE, first_look_cpu_ms={"median": 310.0},
+            learned={"objects": {"bowl": bowl, "milk": {**bowl, "learned": None}}},
+            all={"found": found, "within_10_mm": RATE, "position_mm_median": 4.2},
+        )  # fmt: skip
+    page = tables.results_page()
+    assert (
+        "| all, as in LIBERO | 1 of 2 | 50.0 % | 50.0 % | 15.0 to 85.0 % | 4.2 | 50.0 % of 4 | 310.0 |"
+        in page
+    )
+    assert "| shape, as in LIBERO | 1 of 2 | - | 50.0 %" in page
+
+
 def test_failures_are_told_apart_by_rule(results):
     failed = [
         {"task": task, "state": state, "reason": "gave up at lift", "attempts": 2, "off_mm": off}
