@@ -25,7 +25,7 @@ class Known:
     name: str
     sought: list[tuple[int, bool]] = field(default_factory=list)
     points = np.zeros((0, 3))
-    on_things = False
+    sought_again = False
 
     def localise(self, look: Look) -> PoseEstimate:
         self.sought.append((len(look.views), self.name in look.expected))

@@ -13,7 +13,7 @@ from lerobot_openspm.types import Hand, PoseEstimate
 class Sought:
     """An object that is not found, or not told from another place, until it is said to be."""
 
-    on_things, points = False, np.zeros((0, 3))
+    sought_again, points = False, np.zeros((0, 3))
 
     def __init__(self):
         self.looks, self.status = 0, "not_found"

@@ -1,10 +1,13 @@
 import numpy as np
 import pytest
 from tests.perception.builders import localise
-from tests.perception.drawn_world import cameras, draw_poses, views_of
+from tests.perception.drawn_world import DISTRACTOR, SHAPES, cameras, draw_poses, render, views_of
 
 from lerobot_openspm.geometry import se3
 from lerobot_openspm.geometry.camera import project
+from lerobot_openspm.perception.objects.base import Look
+from lerobot_openspm.perception.objects.shape.fitting import Evidence
+from lerobot_openspm.perception.objects.shape.occlusion import behind, nearest_depth
 from lerobot_openspm.perception.pipeline import hand_mask
 from lerobot_openspm.types import View
 
@@ -90,3 +93,49 @@ def test_an_object_that_is_gone_is_missed_where_it_should_be_seen(models):
     assert gone.visible > 0.9
     everything = {camera: np.ones((160, 160), bool) for camera in without}
     assert localise(without, models["cup"], hidden=everything, T_expected=clear.T_world_obj).visible == 0.0
+
+
+# A pillar of the distractor's colours: half sizes, height, colours, whether it is round.
+PILLAR = ((0.05, 0.05), 0.25, *DISTRACTOR[2:4], False)
+
+
+def pillar_points(T_world_obj):
+    half, height = PILLAR[0][0], PILLAR[1]
+    across, up = np.linspace(-half, half, 11), np.linspace(0, height, 26)
+    sides = [
+        np.stack(np.broadcast_arrays(*np.meshgrid(across, up), at), -1).reshape(-1, 3) for at in (-half, half)
+    ]
+    walls = [side[:, order] for side in sides for order in ([0, 2, 1], [2, 0, 1])]
+    top = np.stack(np.broadcast_arrays(*np.meshgrid(across, across), height), -1).reshape(-1, 3)
+    return se3.apply(T_world_obj, np.concatenate([*walls, top]))
+
+
+def test_what_stands_before_a_place_hides_it_and_what_stands_behind_it_does_not():
+    pillar = se3.from_yaw([0.0, 0.0, 0.0], 0.0)
+    nearest = nearest_depth([pillar_points(pillar)], view())
+    evidence = Evidence(view(), np.ones((160, 160), np.float32))
+    # The front camera stands at x > 0 and looks down: the pillar hides what is at x < 0.
+    far_point, near_point = [-0.12, 0.0, 0.03], [0.15, 0.0, 0.03]
+    (far,) = behind([evidence], [nearest], np.array(far_point))
+    (near,) = behind([evidence], [nearest], np.array(near_point))
+    for one, point, is_seen in ((far, far_point, 0), (near, near_point, 1)):
+        uv, _ = project(view().camera, view().T_world_cam, point)
+        assert one.visible[round(float(uv[1])), round(float(uv[0]))] == is_seen
+    (above,) = behind([evidence], [nearest], np.array([0.3, 0.0, 0.4]))
+    assert above is evidence, "nothing is before it, and nothing need be computed anew"
+    drawn = render([(PILLAR, pillar)])["front"].image
+    is_pillar = (np.abs(drawn.astype(int) - (196, 166, 128)) > 10).any(axis=2)
+    assert np.mean((far.visible == 0) == is_pillar) > 0.97
+
+
+def test_one_of_two_that_is_hidden_in_a_view_by_what_is_known_is_found_too(models):
+    cups = [se3.from_yaw([0.05, 0.15, 0.0], 0.0), se3.from_yaw([-0.15, -0.05, 0.0], 0.0)]
+    pillar = se3.from_yaw([-0.06, -0.06, 0.0], 0.0)
+    views = render([*((SHAPES["cup"], T) for T in cups), (PILLAR, pillar)])
+    alone = models["cup"].localise(Look(views))
+    told = models["cup"].localise(Look(views, standing=[pillar_points(pillar)]))
+    assert alone.others == ()
+    assert len(told.others) == 1
+    found = np.array([T[:2, 3] for T in (told.T_world_obj, *told.others)])
+    for T in cups:
+        assert np.linalg.norm(found - T[:2, 3], axis=1).min() < 0.012

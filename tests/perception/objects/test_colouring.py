@@ -1,5 +1,7 @@
 """Silhouettes of coarse points, sides told by their colours, and what has tipped over."""
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 import pytest
@@ -68,6 +70,19 @@ def test_the_colours_of_a_shape_tell_its_front_from_its_back():
         for turn in (0, np.pi)
     )
     assert there > back + 0.1
+
+
+def test_fine_colours_a_pixel_aside_agree_and_others_do_not():
+    cloud, T = block(0.008), se3.from_yaw([0.02, 0.01, 0.0], 0.3)
+    first, second = (
+        [replace(one, view=replace(one.view, image=noise.integers(0, 255, one.view.image.shape, np.uint8)))
+         for one in views(T)[:1]]
+        for noise in (np.random.default_rng(0), np.random.default_rng(1))
+    )  # fmt: skip
+    colours = learn_colours([Posed(tuple(first), T)] * 3, cloud)
+    aside = [replace(one, view=replace(one.view, image=np.roll(one.view.image, 1, axis=1))) for one in first]
+    assert agreement(first, cloud, colours, T) > 0.7
+    assert agreement(aside, cloud, colours, T) > agreement(second, cloud, colours, T) + 0.3
 
 
 def test_colours_never_seen_tell_nothing():

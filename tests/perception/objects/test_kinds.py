@@ -25,7 +25,7 @@ class Marker:
     yaw_period: float = 0.0
     points = np.zeros((0, 3))
     symmetry = None
-    on_things = False
+    sought_again = False
 
     def localise(self, look):
         return PoseEstimate("found", se3.from_yaw([self.place, 0, 0], 0.0), np.eye(4), 1.0)

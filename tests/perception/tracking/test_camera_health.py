@@ -146,7 +146,7 @@ def test_of_several_like_objects_any_may_be_the_one_that_the_other_camera_shows(
 class Masked:
     """An object that is found by a segmenter's masks alone."""
 
-    points, on_things = np.zeros((0, 3)), False
+    points, sought_again = np.zeros((0, 3)), False
 
     def __init__(self, name):
         self.name, self.cameras = name, []

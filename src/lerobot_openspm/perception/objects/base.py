@@ -72,6 +72,7 @@ class Look:
         expected: Poses ``T_world_obj`` ``(4, 4)`` by object at which it is looked for first.
         told_apart: Objects that words tell from others of their kind, all of which are sought therefore.
         supports: Points ``(n, 3)`` of other things' surfaces, world, that an object may stand on or in.
+        standing: Points ``(n, 3)`` of each of the other things that were found, world, which may hide it.
         before: Earlier looks from elsewhere, the oldest first.
 
     Raises:
@@ -84,6 +85,7 @@ class Look:
     expected: Mapping[str, Array] = field(default_factory=dict[str, Array])
     told_apart: Collection[str] = ()
     supports: Array = field(default_factory=lambda: np.zeros((0, 3)))
+    standing: Sequence[Array] = ()
     before: Sequence[EarlierLook] = ()
     _bins: dict[str, Bins] = field(default_factory=dict[str, Bins])
     _prepared: dict[Hashable, Any] = field(default_factory=dict[Hashable, Any])
@@ -165,17 +167,20 @@ def look_at(
 
 
 def localise_all(objects: Mapping[str, KnownObject], look: Look) -> dict[str, PoseEstimate]:
-    """Find objects by name; those that were not found clearly are sought on top of the others too.
+    """Find objects by name; those that were not found clearly are sought on top of the others too, or behind.
 
     What is under another may not be found for it, but where it seems to be is where to look.
     """
     found = {name: known.localise(look) for name, known in objects.items()}
     points = {name: se3.apply(one.T_world_obj, objects[name].points) for name, one in found.items()}
+    stand = {name for name, one in found.items() if one.status == "found"}
     for name, one in found.items():
         is_clear = one.status == "found" and one.confidence >= CLEAR and name not in look.told_apart
-        supports = [own for other, own in points.items() if other != name and len(own)]
-        if objects[name].on_things and supports and not is_clear and name not in look.expected:
-            found[name] = objects[name].localise(replace(look, supports=np.concatenate(supports)))
+        others = {other: own for other, own in points.items() if other != name and len(own)}
+        if objects[name].sought_again and others and not is_clear and name not in look.expected:
+            supports = np.concatenate(list(others.values()))
+            standing = [own for other, own in others.items() if other in stand]
+            found[name] = objects[name].localise(replace(look, supports=supports, standing=standing))
     return found
 
 
@@ -183,10 +188,10 @@ class KnownObject(Protocol):
     """An object that was learned. Every kind of object implements this.
 
     Attributes:
-        on_things: Whether the kind looks on top of other things and in them too.
+        sought_again: Whether the kind finds more once the others are found: on top of them, in them, behind.
     """
 
-    on_things: ClassVar[bool]
+    sought_again: ClassVar[bool]
 
     @property
     def name(self) -> str:

@@ -153,7 +153,7 @@ def test_earlier_looks_are_handed_on_and_tell_nothing_of_what_was_displaced(mode
             self.looks.append(look)
             return PoseEstimate("found", np.eye(4), 1e-6 * np.eye(4), 1.0)
 
-        points, on_things = np.zeros((0, 3)), False
+        points, sought_again = np.zeros((0, 3)), False
 
     known = Known()
     perception = Perception(known, 0.08)

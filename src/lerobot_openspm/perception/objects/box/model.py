@@ -54,7 +54,7 @@ class BoxModel:
     """
 
     kind: ClassVar[str] = "box"
-    on_things: ClassVar[bool] = False
+    sought_again: ClassVar[bool] = False
 
     name: str
     size: Array

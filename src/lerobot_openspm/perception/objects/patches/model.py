@@ -50,7 +50,7 @@ class PatchModel:
     """
 
     kind: ClassVar[str] = "patches"
-    on_things: ClassVar[bool] = False
+    sought_again: ClassVar[bool] = False
 
     name: str
     probes: tuple[Probe, ...]

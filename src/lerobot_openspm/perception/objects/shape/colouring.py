@@ -24,6 +24,10 @@ MIN_PICTURES = 3
 # What a point never seen may look like is told by so many of the others. One that looks like any of them
 # agrees by this share: less than one that shows its own colour, more than one that shows another.
 PALETTE, UNSEEN_SHARE = 64, 0.9
+# A pose is a little off and a point stands for what is around it: a known point may show its colour half a
+# spacing beside it, to eight sides.
+BESIDE_SPACINGS = 0.5
+AROUND = ((0, 0), (-1, -1), (-1, 0), (-1, 1), (0, -1), (0, 1), (1, -1), (1, 0), (1, 1))
 UNSEEN = -1.0
 # A pixel is another object's where the object's colours are less probable than this.
 OWN_PROBABILITY = 0.5
@@ -34,7 +38,7 @@ def learn_colours(posed: Sequence[Posed], cloud: Cloud) -> Float32:
     total, count = np.zeros((len(cloud.points), 3)), np.zeros(len(cloud.points))
     for scene in posed:
         for index, colours, own in _seen(scene.evidence, cloud, scene.T_world_obj):
-            total[index[own]] += colours[own]
+            total[index[own]] += colours[own, 0]
             count[index[own]] += 1
     is_known = count >= MIN_PICTURES
     mean = total / np.maximum(count, 1)[:, None]
@@ -56,8 +60,8 @@ def agreement(evidence: Sequence[Evidence], cloud: Cloud, colours: Float32, T_wo
         index, seen = index[own], seen[own]
         is_known = known[index]
         alike = np.empty(len(index))
-        alike[is_known] = _alike(seen[is_known], shown[index[is_known]])
-        alike[~is_known] = UNSEEN_SHARE * _alike(seen[~is_known, None], palette[None]).max(axis=1)
+        alike[is_known] = _alike(seen[is_known], shown[index[is_known], None]).max(axis=1)
+        alike[~is_known] = UNSEEN_SHARE * _alike(seen[~is_known, :1], palette[None]).max(axis=1)
         shares.append(alike)
     together = np.concatenate(shares) if shares else np.zeros(0)
     return float(together.mean()) if len(together) else 0.0
@@ -70,7 +74,7 @@ def _alike(a: Array, b: Array) -> Array:
 def _seen(
     evidence: Sequence[Evidence], cloud: Cloud, T_world_obj: Array
 ) -> Iterator[tuple[NDArray[np.intp], Array, NDArray[np.bool_]]]:
-    """By view: the points in sight, the colours that they show, and which of these are the object's."""
+    """By view: points in sight, the colours ``(k, 9, 3)`` there and around, and which are the object's."""
     points_world = se3.apply(T_world_obj, cloud.points)
     for one in evidence:
         camera = one.view.camera
@@ -87,8 +91,10 @@ def _seen(
             kept = one.visible[tuple(pixel)] > 0.5
             index, pixel = index[kept], pixel[:, kept]
         lab = cv2.cvtColor(np.ascontiguousarray(one.view.image), cv2.COLOR_RGB2LAB)
-        colours = lab[tuple(pixel)].astype(float)
-        yield index, colours, one.probability[tuple(pixel)] > OWN_PROBABILITY
+        beside = max(1, round(BESIDE_SPACINGS * spacing_px)) * np.array(AROUND)
+        last = np.array([camera.height, camera.width])[:, None, None] - 1
+        around = (pixel[:, :, None] + beside.T[:, None]).clip(0, last)
+        yield index, lab[tuple(around)].astype(float), one.probability[tuple(pixel)] > OWN_PROBABILITY
 
 
 def _in_front(uv: Array, depth: Array, spacing_px: float, margin: float) -> NDArray[np.bool_]:

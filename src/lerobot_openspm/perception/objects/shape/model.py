@@ -34,6 +34,7 @@ from lerobot_openspm.perception.objects.shape.fitting import (
     others,
     verdict,
 )
+from lerobot_openspm.perception.objects.shape.occlusion import behind, nearest_depth
 from lerobot_openspm.perception.objects.shape.tipped import NEAR_M, has_tipped, lying
 from lerobot_openspm.perception.objects.yaw import canonical
 from lerobot_openspm.types import UNKNOWN_YAW_STD, PoseEstimate, Support, Symmetry
@@ -47,7 +48,7 @@ POOR_SHARE = 0.7
 # Yaws whose fits are this good, relative to the best one's, and this far apart, are sides to choose among.
 SIDES_SHARE, SAME_SIDE_RAD = 0.85, 0.4
 # What the agreement of the colours counts beside that of the silhouettes.
-COLOURS_SHARE = 2.0
+COLOURS_SHARE = 3.0
 # Visibility is estimated on every 5th point.
 SHARE_STEP = 5
 # An object that is followed: how far from where it is expected it is looked for before everywhere else, and
@@ -83,7 +84,7 @@ class ShapeModel:
     """
 
     kind: ClassVar[str] = "shape"
-    on_things: ClassVar[bool] = False
+    sought_again: ClassVar[bool] = True
 
     name: str
     log_odds: NDArray[np.float32] | None
@@ -128,27 +129,38 @@ class ShapeModel:
         return None if is_one_way else Symmetry(np.zeros(2), self.yaw_period)
 
     def localise(self, look: Look) -> PoseEstimate:
-        """Find the object: where it is expected, else on its support plane, at any place and learned yaw."""
+        """Find the object: where it is expected, else on its support plane, at any place and learned yaw.
+
+        What other things hide of a place where it is sought tells nothing.
+        """
         T_expected = look.expected.get(self.name)
         evidence, fits = _evidence(self, look), list[Fit]()
         if T_expected is not None:
             there = fit(evidence, self.cloud, T_expected, _nearby(self, T_expected), NEARBY_CUTS_PX)
             fits = [there] if there.score >= NEARBY_CONFIDENCE * self.typical_overlap else []
         if not fits:
-            prior, starts = PosePrior(yaw=0.0 if self.yaw_period == 0 else np.inf), list[list[Fit]]()
+            prior = PosePrior(yaw=0.0 if self.yaw_period == 0 else np.inf)
+            starts = list[tuple[Sequence[Evidence], list[Fit]]]()
+            depths = [nearest_depth(look.standing, one.view) for one in evidence] if look.standing else None
             for point in candidates(evidence, self):
+                own = evidence if depths is None else behind(evidence, depths, self._middle(point))
                 poses = [se3.from_yaw(point, yaw) for yaw in self.search_yaws()]
-                starts.append([fit(evidence, self.cloud, T, prior, COARSE_CUTS_PX, COARSE_PX) for T in poses])
-            enough = POOR_SHARE * max((one.score for turned in starts for one in turned), default=0.0)
-            for turned in starts:
+                turned = [fit(own, self.cloud, T, prior, COARSE_CUTS_PX, COARSE_PX) for T in poses]
+                starts.append((own, turned))
+            enough = POOR_SHARE * max((one.score for _, turned in starts for one in turned), default=0.0)
+            for own, turned in starts:
                 best = max(one.score for one in turned)
                 if best > 0 and best >= enough:
-                    fits.append(self._finely(evidence, turned, prior))
+                    fits.append(self._finely(own, turned, prior))
             fits.sort(key=lambda one: -one.score)
             fits = [fits[i] for i in distinct([one.T_world_obj for one in fits], self.radius)]
             if fits and self._has_tipped(evidence, fits[0]):
                 return replace(self._estimate(look, evidence, fits), status="not_found", tipped=True)
         return self._estimate(look, evidence, fits)
+
+    def _middle(self, point: Array) -> Array:
+        """The middle ``(3,)`` of the object standing at a point."""
+        return point + np.array([0, 0, float(self.points[:, 2].mean())])
 
     def _has_tipped(self, evidence: Sequence[Evidence], best: Fit) -> bool:
         """Whether the object lies about where it fits best upright."""

@@ -90,7 +90,7 @@ class SurfaceModel:
     """
 
     kind: ClassVar[str] = "surface"
-    on_things: ClassVar[bool] = True
+    sought_again: ClassVar[bool] = True
 
     name: str
     surface: Surface
