@@ -12,7 +12,7 @@ import functools
 import json
 import time
 from collections.abc import Collection, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 from unittest.mock import patch
@@ -42,7 +42,10 @@ from lerobot_openspm.memory.memory import Memory
 from lerobot_openspm.mining import objects as mining_objects
 from lerobot_openspm.mining.dataset import dataset_metadata
 from lerobot_openspm.mining.objects import contact_cues
+from lerobot_openspm.perception.objects.base import Kind
 from lerobot_openspm.perception.objects.kinds import KINDS
+from lerobot_openspm.perception.objects.patches.learn import PATCHES, learn_patches
+from lerobot_openspm.perception.objects.surface.learn import SURFACE
 from lerobot_openspm.perception.observation import Observation
 from lerobot_openspm.perception.pipeline import Perception
 from lerobot_openspm.training import dataset_processor, memory_of
@@ -133,8 +136,10 @@ def learn(root: Path, folder: Path, kinds: Collection[str]) -> dict[str, Any]:
     )
     processor = dataset_processor(dataset_metadata("local/places", str(root)), options)
     begin = time.monotonic()
-    asked = {kind: KINDS[kind] for kind in KINDS if kind in kinds}
-    with patch.dict(KINDS, asked, clear=True), watched(mining_objects, "learn_objects") as learning_s:
+    with (
+        patch.dict(KINDS, learning(kinds), clear=True),
+        watched(mining_objects, "learn_objects") as learning_s,
+    ):
         mined = processor.mine()
     memory, seconds = memory_of(mined, options), time.monotonic() - begin
     write_memory(memory, folder)
@@ -153,6 +158,14 @@ def learn(root: Path, folder: Path, kinds: Collection[str]) -> dict[str, Any]:
     learned = {"episodes": len(mined.episodes), **spent, "objects": told}
     write_json(kept, learned)
     return learned
+
+
+def learning(names: Collection[str]) -> dict[str, Kind]:
+    """The kinds of some names; patches, which surfaces learn beside themselves, learn alone without these."""
+    kinds = {name: kind for name, kind in KINDS.items() if name in names}
+    if PATCHES.name in kinds and SURFACE.name not in kinds:
+        kinds[PATCHES.name] = replace(PATCHES, learn=learn_patches)
+    return kinds
 
 
 def look_at_scene(config: PlacesConfig, folder: Path, task: str, number: int) -> Row:

@@ -8,9 +8,11 @@ import numpy as np
 import pytest
 from benchmarks.libero import places
 from benchmarks.libero.place_errors import is_right, judged, not_known, of_object, summary
-from benchmarks.libero.places import LEARNED, PlacesConfig, look_at_scene
+from benchmarks.libero.places import LEARNED, PlacesConfig, learning, look_at_scene
 
 from lerobot_openspm.geometry import se3
+from lerobot_openspm.perception.objects.kinds import KINDS
+from lerobot_openspm.perception.objects.patches.learn import learn_patches
 from lerobot_openspm.types import PoseEstimate
 
 T_SIM_OBJ = se3.from_yaw([0.01, 0.0, -0.02], 0.3)
@@ -130,3 +132,8 @@ def test_kinds_are_named_by_the_figure_and_unknown_ones_refused():
     assert some.name == "places_libero_goal_exchanged_patches_shape"
     with pytest.raises(ValueError, match=r"no kinds \['sphere'\], expected all or some of surface, patches"):
         PlacesConfig(kinds="patches,sphere")
+
+
+def test_patches_learn_by_themselves_where_surfaces_do_not():
+    assert learning(["patches", "shape"])["patches"].learn is learn_patches
+    assert learning(list(KINDS)) == KINDS
