@@ -15,6 +15,7 @@ from lerobot_openspm.control.state import Status
 from lerobot_openspm.control.transfer import Turn, transfer
 from lerobot_openspm.geometry import se3
 from lerobot_openspm.memory.compose import Candidate
+from lerobot_openspm.memory.retrieval import Scored
 from lerobot_openspm.perception.objects.box.model import BoxModel
 
 HOME = hand_pose(0.0, 0.0, 0.3)
@@ -254,6 +255,19 @@ def test_a_grasp_beside_another_object_is_turned_about_a_round_object(caplog):
     assert "hand or load may touch the post where it takes hold or lets go" in record.getMessage()
 
 
+def test_the_other_one_of_a_kind_is_kept_clear_of_like_any_other_thing(caplog):
+    context, poses, home = scene(None, 0.0)
+    context = replace(context, points={"bowl": POST}, hand_radius_m=RADIUS)
+    _, beside = at_key_pose(context, poses, home, "grasp", (0.0, 0.09))
+    ranked = [Scored(context.entries[0], 1.0, 1.0, 1.0, 1.0)]
+    assert context.choose(ranked, poses, home)[0].turned == 0
+    assert context.choose(ranked, poses, home, {"bowl": (beside,)})[0].turned != 0
+    between = (poses["bowl"][:3, 3] + poses["plate"][:3, 3]) / 2
+    plan = Plan(context.entries[0], poses, home, not_meant={"bowl": (se3.from_yaw(between, 0.0),)})
+    assert len(context.clear(plan).entry.key_poses) > len(plan.entry.key_poses)
+    assert "go" not in caplog.text
+
+
 def test_where_another_entry_grasps_from_elsewhere_it_is_taken_if_it_means_the_same():
     context, poses, home = scene(None, 0.0)
     context = replace(context, symmetries={})
@@ -371,12 +385,12 @@ def test_what_was_put_aside_is_where_it_should_be_until_its_place_moves():
     shown = replace(context.entries[0], outcomes=(ON_PLATE,))
     plan = replace(Plan(shown, poses, home), aside=(0.02, 0.0))
     ended = poses | {"bowl": se3.from_yaw([0.02, 0.0, 0.0], 0.0) @ poses["plate"]}
-    assert_allclose(plan.as_if_in_place(ended)["bowl"], poses["plate"], atol=1e-12)
-    assert_allclose(plan.as_if_in_place(ended)["plate"], poses["plate"], atol=1e-12)
+    assert_allclose(plan.as_if_in_place(ended, {})["bowl"], poses["plate"], atol=1e-12)
+    assert_allclose(plan.as_if_in_place(ended, {})["plate"], poses["plate"], atol=1e-12)
     # What is pushed was not put aside.
     pushed = replace(plan, entry=replace(shown, key_poses=shown.key_poses[3:]))
     assert pushed.asides() == []
-    assert_allclose(pushed.as_if_in_place(ended)["bowl"], ended["bowl"])
+    assert_allclose(pushed.as_if_in_place(ended, {})["bowl"], ended["bowl"])
     for name, metres, aside in (("plate", 0.01, 0.02), ("plate", 0.05, 0.0), ("bowl", 0.05, 0.02)):
         there = {name: se3.from_yaw([metres, 0.0, 0.0], 0.0) @ poses[name]}
         followed = plan.following(there)

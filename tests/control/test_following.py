@@ -181,10 +181,11 @@ def test_what_is_gone_is_waited_for_then_lost_and_taken_up_again_when_it_is_back
     watch(one, perception, HAND, 60)
     assert one.scene.tracker.status("bowl") is TrackStatus.LOST
     assert one.state.status is Status.OBJECT_LOST
+    assert one.state.refusal.startswith("cannot find the bowl")
     assert one.executor.next_action(HAND).tolist() == [0.0] * 6 + [-1.0]
     perception.object_poses["bowl"] = bowl
     watch(one, perception, HAND, 10)
-    assert one.state.status is Status.RUNNING
+    assert (one.state.status, one.state.refusal) == (Status.RUNNING, "")
     assert one.state.status is not Status.PAUSED
     assert one.executor.next_action(HAND) is None or np.isfinite(one.executor.next_action(HAND)).all()
 

@@ -7,10 +7,11 @@ from tests.memory.builders import entry, hand_pose, key_pose, robot
 
 from lerobot_openspm.control.plan import Plan
 from lerobot_openspm.control.planning import PlanningContext
-from lerobot_openspm.control.transfer import HALF_TURN, transfer
+from lerobot_openspm.control.transfer import HALF_TURN, transfer, turn_about
 from lerobot_openspm.geometry import se3
 from lerobot_openspm.memory.entry import WORLD, Anchor, Outcome
 from lerobot_openspm.memory.retrieval import Scored
+from lerobot_openspm.types import Symmetry
 
 HOME = hand_pose(0.0, 0.0, 0.3)
 SHOWN = {"bowl": se3.from_yaw([0.2, 0.1, 0.0], 0.0), "plate": se3.from_yaw([0.0, -0.2, 0.0], 0.0)}
@@ -36,6 +37,22 @@ def test_what_is_carried_ends_on_the_same_side_of_a_landmark_however_it_is_turne
     assert_allclose(ends, se3.apply(now["plate"], BEHIND[None])[0], atol=1e-9)
     # The hand keeps its direction in the world.
     assert_allclose(place.T_world_ee[:3, :3], grasp.T_world_ee[:3, :3], atol=1e-9)
+
+
+@pytest.mark.parametrize("yaw", [0.0, 1.0, 2.5])
+def test_a_round_thing_is_where_it_should_be_however_it_was_turned_before(yaw):
+    middle = np.array([0.0, 0.08])  # its frame lies at its rim
+    round_bowl = {"bowl": Symmetry(middle, 0.0)}
+    context = PlanningContext((), {"bowl": 2 * np.pi, "plate": 2 * np.pi}, robot(), symmetries=round_bowl)
+    now = SHOWN | {"bowl": SHOWN["bowl"] @ turn_about(middle, yaw)}
+    plan = Plan(placed(), now, HOME)
+    grasp, place = plan.targets(context)[:2]
+    ended = now | {"bowl": place.T_world_ee @ se3.inverse(grasp.T_world_ee) @ now["bowl"]}
+    (outcome,) = plan.entry.outcomes
+    assert outcome.is_met(plan.as_if_in_place(ended, round_bowl))
+    assert outcome.is_met(plan.as_if_in_place(ended, {})) == (yaw == 0.0)
+    beside = ended | {"bowl": se3.from_yaw([0.03, 0.0, 0.0], 0.0) @ ended["bowl"]}
+    assert not outcome.is_met(plan.as_if_in_place(beside, round_bowl))
 
 
 def test_where_it_ends_is_not_known_the_key_pose_stands_as_it_is():

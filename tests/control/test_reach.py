@@ -67,6 +67,17 @@ def test_grasps_are_turned_by_what_the_shape_allows(panda, turn, expected):
     assert all(way.put == "turned" for way in ways)
 
 
+@pytest.mark.parametrize("turn", [0.0, np.pi])
+def test_a_handle_is_on_one_side_only_whatever_its_object_turns_into(turn):
+    shown, poses = drawer(-0.05)
+    context, _, home = scene(None, 0.0)
+    context = replace(context, entries=(shown,), symmetries={"cabinet": Symmetry(np.zeros(2), turn)})
+    assert Plan(shown, poses, home).turns(context) == [Plan(shown, poses, home)]
+    turned = {"cabinet": poses["cabinet"] @ se3.from_yaw(np.zeros(3), 0.4)}
+    (handle, *_) = Plan(shown, turned, home).targets(context)
+    assert_allclose(handle.T_world_ee, turned["cabinet"] @ shown.key_poses[0].T_obj_ee, atol=1e-9)
+
+
 def middle_at(targets, index, bowl):
     """Where the hand has the bowl's axis ``(1, 3)`` at a key pose."""
     grasp = next(one for one in targets if one.key_pose.phase == "grasp")

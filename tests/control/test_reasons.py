@@ -7,15 +7,16 @@ from lerobot_openspm.types import Hand, PoseEstimate
 
 
 @pytest.mark.parametrize(
-    ("status", "tipped", "words"),
+    ("status", "seen", "words"),
     [
-        ("not_found", True, "the bowl has tipped over"),
-        ("ambiguous", False, "cannot tell which bowl is meant"),
-        ("not_found", False, "cannot find the bowl: it is in no view"),
+        ("not_found", {"tipped": True}, "the bowl has tipped over"),
+        ("ambiguous", {}, "cannot tell which bowl is meant"),
+        ("not_found", {}, "cannot find the bowl: it is in no view"),
+        ("found", {"visible": 0.4}, "no view shows more than 40 % of the bowl"),
     ],
 )
-def test_each_missing_object_is_named_with_what_is_known_of_it(status, tipped, words):
-    estimate = PoseEstimate(status, np.eye(4), np.eye(4), 0.0, tipped=tipped)
+def test_each_missing_object_is_named_with_what_is_known_of_it(status, seen, words):
+    estimate = PoseEstimate(status, np.eye(4), np.eye(4), 0.0, **seen)
     hand = Hand(hand_pose(0, 0, 0.3), OPEN_WIDTH)
     told = why_missing(["bowl", "plate"], {"bowl": estimate}, {}, hand, robot())
     assert told.startswith(words)

@@ -141,7 +141,8 @@ class EpisodeController:
         if state.status is Status.INFEASIBLE and state.refused.is_same_scene(poses, hand.T_world_ee):
             return  # nor is it now
         state.ranked = self._context.rank(candidates, poses, hand.T_world_ee)
-        plan, problems = self._context.choose(state.ranked, poses, hand.T_world_ee)
+        not_meant = self.scene.grounding.not_meant
+        plan, problems = self._context.choose(state.ranked, poses, hand.T_world_ee, not_meant)
         if missing := [name for name in plan.entry.objects if name not in poses]:
             state.refusal = self.scene.why_missing(missing, hand)
             logger.info("%r: %s", self.instruction, state.refusal)
@@ -255,11 +256,13 @@ class EpisodeController:
         """Hold still without sound pictures, and while what the hand is on its way to is not to be seen."""
         state, scene, needed = self.state, self.scene, self._now_needed()
         if lost := scene.those(TrackStatus.LOST, needed):
+            state.refusal = scene.why_missing(lost, hand)
             if state.status is not Status.OBJECT_LOST:
-                logger.info("%r: lost: %s", self.instruction, ", ".join(lost))
+                logger.info("%r: lost: %s", self.instruction, state.refusal)
             self.executor.stop(Status.OBJECT_LOST)
             return
         if state.status is Status.OBJECT_LOST:
+            state.refusal = ""
             self._begin(self.executor.way_index(), hand)
         is_paused = scene.is_blind or scene.those(TrackStatus.STALE, needed)
         state.go(Status.PAUSED if is_paused else Status.RUNNING)
@@ -312,7 +315,7 @@ class EpisodeController:
     def _judge(self, hand: Hand) -> LookRequest | None:
         """Compare what is seen with the outcomes: go on if all are met, else go back to what can mend it."""
         state, poses = self.state, self.scene.tracker.poses(hand.T_world_ee)
-        poses = state.plan.as_if_in_place(poses)
+        poses = state.plan.as_if_in_place(poses, self._context.symmetries)
         missed = state.plan.entry.missed(poses, self.scene.recognised(), self._context.yaw_periods)
         if missed is None:
             return None if state.looks_left > 0 else self._end_part(hand)

@@ -69,6 +69,7 @@ class Grounding:
         feet: By name, the middle ``(3,)`` of what an object stands on in its frame, metres; its frame's
             origin where it is not named.
         elsewhere: By name, where the only one that the last look brought should be, but plainly is not.
+        not_meant: By name, poses ``T_world_obj`` ``(4, 4)`` of the others of its kind.
     """
 
     said: Mapping[str, Reference] = field(default_factory=dict[str, Reference])
@@ -78,8 +79,8 @@ class Grounding:
     surfaces: frozenset[str] = frozenset()
     feet: Mapping[str, Array] = field(default_factory=dict[str, Array])
     elsewhere: dict[str, Reference] = field(default_factory=dict[str, Reference])
+    not_meant: dict[str, tuple[Array, ...]] = field(default_factory=dict[str, tuple[Array, ...]])
     _told: set[str] = field(default_factory=set[str])
-    _not_meant: dict[str, tuple[Array, ...]] = field(default_factory=dict[str, tuple[Array, ...]])
 
     @property
     def landmarks(self) -> tuple[str, ...]:
@@ -100,7 +101,7 @@ class Grounding:
         self.said = {**self.said, **said}
         kept = {name: one for name, one in self.shown.items() if name not in said}
         self.shown = {**kept, **(shown or {})}
-        self._not_meant = {name: T for name, T in self._not_meant.items() if name not in changed}
+        self.not_meant = {name: T for name, T in self.not_meant.items() if name not in changed}
         self._told -= changed
         return changed
 
@@ -119,7 +120,7 @@ class Grounding:
         return {name: self._meant(name, one, known) for name, one in estimates.items()}
 
     def _meant(self, name: str, estimate: PoseEstimate, object_poses: Mapping[str, Array]) -> PoseEstimate:
-        if name in self._not_meant:
+        if name in self.not_meant:
             return self._unless_another(name, estimate)
         if estimate.status == "not_found" or not estimate.others:
             return self._unless_elsewhere(name, estimate, object_poses)
@@ -136,7 +137,7 @@ class Grounding:
             logger.info("cannot tell which of %d objects like the %r is meant: %s is said of it",
                         len(candidates), name, where)  # fmt: skip
             return replace(estimate, status="ambiguous")
-        self._not_meant[name] = candidates[:index] + candidates[index + 1 :]
+        self.not_meant[name] = candidates[:index] + candidates[index + 1 :]
         return replace(estimate, status="found", T_world_obj=candidates[index], others=())
 
     def _unless_elsewhere(
@@ -168,5 +169,5 @@ class Grounding:
         return {name: self._foot(name, T) for name, T in object_poses.items()}
 
     def _is_another(self, name: str, T_world_obj: Array) -> bool:
-        apart = [float(np.linalg.norm(T[:2, 3] - T_world_obj[:2, 3])) for T in self._not_meant[name]]
+        apart = [float(np.linalg.norm(T[:2, 3] - T_world_obj[:2, 3])) for T in self.not_meant[name]]
         return min(apart) < SAME_PLACE_M

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -20,11 +20,12 @@ from lerobot_openspm.control.transfer import (
     half_turned,
     put_aside,
     transfer,
+    turns_as_shown,
 )
 from lerobot_openspm.geometry import se3
 from lerobot_openspm.geometry.se3 import Array
 from lerobot_openspm.memory.entry import MemoryEntry, MemoryKeyPose, Outcome, RetrievalKey
-from lerobot_openspm.types import SubTask
+from lerobot_openspm.types import SubTask, Symmetry
 
 if TYPE_CHECKING:
     from lerobot_openspm.control.planning import PlanningContext
@@ -62,6 +63,7 @@ class Plan:
             reach is not checked by them.
         retreat_m: How far the hand backs off at the end of a demonstration that was cut before it did.
         aside: How far beside its place what is carried is put down, x and y in the world, metres.
+        not_meant: By name, poses ``T_world_obj`` ``(4, 4)`` of others of its kind, which stand about.
     """
 
     entry: MemoryEntry
@@ -73,6 +75,7 @@ class Plan:
     stance: Array | None = None
     retreat_m: float = RETREAT_M
     aside: tuple[float, float] = (0.0, 0.0)
+    not_meant: Mapping[str, Sequence[Array]] = field(default_factory=dict[str, Sequence[Array]])
 
     def targets(
         self,
@@ -97,9 +100,8 @@ class Plan:
         return half_turned(targets) if self.is_half_turned else targets
 
     def symmetric_grasps(self, context: PlanningContext) -> dict[int, str]:
-        """Objects that are grasped and turn into themselves, by sub-task."""
-        grasps = (pose for pose in self.entry.key_poses if pose.phase == "grasp")
-        return {p.sub_task: p.anchor.place for p in grasps if p.anchor.place in context.symmetries}
+        """What is grasped to be carried and turns into itself, by sub-task; a handle is on one side only."""
+        return {i: name for i, name in self.entry.carried.items() if name in context.symmetries}
 
     def turns(self, context: PlanningContext) -> list[Plan]:
         """The plan with its grasps turned as the objects' shapes allow, the least first; as it is at first.
@@ -138,17 +140,24 @@ class Plan:
         aside = self.aside if all(metres < ASIDE_KEPT_M for metres in went) else (0.0, 0.0)
         return replace(self, object_poses={**self.object_poses, **moved}, aside=aside)
 
-    def as_if_in_place(self, object_poses: Mapping[str, Array]) -> dict[str, Array]:
-        """Object poses, what was put aside moved back by as much, as its outcome is told."""
+    def as_if_in_place(
+        self, object_poses: Mapping[str, Array], symmetries: Mapping[str, Symmetry]
+    ) -> dict[str, Array]:
+        """Object poses as outcomes are told: what was put aside moved back, what is round turned as shown.
+
+        A round thing is turned by as much as before the hand took it along.
+        """
         back = se3.from_yaw(np.array([-self.aside[0], -self.aside[1], 0.0]), 0.0)
+        turns = turns_as_shown(self.entry, self.object_poses, symmetries)
         aside = {one.target for one in self._puts}
-        return {name: back @ T if name in aside else T for name, T in object_poses.items()}
+        shown = {name: T @ turns[name] if name in turns else T for name, T in object_poses.items()}
+        return {name: back @ T if name in aside else T for name, T in shown.items()}
 
     @property
     def _puts(self) -> list[Outcome]:
         """The outcomes of what is grasped and put somewhere; what is pushed is put nowhere."""
-        grasped = {(p.sub_task, p.anchor.place) for p in self.entry.key_poses if p.phase == "grasp"}
-        return [one for one in self.entry.served_outcomes if (one.sub_task, one.target) in grasped]
+        carried = self.entry.carried
+        return [one for one in self.entry.served_outcomes if carried.get(one.sub_task) == one.target]
 
     def followed(self, context: PlanningContext) -> tuple[Plan, list[str]]:
         """The plan, backing off as far as the arm reaches, and what keeps the hand from following it."""

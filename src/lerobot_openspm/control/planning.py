@@ -119,7 +119,11 @@ class PlanningContext:
         return tuple(retrieve(semantic, lambda entry: geometric[id(entry)], self.names))
 
     def choose(
-        self, ranked: Sequence[Scored], object_poses: Mapping[str, Array], T_world_ee: Array
+        self,
+        ranked: Sequence[Scored],
+        object_poses: Mapping[str, Array],
+        T_world_ee: Array,
+        not_meant: Mapping[str, Sequence[Array]] | None = None,
     ) -> tuple[Plan, list[str]]:
         """The best entry that the arm can follow, its grasps turned by an object's symmetry if need be.
 
@@ -131,11 +135,11 @@ class PlanningContext:
             The plan, and what keeps the hand from following it, in words. Where none of the first entries
             can be followed, or objects of the best one were not found, the best one as it is.
         """
-        first = Plan(ranked[0].entry, object_poses, T_world_ee)
+        first = Plan(ranked[0].entry, object_poses, T_world_ee, not_meant=not_meant or {})
         if any(name not in object_poses for name in first.entry.objects):
             return first, []
         first = replace(first, stance=find_stance(self.robot, T_world_ee))
-        points, crowded = self._points(object_poses), list[tuple[Plan, dict[str, int]]]()
+        points, crowded = self._points(first), list[tuple[Plan, dict[str, int]]]()
         sought = set(self.points) if len(self.points) <= MOST_IN_A_SCENE else set[str]()
         if unseen := sorted(sought - set(points)):
             logger.info(
@@ -171,7 +175,7 @@ class PlanningContext:
             for way in plan.turns(self)
             if abs(float(se3.wrap_angle(way.turned - plan.turned))) > OTHERWISE_RAD
         ]
-        found = self._clearest(ways, self._points(plan.object_poses))
+        found = self._clearest(ways, self._points(plan))
         return plan if found is None else found[0]
 
     def _clearest(
@@ -219,21 +223,22 @@ class PlanningContext:
                 return [way]
         return []
 
-    def _points(self, object_poses: Mapping[str, Array]) -> dict[str, Array]:
+    def _points(self, plan: Plan) -> dict[str, Array]:
         """Points ``(n, 3)`` in the world of the objects that were found and whose shape is known."""
-        return {
-            name: se3.apply(object_poses[name], own)
-            for name, own in self.points.items()
-            if name in object_poses
-        }
+        found: dict[str, Array] = {}
+        for name, own in self.points.items():
+            if name in plan.object_poses:
+                found[name] = se3.apply(plan.object_poses[name], own)
+            for i, T in enumerate(plan.not_meant.get(name, ()), 1):
+                found[f"other {name} {i}"] = se3.apply(T, own)
+        return found
 
     def clear(self, plan: Plan) -> Plan:
         """A plan whose ways are lifted over what stands about.
 
         Where the arm cannot follow the lifted ways, the plan stays as it is, and that is said.
         """
-        points = self._points(plan.object_poses)
-        targets = plan.targets(self)
+        points, targets = self._points(plan), plan.targets(self)
         if plan.is_half_turned:  # key poses are kept as the hand was before
             targets = half_turned(targets)
         entry, crossed = lifted(plan.entry, targets, plan.T_world_ee, points, self.hand_radius_m)

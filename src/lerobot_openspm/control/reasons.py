@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 
 from lerobot_openspm.memory.robot import RobotModel
+from lerobot_openspm.perception.tracking.tracker import TrackerSettings
 from lerobot_openspm.types import Hand, PoseEstimate, Reference
 
 # Fingers that are open by such a share are around something, as far as can be felt.
@@ -29,13 +30,16 @@ def why_missing(
     """
     reasons = list[str]()
     for name in missing:
-        if name in estimates and estimates[name].tipped:
+        one = estimates.get(name)
+        if one is not None and one.tipped:
             reasons.append(f"the {name} has tipped over")
         elif name in elsewhere:
             where = elsewhere[name]
             marks = " and the ".join(where.landmarks)
             reasons.append(f"the only {name} that was found is not {where.relation} the {marks}")
-        elif name in estimates and estimates[name].status == "ambiguous":
+        elif one is not None and one.status == "found" and one.visible < TrackerSettings.visible:
+            reasons.append(f"no view shows more than {100 * one.visible:.0f} % of the {name}")
+        elif one is not None and one.status == "ambiguous":
             reasons.append(f"cannot tell which {name} is meant, or where it stands")
         else:
             reasons.append(f"cannot find the {name}: it is in no view, hidden, or not as it was shown")

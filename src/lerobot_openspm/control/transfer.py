@@ -82,13 +82,20 @@ def as_shown(
         object_poses: Poses as they were found.
         symmetries: How objects turn into themselves, of those that do.
     """
-    shown = dict(object_poses)
-    grasped = {pose.anchor.place for pose in entry.key_poses if pose.phase == "grasp"}
-    for name in grasped & symmetries.keys() & object_poses.keys() & entry.object_poses.keys():
-        if symmetries[name].turn == 0:
-            yaw = se3.yaw_of(entry.object_poses[name]) - se3.yaw_of(object_poses[name])
-            shown[name] = object_poses[name] @ turn_about(symmetries[name].middle, float(yaw))
-    return shown
+    turns = turns_as_shown(entry, object_poses, symmetries)
+    return {name: T @ turns[name] if name in turns else T for name, T in object_poses.items()}
+
+
+def turns_as_shown(
+    entry: MemoryEntry, object_poses: Mapping[str, Array], symmetries: Mapping[str, Symmetry]
+) -> dict[str, Array]:
+    """By name, turns ``(4, 4)`` about its axis: they bring round things that an entry carries to as shown."""
+    known = set(entry.carried.values()) & symmetries.keys() & object_poses.keys() & entry.object_poses.keys()
+    turns: dict[str, Array] = {}
+    for name in (name for name in known if symmetries[name].turn == 0):
+        yaw = se3.yaw_of(entry.object_poses[name]) - se3.yaw_of(object_poses[name])
+        turns[name] = turn_about(symmetries[name].middle, float(yaw))
+    return turns
 
 
 def turn_about(middle: Array, radians: float) -> Array:

@@ -218,6 +218,13 @@ class MemoryEntry:
         """The objects the entry needs a pose of, each once, in the order of their first use."""
         return tuple(dict.fromkeys(name for pose in self.key_poses for name in pose.anchor.objects))
 
+    @property
+    def carried(self) -> dict[int, str]:
+        """What the hand grasps and takes along, by sub-task; a handle that it opens or turns stays there."""
+        held = {pose.sub_task for pose in self.key_poses if pose.phase in AXIS_KINDS}
+        grasps = (pose for pose in self.key_poses if pose.phase == "grasp" and pose.sub_task not in held)
+        return {pose.sub_task: pose.anchor.place for pose in grasps}
+
     def until(self, sub_task: int) -> MemoryEntry:
         """The entry without the sub-tasks after one."""
         key = replace(self.key, sub_tasks=self.key.sub_tasks[: sub_task + 1])
