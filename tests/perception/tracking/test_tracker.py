@@ -117,6 +117,14 @@ def test_a_poor_sight_changes_nothing(poor):
     assert_allclose(pose(one), CUP)
 
 
+def test_what_is_half_out_of_all_views_at_first_is_not_followed_until_more_of_it_is_seen():
+    one = Tracker({"cup": 2 * np.pi}, TrackerSettings())
+    assert look(one, seen(CUP, visible=0.4)) == frozenset()
+    assert one.poses(FAR_HAND) == {}
+    assert look(one, seen(CUP, visible=0.6)) == {"cup"}
+    assert_allclose(pose(one), CUP)
+
+
 def test_two_places_that_explain_the_pictures_are_ambiguous_then_stale_then_lost():
     one = tracker()
     statuses = []

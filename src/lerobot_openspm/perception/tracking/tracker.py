@@ -167,7 +167,7 @@ class Tracker:
         for name, estimate in estimates.items():
             track = self._tracks.get(name)
             if track is None:
-                if estimate.status == "found":
+                if estimate.status == "found" and estimate.visible >= self.settings.visible:
                     self._begin(name, estimate.T_world_obj, estimate)
                     moved.add(name)
             elif self._is_seen(estimate):
