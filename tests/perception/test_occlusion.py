@@ -7,7 +7,7 @@ from lerobot_openspm.geometry import se3
 from lerobot_openspm.geometry.camera import project
 from lerobot_openspm.perception.objects.base import Look, localise_all
 from lerobot_openspm.perception.objects.shape.fitting import Evidence
-from lerobot_openspm.perception.objects.shape.occlusion import behind, nearest_depth
+from lerobot_openspm.perception.objects.shape.occlusion import behind
 from lerobot_openspm.perception.pipeline import hand_mask
 from lerobot_openspm.types import PoseEstimate, View
 
@@ -124,20 +124,28 @@ class Pillar:
 
 def test_what_stands_before_a_place_hides_it_and_what_stands_behind_it_does_not():
     pillar = se3.from_yaw([0.0, 0.0, 0.0], 0.0)
-    nearest = nearest_depth([pillar_points(pillar)], view())
+    standing = [pillar_points(pillar)]
     evidence = Evidence(view(), np.ones((160, 160), np.float32))
     # The front camera stands at x > 0 and looks down: the pillar hides what is at x < 0.
     far_point, near_point = [-0.12, 0.0, 0.03], [0.15, 0.0, 0.03]
-    (far,) = behind([evidence], [nearest], np.array(far_point))
-    (near,) = behind([evidence], [nearest], np.array(near_point))
+    (far,) = behind([evidence], standing, np.array(far_point))
+    (near,) = behind([evidence], standing, np.array(near_point))
     for one, point, is_seen in ((far, far_point, 0), (near, near_point, 1)):
         uv, _ = project(view().camera, view().T_world_cam, point)
         assert one.visible[round(float(uv[1])), round(float(uv[0]))] == is_seen
-    (above,) = behind([evidence], [nearest], np.array([0.3, 0.0, 0.4]))
+    (above,) = behind([evidence], standing, np.array([0.3, 0.0, 0.4]))
     assert above is evidence, "nothing is before it, and nothing need be computed anew"
     drawn = render([(PILLAR, pillar)])["front"].image
     is_pillar = (np.abs(drawn.astype(int) - (196, 166, 128)) > 10).any(axis=2)
     assert np.mean((far.visible == 0) == is_pillar) > 0.97
+
+
+def test_a_thing_does_not_hide_itself_under_another_name():
+    points = pillar_points(se3.from_yaw([0.0, 0.0, 0.0], 0.0))
+    evidence = Evidence(view(), np.ones((160, 160), np.float32))
+    assert behind([evidence], [points], points.mean(0)) == [evidence]
+    (beside,) = behind([evidence], [points], points.mean(0) - [0.1, 0.0, 0.0])
+    assert beside.visible.min() == 0
 
 
 def test_one_of_two_that_is_hidden_in_a_view_by_what_is_known_is_found_too(models):

@@ -34,7 +34,7 @@ from lerobot_openspm.perception.objects.shape.fitting import (
     others,
     verdict,
 )
-from lerobot_openspm.perception.objects.shape.occlusion import behind, nearest_depth
+from lerobot_openspm.perception.objects.shape.occlusion import behind
 from lerobot_openspm.perception.objects.shape.tipped import NEAR_M, has_tipped, lying
 from lerobot_openspm.perception.objects.yaw import canonical
 from lerobot_openspm.types import UNKNOWN_YAW_STD, PoseEstimate, Support, Symmetry
@@ -141,9 +141,8 @@ class ShapeModel:
         if not fits:
             prior = PosePrior(yaw=0.0 if self.yaw_period == 0 else np.inf)
             starts = list[tuple[Sequence[Evidence], list[Fit]]]()
-            depths = [nearest_depth(look.standing, one.view) for one in evidence] if look.standing else None
             for point in candidates(evidence, self):
-                own = evidence if depths is None else behind(evidence, depths, self._middle(point))
+                own = behind(evidence, look.standing, self._middle(point))
                 poses = [se3.from_yaw(point, yaw) for yaw in self.search_yaws()]
                 turned = [fit(own, self.cloud, T, prior, COARSE_CUTS_PX, COARSE_PX) for T in poses]
                 starts.append((own, turned))
@@ -231,9 +230,7 @@ def from_record(fields: Mapping[str, Any], arrays: Mapping[str, NDArray[Any]], w
         )
     numbers = records.numbers(fields, NUMBERS, where)
     log_odds = records.array(arrays, "log_odds", (foreground.N_BINS,), where) if source == COLOURS else None
-    points = records.array(arrays, "points", (-1, 3), where)
-    if not 8 <= len(points) <= MAX_POINTS:
-        raise MemoryFormatError(f"{where}: 'points' has {len(points)} rows, expected 8 to {MAX_POINTS}")
+    points = records.points(arrays, where, MAX_POINTS)
     shown = records.array(arrays, "colours", points.shape, where) if "colours" in arrays else None
     return ShapeModel(name, log_odds, points, **numbers, colours=shown)
 

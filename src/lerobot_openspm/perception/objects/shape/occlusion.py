@@ -16,6 +16,8 @@ from lerobot_openspm.types import View
 
 # Points of a surface are at most about this far from one another, metres.
 GAP_M = 0.012
+# What has its middle this near to that of another thing, metres, is that thing.
+SAME_THING_M = 0.02
 
 
 def nearest_depth(surfaces: Sequence[Array], view: View) -> Float32:
@@ -43,16 +45,21 @@ def nearest_depth(surfaces: Sequence[Array], view: View) -> Float32:
     return nearest
 
 
-def behind(evidence: Sequence[Evidence], depths: Sequence[Float32], point: Array) -> list[Evidence]:
+def behind(evidence: Sequence[Evidence], standing: Sequence[Array], point: Array) -> list[Evidence]:
     """The views of something at a point ``(3,)``, world: pixels of what stands before it tell nothing.
 
     Args:
         evidence: The views.
-        depths: For each its :func:`nearest_depth`.
+        standing: Points ``(n, 3)`` of each thing's surface, world. One whose middle is there is the same
+            thing by another name, and hides nothing.
         point: The middle of what may be there.
     """
+    others = [own for own in standing if np.linalg.norm(own.mean(0) - point) > SAME_THING_M]
+    if not others:
+        return list(evidence)
     told = list[Evidence]()
-    for one, nearest in zip(evidence, depths, strict=True):
+    for one in evidence:
+        nearest = nearest_depth(others, one.view)
         _, depth = project(one.view.camera, one.view.T_world_cam, point)
         is_free = (nearest >= float(depth)).astype(np.float32)
         if is_free.all():

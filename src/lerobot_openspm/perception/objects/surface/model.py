@@ -155,7 +155,8 @@ class SurfaceModel:
         if is_near:
             return near
         places = self._anywhere(look, sights)
-        if near_score > BETTER_SHARE * places[0].score:  # something may stand on it
+        # Something may stand on it.
+        if near_score > max(BETTER_SHARE * places[0].score, GONE_SHARE * self.typical_agreement):
             return replace(near, confidence=min(near.confidence, near_score / self.typical_agreement))
         found = self._estimate(look, sights, places)
         if found.status == "found":
@@ -261,9 +262,14 @@ class SurfaceModel:
         ground = ground[((ground[:, :2] > low) & (ground[:, :2] < high)).all(1)]
         if len(ground) == 0:
             return []
-        return search(
-            self.surface, sights, ground, self._yaws, Freedom(not self.surface.is_round, lifts=True), several
-        )
+        free = Freedom(not self.surface.is_round, lifts=True)
+        places = search(self.surface, sights, ground, self._yaws, free, several)
+        return [one for one in places if one.score >= self._needed(one) * self.typical_agreement]
+
+    def _needed(self, place: Place) -> float:
+        """The share of the typical agreement from which on it is found at a place."""
+        is_raised = place.pose[2] > self.height + LIFTED_M / 2
+        return max(self.found_share, RAISED_SHARE) if is_raised else self.found_share
 
     def _unless_tipped(self, look: Look, sights: Mapping[str, Sight], found: PoseEstimate) -> PoseEstimate:
         """A first look's estimate, which says where there is none whether the object lies on the table."""
@@ -294,9 +300,7 @@ class SurfaceModel:
         rivals = [one for one in places[1:] if middles_apart(self.surface, one, best) > apart]
         likely = likelihood(self.surface, best)
         is_rivalled = any(likelihood(self.surface, one) > RIVAL_SHARE * likely for one in rivals)
-        is_raised = best.pose[2] > self.height + LIFTED_M / 2
-        needed = max(self.found_share, RAISED_SHARE) if is_raised else self.found_share
-        status = "not_found" if share < needed else "ambiguous" if is_rivalled else "found"
+        status = "not_found" if share < self._needed(best) else "ambiguous" if is_rivalled else "found"
         T = se3.from_yaw(best.pose[:3], float(best.pose[3]))
         covariance = covariance_at(self.surface, sights, best.pose, not self.surface.is_round)
         visible = look.seen_share(se3.apply(T, self.surface.coloured))
