@@ -1,6 +1,7 @@
 """A contact is anchored to what it belongs to, or to nothing."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -11,6 +12,8 @@ from lerobot_openspm.geometry import se3
 from lerobot_openspm.language.instruction import parse_instruction
 from lerobot_openspm.memory.entry import WORLD, Anchor
 from lerobot_openspm.mining.anchors import Demonstration, consensus, contact_roles
+from lerobot_openspm.mining.mined import MinedTask
+from lerobot_openspm.mining.not_learned import list_not_learned
 
 
 def without(name: str, made: list[Demonstration], n_left: int = 0) -> list[Demonstration]:
@@ -53,6 +56,20 @@ def test_demonstrations_may_show_that_it_goes_along_with_another_object():
     assert consensus(beside_the_plate(6, 0.2), SUB_TASKS)[GRASP].place == "plate"
     assert consensus(beside_the_plate(2, 0.2), SUB_TASKS) == {}  # two may agree by chance
     assert consensus(beside_the_plate(6, 0.002), SUB_TASKS) == {}  # where nothing moves nothing is shown
+
+
+@pytest.mark.parametrize(
+    ("n", "words"), [(6, "kept relative to the plate, with which it goes along"), (2, "")]
+)
+def test_it_is_said_what_a_contact_is_kept_relative_to_instead(n: int, words: str):
+    made = beside_the_plate(n, 0.2)
+    episode = SimpleNamespace(sub_tasks=SUB_TASKS, episode=SimpleNamespace(task="put the bowl on the plate"))
+    task = MinedTask((episode,), tuple(made), consensus(made, SUB_TASKS), (), (), ())
+    mined = SimpleNamespace(tasks=[task], object_poses=[one.object_poses for one in made], surfaces=(),
+                            unlearned={"bowl": "it is grey"}, objects={}, simulator_objects=())  # fmt: skip
+    (bowl, *_) = list_not_learned(mined)
+    assert (bowl.name, bowl.demonstrations) == ("bowl", n)
+    assert bowl.reason == "it is grey" + (f"; what the hand does there is {words}" if words else "")
 
 
 def test_what_is_put_on_the_table_is_put_relative_to_what_is_known():

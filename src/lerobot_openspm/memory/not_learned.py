@@ -38,8 +38,8 @@ class NotLearned:
         if self.what == "instruction":
             return f"{self.name!r} is not learned: none of its {count} is kept, because {self.reason}"
         return (
-            f"{self.name!r} is handled in {count} and could not be learned: {self.reason}. Nothing is "
-            f"anchored to another object in its place. What helps: {NEXT_STEP}"
+            f"{self.name!r} is handled in {count} and could not be learned: {self.reason}. "
+            f"What helps: {NEXT_STEP}"
         )
 
 

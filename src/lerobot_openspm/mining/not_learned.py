@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections import Counter
+from collections import Counter, defaultdict
 
 from lerobot_openspm.memory.not_learned import MAX_RECORDS, NotLearned, not_learned
 from lerobot_openspm.mining.anchors import Demonstration, contact_roles, roles, suggested_anchor
@@ -28,11 +28,15 @@ def list_not_learned(mined: MinedDataset) -> tuple[NotLearned, ...]:
     At most :data:`MAX_RECORDS` of them.
     """
     handled, lost, instructions = Counter[str](), Counter[str](), list[NotLearned]()
+    stand_ins = defaultdict[str, set[str]](set)
     for task in mined.tasks:
         missing = [missing_objects(one, task) for one in task.aligned]
         for demonstration, own in zip(task.aligned, missing, strict=True):
-            handled.update(_handled(demonstration, task) | own)
+            anchors = _anchors_of_handled(demonstration, task)
+            handled.update(anchors.keys() | own)
             lost.update(own)
+            for name, places in anchors.items():
+                stand_ins[name] |= places - {name}
         if all(missing):
             named = " and ".join(map(repr, sorted(frozenset[str]().union(*missing))))
             why = f"what they handle is not known: {named}"
@@ -43,7 +47,10 @@ def list_not_learned(mined: MinedDataset) -> tuple[NotLearned, ...]:
         if name in mined.surfaces:
             continue
         if name not in found and name in mined.unlearned:
-            objects.append(not_learned("object", name, count, mined.unlearned[name]))
+            why = mined.unlearned[name]
+            if marks := " and the ".join(sorted(stand_ins[name])):
+                why += f"; what the hand does there is kept relative to the {marks}, with which it goes along"
+            objects.append(not_learned("object", name, count, why))
         elif lost[name] and name not in mined.objects and not mined.simulator_objects:
             objects.append(not_learned("object", name, count, "the hand touches it in no demonstration"))
         elif lost[name]:
@@ -52,8 +59,12 @@ def list_not_learned(mined: MinedDataset) -> tuple[NotLearned, ...]:
     return (*objects, *instructions)[:MAX_RECORDS]
 
 
-def _handled(demonstration: Demonstration, task: MinedTask) -> frozenset[str]:
-    """The objects that a demonstration's contacts belong to, as the instruction says."""
+def _anchors_of_handled(demonstration: Demonstration, task: MinedTask) -> dict[str, set[str]]:
+    """By object that contacts of a demonstration belong to, as the instruction says: what anchors them."""
     touching = contact_roles(demonstration.key_poses)
-    with_roles = zip(roles(demonstration.key_poses), demonstration.key_poses, strict=True)
-    return frozenset(suggested_anchor(pose, task.sub_tasks) for role, pose in with_roles if role in touching)
+    anchors = defaultdict[str, set[str]](set)
+    for role, pose in zip(roles(demonstration.key_poses), demonstration.key_poses, strict=True):
+        if role in touching:
+            anchor = task.anchors.get(role)
+            anchors[suggested_anchor(pose, task.sub_tasks)] |= set() if anchor is None else {anchor.place}
+    return anchors
