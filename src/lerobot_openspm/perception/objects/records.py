@@ -10,6 +10,8 @@ from numpy.typing import NDArray
 
 from lerobot_openspm.errors import MemoryFormatError
 
+# Points of an object, the fewest and how far from its frame, metres.
+MIN_POINTS, LARGEST_M = 8, 3.0
 # Name -> lowest and highest value that makes sense.
 BOUNDS = {
     "spacing": (1e-6, 1.0),
@@ -34,6 +36,18 @@ def number(fields: Mapping[str, Any], key: str, low: float, high: float, where: 
     if isinstance(value, bool) or not isinstance(value, (int, float)) or not low <= value <= high:
         raise MemoryFormatError(f"{where}: {key!r} is {value!r}, expected a number from {low:g} to {high:g}")
     return float(value)
+
+
+def points(arrays: Mapping[str, NDArray[Any]], where: str, most: int) -> NDArray[Any]:
+    """The points ``(n, 3)`` of an object in its frame, metres. Raises MemoryFormatError."""
+    found = array(arrays, "points", (-1, 3), where)
+    if not MIN_POINTS <= len(found) <= most:
+        raise MemoryFormatError(f"{where}: 'points' has {len(found)} rows, expected {MIN_POINTS} to {most}")
+    if (farthest := float(np.abs(found).max())) > LARGEST_M:
+        raise MemoryFormatError(
+            f"{where}: 'points' lie {farthest:g} m from the object's frame, expected {LARGEST_M:g} at most"
+        )
+    return found
 
 
 def array(

@@ -149,6 +149,36 @@ def test_where_it_stood_in_the_demonstrations_its_patches_are_believed(models):
     assert np.array_equal(found.T_world_obj, near.T_world_obj)
 
 
+@pytest.mark.parametrize(("share", "status"), [(0.3, "not_found"), (0.5, "found")])
+def test_patches_are_not_believed_where_the_surface_hardly_agrees(models, monkeypatch, share, status):
+    usual = {name: se3.from_yaw((x, y, 0.0), yaw) for name, (x, y, yaw) in MIDDLES.items()}
+    model, look = models["cup"], Look(views_at(usual, looking_down(*HOME)))
+    score = share * model.typical_agreement
+    place = Place(np.array([-0.1, 0.1, model.height, 0.0]), score)  # nothing agrees better anywhere
+    monkeypatch.setattr(model_module, "score_at", lambda *_: score)
+    monkeypatch.setattr(model_module, "search", lambda *_: [place])
+    assert model.near.localise(look).status == "found"
+    assert model.localise(look).status == status
+
+
+@pytest.mark.parametrize(("share", "is_raised"), [(0.7, False), (0.9, True)])
+def test_a_place_on_a_thing_that_is_not_believed_hides_none_on_the_table(
+    models, monkeypatch, share, is_raised
+):
+    model, supports = models["cup"], np.array([[0.1, 0.1, 0.05]])
+
+    def search(surface, sights, ground, *_):
+        on_thing = ground[0, 2] > model.height + 0.011
+        pose = np.array([0.1, 0.1, model.height + (0.05 if on_thing else 0.0), 0.0])
+        return [Place(pose, (share if on_thing else 0.62) * model.typical_agreement)]
+
+    monkeypatch.setattr(model_module, "search", search)
+    for told_apart in ((), ("cup",)):
+        look = Look(views_at({}, looking_down(*HOME)), supports=supports, told_apart=told_apart)
+        places = (model._all_places if told_apart else model._anywhere)(look, model._sights(look))
+        assert (places[0].pose[2] > model.height + 0.01) == is_raised
+
+
 @pytest.mark.parametrize(("is_large", "first"), [(False, np.pi / 2), (True, 0.0)])
 def test_another_direction_counts_less_of_a_large_object(models, is_large, first):
     surface = dataclasses.replace(models["block"].surface)
@@ -248,6 +278,7 @@ def test_a_record_tells_all_of_it(models):
         ({"hand_cameras": "hand"}, "list of camera keys"),
         ({"spacing": -1.0}, "'spacing' is -1.0"),
         ({"typical_agreement": 0.0}, "'typical_agreement' is 0.0"),
+        ({"table_height": -100.0}, "'table_height' -100, expected 3 m between them at most"),
     ],
 )
 def test_a_broken_record_is_refused(models, change, message):
@@ -261,6 +292,7 @@ def test_a_broken_record_is_refused(models, change, message):
     [
         ("table_area", np.array([[-1e6, -1e6], [1e6, 1e6]]), "'table_area' is"),
         ("table_area", np.array([[1.0, 1.0], [-1.0, -1.0]]), "'table_area' is"),
+        ("points", np.array([[0.0, 0.0, 1e7], *7 * [[0.0, 0.0, 0.0]]]), "'points' lie 1e\\+07 m"),
         ("hand.0", np.zeros((0, 4), np.uint8), "has no pixels"),
     ],
 )

@@ -35,7 +35,7 @@ CONSISTENT_M = 0.005
 # Of the typical correlation.
 FOUND_CORRELATION = 0.5
 INTRINSICS = ("width", "height", "fx", "fy", "cx", "cy")
-MAX_PROBES, MAX_PIXELS = 64, 10_000
+MAX_PROBES, MAX_PIXELS = 64, 4096
 
 
 @dataclass(frozen=True)

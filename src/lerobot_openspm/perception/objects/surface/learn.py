@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
 
 import cv2
@@ -66,6 +66,8 @@ def _learn_surfaces(near: Mapping[str, PatchModel], examples: Examples) -> dict[
     films = [(scene, scene.film()) for scene in examples.scenes if near and scene.film is not None]
     backdrop = learn_backdrop(_pictures(films), examples.floor) if films else None
     if backdrop is None:
+        if films:
+            _warn_of(near, "no camera of the hand shows a table")
         return {}
     scenes = [scene for scene, _ in films]
     first = [_first_poses(scene, near) for scene in scenes]
@@ -80,7 +82,14 @@ def _learn_surfaces(near: Mapping[str, PatchModel], examples: Examples) -> dict[
         models[name] = SurfaceModel(name, surface, backdrop, heights[name], typical, rival, near[name])
         logger.info("surface of %s: %d coloured points, agreement %.2f, without it %.2f",
                     name, len(surface.coloured), typical, rival)  # fmt: skip
+    _warn_of(near.keys() - models.keys(), "the hand's camera shows too little of its surface")
     return models
+
+
+def _warn_of(names: Collection[str], why: str) -> None:
+    """Say which objects are known by patches alone."""
+    if names:
+        logger.warning("found only about where they were shown, since %s: %s", why, ", ".join(sorted(names)))
 
 
 def _pictures(films: Sequence[tuple[DemonstrationScene, Sequence[Moment]]]) -> dict[str, list[View]]:

@@ -18,6 +18,8 @@ from lerobot_openspm.perception.objects.surface.sight import Surface
 
 # What a record may hold: points, coloured ones at least, and the table's length and width in metres, rounded.
 MAX_POINTS, MIN_COLOURED, MAX_TABLE_M, ROUNDING_M = 60_000, 8, 10.0, 1e-3
+# The frame of what stands on the table is this far above or below it at most, metres.
+MAX_ABOVE_M = 3.0
 BOUNDS = {
     "height": (-100.0, 100.0),
     "typical_agreement": (0.05, 1.0),
@@ -35,9 +37,7 @@ def from_record(fields: Mapping[str, Any], arrays: Mapping[str, NDArray[Any]], w
         raise MemoryFormatError(f"{where}: 'near' of {name!r} must be an object of kind {PatchModel.kind}")
     if not isinstance(cameras, list) or not all(isinstance(one, str) for one in cameras):
         raise MemoryFormatError(f"{where}: 'hand_cameras' of {name!r} must be a list of camera keys")
-    points = records.array(arrays, "points", (-1, 3), where)
-    if not 8 <= len(points) <= MAX_POINTS:
-        raise MemoryFormatError(f"{where}: 'points' has {len(points)} rows, expected 8 to {MAX_POINTS}")
+    points = records.points(arrays, where, MAX_POINTS)
     normals = records.array(arrays, "normals", (len(points), 3), where)
     colours = records.array(arrays, "colours", (len(points), 2, 3), where).copy()
     colours[(colours <= UNCOLOURED).any((1, 2))] = np.nan
@@ -61,6 +61,11 @@ def from_record(fields: Mapping[str, Any], arrays: Mapping[str, NDArray[Any]], w
     if any(mask.size == 0 for mask in hand.values()):
         raise MemoryFormatError(f"{where}: a picture of the hand has no pixels; learn the objects again")
     numbers = {key: records.number(fields, key, *BOUNDS[key], where) for key in BOUNDS}
+    if abs(numbers["height"] - numbers["table_height"]) > MAX_ABOVE_M:
+        raise MemoryFormatError(
+            f"{where}: 'height' is {numbers['height']:g} and 'table_height' {numbers['table_height']:g}, "
+            f"expected {MAX_ABOVE_M:g} m between them at most"
+        )
     backdrop = Backdrop(Colour(table[0], table[1:]), numbers["table_height"], area, {}, hand)
     own = {key.removeprefix("near."): value for key, value in arrays.items() if key.startswith("near.")}
     return SurfaceModel(
