@@ -119,8 +119,9 @@ class OpenSPMPolicy(PreTrainedPolicy):
             look = controller.advance(hand)
             while look is not None:  # twice where a part of the instruction ends and the next one begins
                 detections = episode.perception.detect(
-                    observation, look.names, look.expected, look.time_s, look.told_apart, look.displaced
-                )
+                    observation, look.names, look.expected, look.time_s, look.told_apart, look.displaced,
+                    look.is_loaded,
+                )  # fmt: skip
                 look = controller.take_in(look, detections, hand)
             for i in range(n_actions):
                 action = controller.executor.next_action(hand)

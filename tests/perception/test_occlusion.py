@@ -36,6 +36,15 @@ def test_a_larger_hand_hides_more_and_a_hand_camera_sees_past_its_own():
     assert not hand_mask(view("ee"), T_world_ee, 0.08).any()
 
 
+def test_what_the_fingers_are_around_is_hidden_too():
+    T_world_ee = se3.transform(DOWN, [0.0, 0.0, 0.1])
+    empty, loaded = (hand_mask(view(), T_world_ee, 0.05, load_m) for load_m in (0.0, 0.12))
+    uv, _ = project(view().camera, view().T_world_cam, [0.0, 0.1, 0.09])
+    row, column = round(float(uv[1])), round(float(uv[0]))
+    assert (empty[row, column], loaded[row, column]) == (False, True)
+    assert loaded[empty].all()
+
+
 @pytest.fixture
 def models(drawn_objects):
     return drawn_objects

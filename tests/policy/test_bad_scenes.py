@@ -1,5 +1,6 @@
 """Scenes that the policy must not act in: it says which object or camera is the reason, and nothing moves."""
 
+import re
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 
@@ -15,11 +16,12 @@ from lerobot_openspm.envs.tabletop.env import TabletopEnv
 from lerobot_openspm.envs.tabletop.simulator import TabletopSimulator
 from lerobot_openspm.geometry import se3
 from lerobot_openspm.modeling_openspm import OpenSPMPolicy
+from lerobot_openspm.perception.objects.base import Look
 
 SEEDS = (2_600_400, 2_600_401)
 STEPS = 6
 SIZE = 256
-CLOSE = np.array([0.0, 0, 0, 0, 0, 0, 1.0])
+CLOSE, FORWARD = np.array([0.0, 0, 0, 0, 0, 0, 1.0]), np.array([1.0, 0, 0, 0, 0, 0, -1.0])
 
 
 @pytest.fixture
@@ -37,43 +39,55 @@ def in_no_view(simulator: TabletopSimulator) -> None:
     put(simulator, (3.0, 3.0, 0.0))
 
 
-def half_out_of_all_views(simulator: TabletopSimulator) -> None:
-    put(simulator, (0.35, 0.85, 0.0))
-
-
-def in_the_hand(simulator: TabletopSimulator) -> None:
+def in_the_hand(simulator: TabletopSimulator, forward: int = 10) -> None:
+    """The gripper around the bowl's rim, some steps of 2 cm before its home."""
+    for _ in range(forward):
+        simulator.apply(FORWARD)
     at = simulator.ee_pose()[:3, 3] - [0.0, 0.053, 0.040]
     for _ in range(14):
         put(simulator, at)
         simulator.apply(CLOSE)
 
 
+def in_the_hand_at_home(simulator: TabletopSimulator) -> None:
+    in_the_hand(simulator, forward=0)
+
+
 def under_another(simulator: TabletopSimulator) -> None:
     put(simulator, (*simulator.object_poses()["cabinet"][:2, 3], 0.08))
 
 
-def hold_still(policy: OpenSPMPolicy, env: TabletopEnv) -> EpisodeState:
-    """What becomes of an episode whose actions are all still, from the scene as it is."""
+def look(policy: OpenSPMPolicy, env: TabletopEnv, steps: int = 1) -> tuple[EpisodeState, np.ndarray]:
+    """What becomes of an episode in a scene that nobody changes, and the actions ``(steps, 7)``."""
     policy.reset()
-    for _ in range(STEPS):
+    actions = []
+    for _ in range(steps):
         observation = {
             "pixels": {name: env.simulator.render(name, SIZE, SIZE) for name in ("front", "side", "wrist")},
             "agent_pos": env.state(),
         }
         with torch.inference_mode():
-            action = policy.select_action(batch_of([frame_of(env, observation)]))
-        assert not action[..., :6].any()
-    return policy.episodes[0].controller.state
+            actions.append(policy.select_action(batch_of([frame_of(env, observation)]))[0].numpy())
+    return policy.episodes[0].controller.state, np.stack(actions)
 
 
+def hold_still(policy: OpenSPMPolicy, env: TabletopEnv) -> EpisodeState:
+    """What becomes of an episode whose actions are all still, from the scene as it is."""
+    state, actions = look(policy, env, STEPS)
+    assert not actions[:, :6].any()
+    return state
+
+
+# The bowl in the hand at home hides from the front camera a place behind the table's middle that no other
+# camera shows. There it is taken to stand, 36 cm further than the demonstrations went.
 @pytest.mark.parametrize("seed", SEEDS)
 @pytest.mark.parametrize(
-    ("spoil", "statuses"),
+    ("spoil", "status", "words"),
     [
-        (in_no_view, {Status.OBJECT_NOT_FOUND}),
-        (half_out_of_all_views, {Status.OBJECT_NOT_FOUND, Status.INFEASIBLE}),
-        (in_the_hand, {Status.OBJECT_NOT_FOUND, Status.INFEASIBLE}),
-        (under_another, {Status.OBJECT_NOT_FOUND}),
+        (in_no_view, Status.OBJECT_NOT_FOUND, "cannot find the bowl"),
+        (in_the_hand, Status.OBJECT_NOT_FOUND, "the fingers are around something"),
+        (in_the_hand_at_home, Status.OBJECT_NOT_FOUND, "the fingers are around something"),
+        (under_another, Status.OBJECT_NOT_FOUND, "cannot find the bowl"),
     ],
     ids=lambda one: getattr(one, "__name__", ""),
 )
@@ -81,14 +95,31 @@ def test_what_cannot_be_grasped_as_it_was_shown_is_refused_by_name(
     policy: OpenSPMPolicy,
     env: TabletopEnv,
     spoil: Callable[[TabletopSimulator], None],
-    statuses: set[Status],
+    status: Status,
+    words: str,
     seed: int,
 ):
     env.reset(seed=seed)
     spoil(env.simulator)
     state = hold_still(policy, env)
-    assert state.status in statuses
+    assert state.status is status
     assert "bowl" in state.refusal
+    assert words in state.refusal
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_what_is_half_out_of_all_views_is_refused_for_that_alone(
+    load: Callable[..., OpenSPMPolicy], env: TabletopEnv, monkeypatch: pytest.MonkeyPatch, seed: int
+):
+    # The few demonstrations of the tests went no further than 30 cm to this side; the arm reaches further.
+    policy = load(reach_margin_m=0.2)
+    env.reset(seed=seed)
+    put(env.simulator, (0.1, -0.485, 0.0))
+    state = hold_still(policy, env)
+    assert state.status is Status.OBJECT_NOT_FOUND
+    assert re.fullmatch("no view shows more than [34][0-9] % of the bowl", state.refusal)
+    monkeypatch.setattr(Look, "seen_share", lambda *_: 1.0)
+    assert look(policy, env)[0].status is Status.RUNNING
 
 
 # The policy of the tests knows three objects, the fewest to compare; the front camera turned by 3 degrees is

@@ -43,7 +43,12 @@ def why_missing(
             reasons.append(f"cannot tell which {name} is meant, or where it stands")
         else:
             reasons.append(f"cannot find the {name}: it is in no view, hidden, or not as it was shown")
-    low, high = FINGERS_AROUND
-    if low < hand.opening / robot.open_width < high:
+    if are_around_something(hand, robot):
         reasons.append("the fingers are around something, which may be it")
     return "; ".join(reasons)
+
+
+def are_around_something(hand: Hand, robot: RobotModel) -> bool:
+    """Whether the fingers are, as far as can be felt."""
+    low, high = FINGERS_AROUND
+    return low < hand.opening / robot.open_width < high

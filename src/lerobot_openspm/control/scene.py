@@ -10,7 +10,7 @@ import numpy as np
 from lerobot_openspm.control.grounding import Grounding, demonstrations, references
 from lerobot_openspm.control.plan import Plan
 from lerobot_openspm.control.planning import PlanningContext
-from lerobot_openspm.control.reasons import why_missing
+from lerobot_openspm.control.reasons import are_around_something, why_missing
 from lerobot_openspm.control.transfer import Target
 from lerobot_openspm.geometry.se3 import Array
 from lerobot_openspm.memory.compose import Candidate
@@ -40,6 +40,7 @@ class LookRequest:
         told_apart: Those that the instruction tells from others of their kind.
         displaced: Those that need not be where they were in the first looks any more.
         back_to: The key pose to go back to after the look; None unless something is tried again.
+        is_loaded: Whether the fingers are around something before anything was seen.
     """
 
     names: tuple[str, ...]
@@ -49,6 +50,7 @@ class LookRequest:
     told_apart: frozenset[str]
     displaced: frozenset[str]
     back_to: int | None
+    is_loaded: bool = False
 
 
 class SceneState:
@@ -93,7 +95,8 @@ class SceneState:
         told_apart = frozenset(self.grounding.said) & frozenset(names)
         time_s = self._step * self._context.step_s
         displaced = frozenset(self.tracker.displaced)
-        return LookRequest(tuple(names), expected, time_s, held, told_apart, displaced, back_to)
+        is_loaded = not expected and are_around_something(hand, self._context.robot)
+        return LookRequest(tuple(names), expected, time_s, held, told_apart, displaced, back_to, is_loaded)
 
     def take_in(self, detections: Detections, hand: Hand, is_felt: bool = False) -> frozenset[str]:
         """Take in what a look brought; the names of the objects that are somewhere else than before.

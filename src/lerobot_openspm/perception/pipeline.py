@@ -32,6 +32,8 @@ CHANGED_PX, CHANGED_LEVELS = 8, 6.0
 TIP_M, BACK_M, BALLS = 0.01, -0.30, 12
 # The fingers are slimmer than what carries them; they end here.
 FINGERS_M, FINGER_SHARE = -0.05, 0.6
+# What the fingers are around reaches this far from their tips, metres.
+LOAD_M = 0.12
 
 
 class KnownWorld(Protocol):
@@ -113,6 +115,7 @@ class Perception:
         time_s: float,
         told_apart: Collection[str] = (),
         displaced: Collection[str] = (),
+        is_loaded: bool = False,
     ) -> Detections:
         """Look for objects.
 
@@ -124,6 +127,7 @@ class Perception:
             time_s: Seconds since the episode began.
             told_apart: Those of the objects that words tell from others of their kind.
             displaced: Objects of which earlier looks tell nothing any more.
+            is_loaded: Whether the fingers are around something: it is not to be taken for what stands behind.
 
         Raises:
             ObservationError: A camera is missing or broken at the very first look.
@@ -144,7 +148,10 @@ class Perception:
         sound = {camera: view for camera, view in views.items() if camera not in faults}
         if not sound:
             return Detections({}, faults)
-        hidden = {camera: hand_mask(view, T_world_ee, self.hand_radius_m) for camera, view in sound.items()}
+        load_m = LOAD_M if is_loaded else 0.0
+        hidden = {
+            camera: hand_mask(view, T_world_ee, self.hand_radius_m, load_m) for camera, view in sound.items()
+        }
         known = {name: self.memory.objects[name] for name in names if name in self.memory.objects}
         self.before = tuple(one.without(displaced) for one in self.before)
         look = look_at(sound, list(known), self.segmenter, hidden, expected, told_apart, self.before)
@@ -274,13 +281,14 @@ def detect(
     return localise_all(objects, look)
 
 
-def hand_mask(view: View, T_world_ee: Array, radius: float) -> Mask:
+def hand_mask(view: View, T_world_ee: Array, radius: float, load_m: float = 0.0) -> Mask:
     """Pixels ``(H, W)`` that the hand may cover, drawn generously; none in a camera that the hand carries.
 
     Args:
         view: The view.
         T_world_ee: The hand's pose ``(4, 4)``; its z axis points out of it, away from the arm.
         radius: Of the hand, metres.
+        load_m: How far what it holds reaches from the fingertips, metres.
     """
     mask = np.zeros(view.image.shape[:2], np.uint8)
     if view.camera.mount == "ee":
@@ -290,7 +298,7 @@ def hand_mask(view: View, T_world_ee: Array, radius: float) -> Mask:
     uv, depth = project(view.camera, view.T_world_cam, centres)
     for at, centre, distance in zip(z, uv, depth, strict=True):
         if distance > radius and np.abs(centre).max() < 1e4:
-            own = radius * (FINGER_SHARE if at > FINGERS_M else 1.0)
+            own = max(radius * (FINGER_SHARE if at > FINGERS_M else 1.0), load_m if at == TIP_M else 0.0)
             radius_px = max(1, round(view.camera.focal_px * own / float(distance)))
             cv2.circle(mask, (round(centre[0]), round(centre[1])), radius_px, 1, -1)
     return mask.astype(bool)
