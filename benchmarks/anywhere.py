@@ -77,7 +77,7 @@ def look(checkpoint: Path, root: Path, task: str, seed: int) -> Row:
         for own, name in _taken_away(world, list(T_sim_obj)):
             with _without(world, own):
                 views, _ = observe(policy, world).usable_views(cameras)
-                gone.append((name, detect(views, {name: objects[name]})[name].status != "not_found"))
+                gone.append((name, detect(views, objects)[name].status != "not_found"))
     return {"found": found, "gone": gone, "drawn": len(drawn), "tried": len(tried)}
 
 

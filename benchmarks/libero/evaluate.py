@@ -9,6 +9,7 @@ two action by action. Every episode is written down as it ends; a second run doe
 
 from __future__ import annotations
 
+import functools
 import gc
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -173,7 +174,7 @@ def evaluate_one(config: EvaluationConfig, task: str, state: int) -> Row:
     seed = (config.tuning_seed if config.tuning else SEED) + state
     is_exchanged = config.tuning and config.suite != SUITE
     file = exchanged(task, seed) if is_exchanged else variant_file(config.suite, task)
-    policy, simulator = _policy(config), kept_simulator(task, file)
+    policy, simulator = _policy(config.checkpoint, config.execution), kept_simulator(task, file)
     if config.tuning:
         simulator.reset(seed)
         move_hand(simulator, np.random.default_rng(seed))
@@ -212,28 +213,27 @@ def _place(T_world_obj: np.ndarray) -> list[float]:
     return [round(float(x), 5) for x in (*T_world_obj[:3, 3], se3.yaw_of(T_world_obj))]
 
 
-_KEPT: dict[str, Any] = {}
+@functools.lru_cache(1)
+def _policy(checkpoint: str, execution: Execution | None) -> OpenSPMPolicy:
+    policy = load(checkpoint)
+    if execution:
+        policy.config.execution = execution
+    # robosuite collects garbage at every reset; it need not look through all modules each time.
+    gc.freeze()
+    return policy
 
 
-def _policy(config: EvaluationConfig) -> OpenSPMPolicy:
-    kept = (config.checkpoint, config.execution)
-    if _KEPT.get("policy_of") != kept:
-        policy = load(config.checkpoint)
-        if config.execution:
-            policy.config.execution = config.execution
-        _KEPT.update(policy_of=kept, policy=policy)
-        # robosuite collects garbage at every reset; it need not look through all modules each time.
-        gc.freeze()
-    return _KEPT["policy"]
+# The last simulator by its task and file; a cache would drop it without closing it.
+_SIMULATOR: dict[tuple[str, Path | None], LiberoSimulator] = {}
 
 
 def kept_simulator(task: str, file: Path | None) -> LiberoSimulator:
     """A task's simulator, the same one as before if it was asked for last; else that is closed."""
-    if _KEPT.get("scene") != (task, file):
-        if "simulator" in _KEPT:
-            _KEPT["simulator"].close()
-        _KEPT.update(scene=(task, file), simulator=LiberoSimulator(task, LIBERO_IMAGE_SIZE, file))
-    return _KEPT["simulator"]
+    if (task, file) not in _SIMULATOR:
+        while _SIMULATOR:
+            _SIMULATOR.popitem()[1].close()
+        _SIMULATOR[task, file] = LiberoSimulator(task, LIBERO_IMAGE_SIZE, file)
+    return _SIMULATOR[task, file]
 
 
 if __name__ == "__main__":

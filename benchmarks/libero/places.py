@@ -21,6 +21,7 @@ import numpy as np
 from benchmarks.calls import watched
 from benchmarks.episodes import LazyImages
 from benchmarks.harness import Row, measured_folder, resume
+from benchmarks.libero import evaluate, place_errors, variants
 from benchmarks.libero.evaluate import kept_simulator, move_hand
 from benchmarks.libero.place_errors import judged, not_known, several_of_a_kind, summary
 from benchmarks.libero.variants import exchanged
@@ -29,6 +30,7 @@ from benchmarks.stages import DEMOS, LIBERO, DatasetOption, dataset
 from benchmarks.truth import offsets_in
 from benchmarks.worlds import LiberoWorld
 
+from benchmarks import calls, truth
 from lerobot_openspm.cli.pipeline import collect_dataset
 from lerobot_openspm.configuration_openspm import OpenSPMConfig
 from lerobot_openspm.envs.collection import SUMMARY_FILE
@@ -232,7 +234,8 @@ def look(
 def main(config: PlacesConfig) -> dict[str, Any]:
     """Do what is missing, write and return the result."""
     root = config.demonstrations()
-    files = [root / "meta/info.json", root / SUMMARY_FILE]
+    code = [Path(str(module.__file__)) for module in (calls, evaluate, place_errors, truth, variants)]
+    files = [root / "meta/info.json", root / SUMMARY_FILE, *code]
     output = Path(config.output or f"outputs/bench/{config.name}")
     options = [config.suite, str(config.exchanged), *config.asked()]
     folder = measured_folder(output, files, options, __file__)
