@@ -141,9 +141,9 @@ class OpenSPMConfig(PreTrainedConfig):
             that its joints cannot reach are refused, grasps of symmetric objects turned. It is kept with
             the checkpoint.
         hand_radius_m: Radius of the hand, in metres. It hides what is behind it, and keeps clear of objects.
-        perception: What finds objects. "demonstrations": the colours and patches that the demonstrations
-            showed. "sam3" and "grounded_sam2": pretrained segmenters that take any phrase. "given": the
-            masks in ``observation.masks.<camera>``. "oracle": the simulator's poses, for ablations only.
+        perception: What finds objects. "demonstrations": the colours, patches, surfaces and shapes that
+            these show. "sam3" and "grounded_sam2": pretrained segmenters that take any phrase. "given": masks
+            in ``observation.masks.<camera>``. "oracle": the simulator's poses, for ablations only.
         tracking: Whether objects are followed through the episode. Otherwise they are found once, as in the
             paper, and later pictures are neither needed nor used.
         segmenter: What a segmenter needs, and what is learned from its masks.

@@ -54,7 +54,7 @@ MIN_END_CONFIDENCE = 0.8
 def learn_scenes(
     demonstrations: Demonstrations, mined: Sequence[MinedEpisode], cameras: Mapping[str, Camera]
 ) -> list[DemonstrationScene]:
-    """What perception learns from: two frames of every episode, and where the hand touched what."""
+    """What perception learns from: two frames of every episode, films of some, and what was touched where."""
     scenes, filmed = [], Counter[str]()
     n_tasks = len({item.episode.task for item in mined})
     per_task = int(np.clip(FILMED // max(n_tasks, 1), 1, FILMED_PER_TASK))
