@@ -43,6 +43,8 @@ def test_what_the_fingers_are_around_is_hidden_too():
     row, column = round(float(uv[1])), round(float(uv[0]))
     assert (empty[row, column], loaded[row, column]) == (False, True)
     assert loaded[empty].all()
+    # Right before the hand's camera it would look like anything.
+    assert hand_mask(view("ee"), T_world_ee, 0.05, 0.12).all()
 
 
 @pytest.fixture

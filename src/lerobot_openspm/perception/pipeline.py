@@ -228,12 +228,18 @@ def disagreeing_cameras(
         alone = Look({camera: view}, instances, hidden, expected)
         seen = {name: known[name].localise(alone) for name in names}
         places[camera] = {
-            name: [T[:2, 3] for T in (one.T_world_obj, *one.others)]
+            name: [_middle(known[name], T) for T in (one.T_world_obj, *one.others)]
             for name, one in seen.items()
             if one.status != "not_found"
         }
     # What such a camera shows was never usable.
     return {camera: Fault(reason, float("inf")) for camera, reason in disagreements(places).items()}
+
+
+def _middle(known: KnownObject, T_world_obj: Array) -> Array:
+    """Where the middle of an object is ``(2,)``: its frame may lie beside it, and swings as it turns."""
+    middle = known.points.mean(0) if len(known.points) else np.zeros(3)
+    return se3.apply(T_world_obj, np.asarray(middle, float)[None])[0, :2]
 
 
 def _small(view: View) -> Array:
@@ -282,7 +288,9 @@ def detect(
 
 
 def hand_mask(view: View, T_world_ee: Array, radius: float, load_m: float = 0.0) -> Mask:
-    """Pixels ``(H, W)`` that the hand may cover, drawn generously; none in a camera that the hand carries.
+    """Pixels ``(H, W)`` that the hand may cover, drawn generously.
+
+    In a camera that the hand carries none, or all where it holds something, which is close before it.
 
     Args:
         view: The view.
@@ -290,9 +298,9 @@ def hand_mask(view: View, T_world_ee: Array, radius: float, load_m: float = 0.0)
         radius: Of the hand, metres.
         load_m: How far what it holds reaches from the fingertips, metres.
     """
-    mask = np.zeros(view.image.shape[:2], np.uint8)
     if view.camera.mount == "ee":
-        return mask.astype(bool)
+        return np.full(view.image.shape[:2], load_m > 0)
+    mask = np.zeros(view.image.shape[:2], np.uint8)
     z = np.linspace(TIP_M, BACK_M, BALLS)
     centres = se3.apply(T_world_ee, np.stack([0 * z, 0 * z, z], axis=1))
     uv, depth = project(view.camera, view.T_world_cam, centres)

@@ -23,8 +23,11 @@ def views_at(poses, T_world_ee):
     )
 
 
-def demonstration(rng):
-    """The hand comes from one side to the cup, grasps it, and carries it over the block."""
+def demonstration(rng, touched=("cup", "block")):
+    """The hand comes from one side to the cup, grasps it, and carries it over the block.
+
+    Or it touches the distractor; only what is named is told to have been touched.
+    """
     poses = {
         name: se3.from_yaw([x + dx, y + dy, 0.0], yaw)
         for (name, (x, y, yaw)), (dx, dy) in zip(
@@ -33,7 +36,12 @@ def demonstration(rng):
     }
     grasp = poses["cup"][:3, 3] + [0.03, 0.0, 0.05] + rng.normal(0, 0.002, 3)
     release = poses["block"][:3, 3] + [0, 0, 0.12] + rng.normal(0, 0.002, 3)
-    cues = (ContactCue("cup", grasp, "grasp"), ContactCue("block", release, "release"))
+    touch = poses["distractor"][:3, 3] + [0.02, 0.0, 0.04]
+    cues = (
+        ContactCue("cup", grasp, "grasp"),
+        ContactCue("block", release, "release"),
+        ContactCue("distractor", touch, "contact"),
+    )
     places = [
         (
             *(rng.uniform(-0.25, 0.2), rng.uniform(-0.25, 0.25), rng.uniform(0.25, 0.45)),
@@ -49,7 +57,8 @@ def demonstration(rng):
             moments.append(Moment({"hand": seen["hand"]}, frozenset()))
         return moments
 
-    return DemonstrationScene(views_at(poses, looking_down(*HOME)), cues, None, film)
+    told = tuple(cue for cue in cues if cue.name in touched)
+    return DemonstrationScene(views_at(poses, looking_down(*HOME)), told, None, film)
 
 
 def moved(x, y, yaw):

@@ -81,7 +81,12 @@ def test_what_lies_on_its_side_is_not_found_and_said_to_have_tipped(models):
 def test_pictures_are_searched_once_for_what_has_tipped(models, monkeypatch):
     searched = []
     monkeypatch.setattr(model_module, "has_tipped", lambda *_: bool(searched.append(1)))
-    scene = {"block": se3.from_yaw([0.05, 0.1, 0.0], 0.4)}  # on which the missing cup is sought as well
+    # On the block the cup, which lies beside it, is sought as well.
+    on_its_side = se3.exp_so3([0.0, np.pi / 2, 0.0])
+    scene = {
+        "block": se3.from_yaw([0.05, 0.1, 0.0], 0.4),
+        "cup": se3.transform(on_its_side, [-0.1, 0.1, 0.04]),
+    }
     found = localise_all(models, Look(views_at(scene, looking_down(*HOME))))
     assert found["cup"].status == "not_found"
     assert searched == [1]

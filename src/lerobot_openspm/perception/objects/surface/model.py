@@ -71,8 +71,8 @@ YAWS = tuple(np.linspace(0, 2 * np.pi, 8, endpoint=False))
 # An object that agrees less than this share with its best place on the table may stand on something. That is
 # believed if it agrees this share, and the place on the table less than this share as well.
 CLEAR_SHARE, RAISED_SHARE, BETTER_SHARE = 0.9, 0.85, 0.93
-# What stands upright nowhere has tipped if it agrees by this share more than it would need to be found.
-TIPPED_MORE = 0.05
+# What stands upright nowhere has tipped if it agrees by so much more than to be found, and is half in view.
+TIPPED_MORE, TIPPED_SEEN_SHARE = 0.05, 0.5
 
 
 @dataclass(frozen=True)
@@ -141,9 +141,8 @@ class SurfaceModel:
         if self.name in look.told_apart and expected is None:
             found = self._estimate(look, sights, self._all_places(look, sights))
             return self._unless_tipped(look, sights, found)
-        near_score = 0.0
-        if near.status == "found":
-            near_score = score_at(self.surface, sights, _pose(near.T_world_obj))
+        is_seen = near.status == "found"
+        near_score = score_at(self.surface, sights, _pose(near.T_world_obj)) if is_seen else 0.0
         is_near = near_score >= BELIEVED_SHARE * self.typical_agreement
         # Of two alike, another one may stand where this one was shown.
         if is_near and (expected is None or self.name not in look.told_apart):
@@ -262,8 +261,8 @@ class SurfaceModel:
         ground = ground[((ground[:, :2] > low) & (ground[:, :2] < high)).all(1)]
         if len(ground) == 0:
             return []
-        free = Freedom(not self.surface.is_round, lifts=True)
-        places = search(self.surface, sights, ground, self._yaws, free, several)
+        lifts = replace(self._freedom, lifts=True)
+        places = search(self.surface, sights, ground, self._yaws, lifts, several)
         return [one for one in places if one.score >= self._needed(one) * self.typical_agreement]
 
     def _needed(self, place: Place) -> float:
@@ -273,7 +272,7 @@ class SurfaceModel:
 
     def _unless_tipped(self, look: Look, sights: Mapping[str, Sight], found: PoseEstimate) -> PoseEstimate:
         """A first look's estimate, which says where there is none whether the object lies on the table."""
-        if found.status != "not_found":
+        if found.status != "not_found" or found.visible < TIPPED_SEEN_SHARE:
             return found
         sides, table = lying(self.surface), self.backdrop.table_height
         needed = (self.found_share + TIPPED_MORE) * self.typical_agreement
@@ -298,8 +297,8 @@ class SurfaceModel:
         share = best.score / self.typical_agreement
         apart = max(SAME_PLACE_M, OVERLAP_SHARE * self.surface.radius)
         rivals = [one for one in places[1:] if middles_apart(self.surface, one, best) > apart]
-        likely = likelihood(self.surface, best)
-        is_rivalled = any(likelihood(self.surface, one) > RIVAL_SHARE * likely for one in rivals)
+        most = RIVAL_SHARE * likelihood(self.surface, best)
+        is_rivalled = any(likelihood(self.surface, one) > most for one in rivals)
         status = "not_found" if share < self._needed(best) else "ambiguous" if is_rivalled else "found"
         T = se3.from_yaw(best.pose[:3], float(best.pose[3]))
         covariance = covariance_at(self.surface, sights, best.pose, not self.surface.is_round)
