@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from tests.perception.builders import localise
@@ -6,7 +8,6 @@ from tests.perception.drawn_world import DISTRACTOR, SHAPES, cameras, draw_poses
 from lerobot_openspm.geometry import se3
 from lerobot_openspm.geometry.camera import project
 from lerobot_openspm.perception.objects.base import Look, localise_all
-from lerobot_openspm.perception.objects.shape.fitting import Evidence
 from lerobot_openspm.perception.objects.shape.occlusion import behind
 from lerobot_openspm.perception.pipeline import hand_mask
 from lerobot_openspm.types import PoseEstimate, View
@@ -135,28 +136,52 @@ class Pillar:
 
 def test_what_stands_before_a_place_hides_it_and_what_stands_behind_it_does_not():
     pillar = se3.from_yaw([0.0, 0.0, 0.0], 0.0)
-    standing = [pillar_points(pillar)]
-    evidence = Evidence(view(), np.ones((160, 160), np.float32))
+    look = Look({"front": view()}, standing={"pillar": pillar_points(pillar)})
     # The front camera stands at x > 0 and looks down: the pillar hides what is at x < 0.
     far_point, near_point = [-0.12, 0.0, 0.03], [0.15, 0.0, 0.03]
-    (far,) = behind([evidence], standing, np.array(far_point))
-    (near,) = behind([evidence], standing, np.array(near_point))
-    for one, point, is_seen in ((far, far_point, 0), (near, near_point, 1)):
+    far, near = (behind(look, "cup", np.array(point)).hidden["front"] for point in (far_point, near_point))
+    for hidden, point, is_hidden in ((far, far_point, True), (near, near_point, False)):
         uv, _ = project(view().camera, view().T_world_cam, point)
-        assert one.visible[round(float(uv[1])), round(float(uv[0]))] == is_seen
-    (above,) = behind([evidence], standing, np.array([0.3, 0.0, 0.4]))
-    assert above is evidence, "nothing is before it, and nothing need be computed anew"
+        assert hidden[round(float(uv[1])), round(float(uv[0]))] == is_hidden
+    above = behind(look, "cup", np.array([0.3, 0.0, 0.4]))
+    assert above is look, "nothing is before it, and nothing need be computed anew"
     drawn = render([(PILLAR, pillar)])["front"].image
     is_pillar = (np.abs(drawn.astype(int) - (196, 166, 128)) > 10).any(axis=2)
-    assert np.mean((far.visible == 0) == is_pillar) > 0.97
+    assert np.mean(far == is_pillar) > 0.97
 
 
-def test_a_thing_does_not_hide_itself_under_another_name():
+def test_a_thing_hides_itself_neither_by_its_name_nor_under_another_one():
     points = pillar_points(se3.from_yaw([0.0, 0.0, 0.0], 0.0))
-    evidence = Evidence(view(), np.ones((160, 160), np.float32))
-    assert behind([evidence], [points], points.mean(0)) == [evidence]
-    (beside,) = behind([evidence], [points], points.mean(0) - [0.1, 0.0, 0.0])
-    assert beside.visible.min() == 0
+    look, behind_it = Look({"front": view()}, standing={"pillar": points}), points.mean(0) - [0.1, 0.0, 0.0]
+    assert behind(look, "post", points.mean(0)) is look
+    assert behind(look, "pillar", behind_it) is look
+    assert behind(look, "post", behind_it).hidden["front"].any()
+
+
+@pytest.mark.parametrize("beside", [[0.09, -0.01], [0.07, -0.01]])
+def test_what_is_followed_is_seen_past_what_stands_before_it(models, beside):
+    model, cup = models["cup"], se3.from_yaw([-0.15, -0.05, 0.0], 0.0)
+    expected = {"cup": model.localise(Look(render([(SHAPES["cup"], cup)]))).T_world_obj}
+    pillar = se3.from_yaw([*(cup[:2, 3] + beside), 0.0], 0.0)
+    standing = {"pillar": pillar_points(pillar)}
+    there, gone = (render([*shapes, (PILLAR, pillar)]) for shapes in ([(SHAPES["cup"], cup)], []))
+    assert model.localise(Look(there, expected=expected)).status == "not_found"
+    found = model.localise(Look(there, expected=expected, standing=standing))
+    assert found.status == "found"
+    assert found.T_world_obj[:2, 3] == pytest.approx(cup[:2, 3], abs=0.005)
+    assert model.localise(Look(gone, expected=expected, standing=standing)).status == "not_found"
+
+
+def test_what_others_hide_where_it_is_expected_is_not_missed_there(models):
+    model, cup = models["cup"], se3.from_yaw([-0.15, -0.05, 0.0], 0.0)
+    pillars = [
+        se3.from_yaw([*(cup[:2, 3] + by), 0.0], 0.0) for by in ([0.06, 0.0], [0.0, -0.06], [0.0, 0.06])
+    ]
+    look = Look(render([(PILLAR, T) for T in pillars]), expected={"cup": cup})
+    standing = {f"pillar {i}": pillar_points(T) for i, T in enumerate(pillars)}
+    alone, among = model.localise(look), model.localise(replace(look, standing=standing))
+    assert (alone.status, among.status) == ("not_found", "not_found")
+    assert among.visible < 0.5 < alone.visible
 
 
 def test_one_of_two_that_is_hidden_in_a_view_by_what_is_known_is_found_too(models):
@@ -164,7 +189,7 @@ def test_one_of_two_that_is_hidden_in_a_view_by_what_is_known_is_found_too(model
     pillar = se3.from_yaw([-0.06, -0.06, 0.0], 0.0)
     views = render([*((SHAPES["cup"], T) for T in cups), (PILLAR, pillar)])
     alone = models["cup"].localise(Look(views))
-    told = models["cup"].localise(Look(views, standing=[pillar_points(pillar)]))
+    told = models["cup"].localise(Look(views, standing={"pillar": pillar_points(pillar)}))
     assert alone.others == ()
     assert len(told.others) == 1
     objects = {"cup": models["cup"], "pillar": Pillar(pillar)}

@@ -34,7 +34,7 @@ class LookRequest:
 
     Attributes:
         names: The objects.
-        expected: Poses ``T_world_obj`` ``(4, 4)`` at which those that were seen before are expected.
+        expected: Poses ``T_world_obj`` ``(4, 4)`` of all objects that were seen before.
         time_s: Seconds since the episode began.
         held: Those of the objects that are taken to be in the hand.
         told_apart: Those that the instruction tells from others of their kind.
@@ -90,7 +90,7 @@ class SceneState:
 
     def look(self, names: Sequence[str], hand: Hand, back_to: int | None = None) -> LookRequest:
         """A look for some objects, now."""
-        expected = {k: T for k, T in self.tracker.poses(hand.T_world_ee).items() if k in names}
+        expected = self.tracker.poses(hand.T_world_ee)
         held = self.tracker.held & frozenset(names)
         told_apart = frozenset(self.grounding.said) & frozenset(names)
         time_s = self._step * self._context.step_s

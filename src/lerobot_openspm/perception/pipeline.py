@@ -122,8 +122,8 @@ class Perception:
         Args:
             observation: What there is to see.
             names: The objects.
-            expected: Poses ``T_world_obj`` ``(4, 4)`` of those that were seen before; they are looked for
-                there first.
+            expected: Poses ``T_world_obj`` ``(4, 4)`` of what was seen before. There the objects are sought
+                first, and others may hide them.
             time_s: Seconds since the episode began.
             told_apart: Those of the objects that words tell from others of their kind.
             displaced: Objects of which earlier looks tell nothing any more.
@@ -154,7 +154,14 @@ class Perception:
         }
         known = {name: self.memory.objects[name] for name in names if name in self.memory.objects}
         self.before = tuple(one.without(displaced) for one in self.before)
-        look = look_at(sound, list(known), self.segmenter, hidden, expected, told_apart, self.before)
+        standing = {
+            name: se3.apply(T, self.memory.objects[name].points)
+            for name, T in expected.items()
+            if name in self.memory.objects and len(self.memory.objects[name].points)
+        }
+        look = look_at(
+            sound, list(known), self.segmenter, hidden, expected, told_apart, standing, self.before
+        )
         estimates = self._localise(known, look)
         found = {name: one for name, one in estimates.items() if name not in displaced}
         self.remember(look, found, is_still=not displaced)

@@ -72,7 +72,7 @@ class Look:
         expected: Poses ``T_world_obj`` ``(4, 4)`` by object at which it is looked for first.
         told_apart: Objects that words tell from others of their kind, all of which are sought therefore.
         supports: Points ``(n, 3)`` of other things' surfaces, world, that an object may stand on or in.
-        standing: Points ``(n, 3)`` of each of the other things that were found, world, which may hide it.
+        standing: Points ``(n, 3)``, world, of what is known to stand somewhere, by name; it may hide others.
         before: Earlier looks from elsewhere, the oldest first.
 
     Raises:
@@ -85,7 +85,7 @@ class Look:
     expected: Mapping[str, Array] = field(default_factory=dict[str, Array])
     told_apart: Collection[str] = ()
     supports: Array = field(default_factory=lambda: np.zeros((0, 3)))
-    standing: Sequence[Array] = ()
+    standing: Mapping[str, Array] = field(default_factory=dict[str, Array])
     before: Sequence[EarlierLook] = ()
     _bins: dict[str, Bins] = field(default_factory=dict[str, Bins])
     _prepared: dict[Hashable, Any] = field(default_factory=dict[Hashable, Any])
@@ -159,11 +159,12 @@ def look_at(
     hidden: Mapping[str, Mask],
     expected: Mapping[str, Array],
     told_apart: Collection[str] = (),
+    standing: Mapping[str, Array] | None = None,
     before: Sequence[EarlierLook] = (),
 ) -> Look:
     """A :class:`Look` for objects. A segmenter is asked once for all of their phrases."""
     found = segmenter.segment(views, phrases) if segmenter is not None and phrases else {}
-    return Look(views, found, hidden, expected, told_apart, before=before)
+    return Look(views, found, hidden, expected, told_apart, standing=standing or {}, before=before)
 
 
 def localise_all(objects: Mapping[str, KnownObject], look: Look) -> dict[str, PoseEstimate]:
@@ -179,7 +180,7 @@ def localise_all(objects: Mapping[str, KnownObject], look: Look) -> dict[str, Po
         others = {other: own for other, own in points.items() if other != name and len(own)}
         if objects[name].sought_again and others and not is_clear and name not in look.expected:
             supports = np.concatenate(list(others.values()))
-            standing = [own for other, own in others.items() if other in stand]
+            standing = {**look.standing, **{other: own for other, own in others.items() if other in stand}}
             found[name] = objects[name].localise(replace(look, supports=supports, standing=standing))
     return found
 

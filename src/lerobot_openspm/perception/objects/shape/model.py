@@ -133,16 +133,13 @@ class ShapeModel:
 
         What other things hide of a place where it is sought tells nothing.
         """
-        T_expected = look.expected.get(self.name)
-        evidence, fits = _evidence(self, look), list[Fit]()
-        if T_expected is not None:
-            there = fit(evidence, self.cloud, T_expected, _nearby(self, T_expected), NEARBY_CUTS_PX)
-            fits = [there] if there.score >= NEARBY_CONFIDENCE * self.typical_overlap else []
+        evidence, fits = _evidence(self, look), self._where_expected(look)
         if not fits:
             prior = PosePrior(yaw=0.0 if self.yaw_period == 0 else np.inf)
             starts = list[tuple[Sequence[Evidence], list[Fit]]]()
             for point in candidates(evidence, self):
-                own = behind(evidence, look.standing, self._middle(point))
+                among = behind(look, self.name, self._middle(point))
+                own = evidence if among is look else _evidence(self, among)
                 poses = [se3.from_yaw(point, yaw) for yaw in self.search_yaws()]
                 turned = [fit(own, self.cloud, T, prior, COARSE_CUTS_PX, COARSE_PX) for T in poses]
                 starts.append((own, turned))
@@ -156,6 +153,20 @@ class ShapeModel:
             if fits and self._has_tipped(evidence, fits[0]):
                 return replace(self._estimate(look, evidence, fits), status="not_found", tipped=True)
         return self._estimate(look, evidence, fits)
+
+    def _where_expected(self, look: Look) -> list[Fit]:
+        """The fit around where the object is expected, if it is plainly seen there, at least past others."""
+        if (T_expected := look.expected.get(self.name)) is None:
+            return []
+        prior, enough = _nearby(self, T_expected), NEARBY_CONFIDENCE * self.typical_overlap
+        there = fit(_evidence(self, look), self.cloud, T_expected, prior, NEARBY_CUTS_PX)
+        if there.score < enough and (among := self._among_others(look, T_expected)) is not look:
+            there = fit(_evidence(self, among), self.cloud, T_expected, prior, NEARBY_CUTS_PX)
+        return [there] if there.score >= enough else []
+
+    def _among_others(self, look: Look, T_world_obj: Array) -> Look:
+        """The look for the object at a pose ``(4, 4)``, behind whatever stands before it."""
+        return behind(look, self.name, self._middle(T_world_obj[:3, 3]))
 
     def _middle(self, point: Array) -> Array:
         """The middle ``(3,)`` of the object standing at a point."""
@@ -193,13 +204,15 @@ class ShapeModel:
         """What fits at distinct places say, the best first."""
         T_expected, points = look.expected.get(self.name), self.cloud.points[::SHARE_STEP]
         if not fits:
-            visible = 1.0 if T_expected is None else look.seen_share(se3.apply(T_expected, points))
+            visible = 1.0 if T_expected is None else self._visible(look, T_expected)
             ignorance = np.diag([1.0, 1.0, 1.0, UNKNOWN_YAW_STD**2])
             return PoseEstimate("not_found", np.eye(4), ignorance, 0.0, visible)
         scores = [one.score for one in fits]
         status, confidence = verdict(scores, self.typical_overlap)
-        place = fits[0].T_world_obj if T_expected is None or status == "found" else T_expected
-        visible = look.seen_share(se3.apply(place, points))
+        if T_expected is None or status == "found":
+            visible = look.seen_share(se3.apply(fits[0].T_world_obj, points))
+        else:
+            visible = self._visible(look, T_expected)
         covariance = fits[0].covariance.copy()
         if self.yaw_period == 0:
             covariance[3, :] = covariance[:, 3] = 0
@@ -208,6 +221,11 @@ class ShapeModel:
         alike = tuple(poses[1 : 1 + others(scores, self.typical_overlap)])
         support = _support(self, evidence, fits[0])
         return PoseEstimate(status, poses[0], covariance, confidence, visible, support, alike)
+
+    def _visible(self, look: Look, T_expected: Array) -> float:
+        """How much of the object could be seen where it is expected ``(4, 4)``, past the hand and others."""
+        points = se3.apply(T_expected, self.cloud.points[::SHARE_STEP])
+        return self._among_others(look, T_expected).seen_share(points)
 
     def to_record(self) -> Record:
         """See :class:`lerobot_openspm.perception.objects.base.KnownObject`."""

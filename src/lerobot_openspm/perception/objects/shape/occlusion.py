@@ -10,7 +10,7 @@ import numpy as np
 
 from lerobot_openspm.geometry.camera import project
 from lerobot_openspm.geometry.se3 import Array
-from lerobot_openspm.perception.objects.shape.fitting import Evidence
+from lerobot_openspm.perception.objects.base import Look
 from lerobot_openspm.perception.objects.shape.silhouette import Float32
 from lerobot_openspm.types import View
 
@@ -18,6 +18,32 @@ from lerobot_openspm.types import View
 GAP_M = 0.012
 # What has its middle this near to that of another thing, metres, is that thing.
 SAME_THING_M = 0.02
+
+
+def behind(look: Look, name: str, point: Array) -> Look:
+    """The look for something at a point ``(3,)``, world: what stands before it is hidden too.
+
+    Args:
+        look: The look. Something known whose middle is at the point is the same thing by another name.
+        name: What is sought.
+        point: The middle of what may be there.
+
+    Returns:
+        The look itself where nothing is before the point.
+    """
+    others = [
+        own
+        for other, own in look.standing.items()
+        if other != name and np.linalg.norm(own.mean(0) - point) > SAME_THING_M
+    ]
+    hidden = dict(look.hidden)
+    for camera, view in look.views.items():
+        _, depth = project(view.camera, view.T_world_cam, point)
+        covered = nearest_depth(others, view) < float(depth)
+        if covered.any():
+            hidden[camera] = covered | hidden[camera] if camera in hidden else covered
+    is_same = all(hidden[camera] is look.hidden.get(camera) for camera in hidden)
+    return look if is_same else replace(look, hidden=hidden)
 
 
 def nearest_depth(surfaces: Sequence[Array], view: View) -> Float32:
@@ -43,28 +69,3 @@ def nearest_depth(surfaces: Sequence[Array], view: View) -> Float32:
         own = np.where(np.asarray(covered) > 0, cv2.erode(own, kernel), np.inf)
         nearest = np.minimum(nearest, own)
     return nearest
-
-
-def behind(evidence: Sequence[Evidence], standing: Sequence[Array], point: Array) -> list[Evidence]:
-    """The views of something at a point ``(3,)``, world: pixels of what stands before it tell nothing.
-
-    Args:
-        evidence: The views.
-        standing: Points ``(n, 3)`` of each thing's surface, world. One whose middle is there is the same
-            thing by another name, and hides nothing.
-        point: The middle of what may be there.
-    """
-    others = [own for own in standing if np.linalg.norm(own.mean(0) - point) > SAME_THING_M]
-    if not others:
-        return list(evidence)
-    told = list[Evidence]()
-    for one in evidence:
-        nearest = nearest_depth(others, one.view)
-        _, depth = project(one.view.camera, one.view.T_world_cam, point)
-        is_free = (nearest >= float(depth)).astype(np.float32)
-        if is_free.all():
-            told.append(one)
-            continue
-        visible = is_free if one.visible is None else np.minimum(one.visible, is_free)
-        told.append(replace(one, visible=visible))
-    return told
