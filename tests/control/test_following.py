@@ -190,6 +190,20 @@ def test_what_is_gone_is_waited_for_then_lost_and_taken_up_again_when_it_is_back
     assert one.executor.next_action(HAND) is None or np.isfinite(one.executor.next_action(HAND)).all()
 
 
+@pytest.mark.parametrize(("share", "is_loaded"), [(0.5, True), (1.0, False)])
+def test_what_the_fingers_are_around_is_left_out_until_all_is_seen(share, is_loaded):
+    # The plate is seen, and the bowl may be in the hand.
+    perception, one = Perception({"plate": entry().object_poses["plate"]}), controller()
+    hand, looks = Hand(HAND.T_world_ee, share * HAND.opening), []
+    for _ in range(12):
+        look = one.advance(hand)
+        while look is not None:
+            looks.append(look.is_loaded)
+            look = one.take_in(look, perception(look.names, look.expected, look.time_s), hand)
+    assert len(looks) > 1
+    assert set(looks) == {is_loaded}
+
+
 def test_what_hides_behind_the_hand_is_not_lost():
     perception, one = Perception(entry().object_poses), controller()
     observe(one, HAND, perception)

@@ -79,7 +79,7 @@ def hold_still(policy: OpenSPMPolicy, env: TabletopEnv) -> EpisodeState:
 
 
 # The bowl in the hand at home hides from the front camera a place behind the table's middle that no other
-# camera shows. There it is taken to stand, 36 cm further than the demonstrations went.
+# camera shows; there it would be taken to stand, were what the fingers are around not left out.
 @pytest.mark.parametrize("seed", SEEDS)
 @pytest.mark.parametrize(
     ("spoil", "status", "words"),

@@ -40,7 +40,7 @@ class LookRequest:
         told_apart: Those that the instruction tells from others of their kind.
         displaced: Those that need not be where they were in the first looks any more.
         back_to: The key pose to go back to after the look; None unless something is tried again.
-        is_loaded: Whether the fingers are around something before anything was seen.
+        is_loaded: Whether the fingers are around something, which may be an object that was not seen yet.
     """
 
     names: tuple[str, ...]
@@ -95,7 +95,8 @@ class SceneState:
         told_apart = frozenset(self.grounding.said) & frozenset(names)
         time_s = self._step * self._context.step_s
         displaced = frozenset(self.tracker.displaced)
-        is_loaded = not expected and are_around_something(hand, self._context.robot)
+        is_unknown = not self.tracker.held and not expected.keys() >= frozenset(names)
+        is_loaded = is_unknown and are_around_something(hand, self._context.robot)
         return LookRequest(tuple(names), expected, time_s, held, told_apart, displaced, back_to, is_loaded)
 
     def take_in(self, detections: Detections, hand: Hand, is_felt: bool = False) -> frozenset[str]:

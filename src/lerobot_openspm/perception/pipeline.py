@@ -143,22 +143,15 @@ class Perception:
             del views[camera]
         if self.segmenter is not None:
             self._labelled |= {name for name, view in views.items() if view.labels is not None}
-        T_world_ee = observation.hand.T_world_ee
-        faults = self._watch.check(views, absent, T_world_ee, time_s)
+        faults = self._watch.check(views, absent, observation.hand.T_world_ee, time_s)
         sound = {camera: view for camera, view in views.items() if camera not in faults}
         if not sound:
             return Detections({}, faults)
-        load_m = LOAD_M if is_loaded else 0.0
-        hidden = {
-            camera: hand_mask(view, T_world_ee, self.hand_radius_m, load_m) for camera, view in sound.items()
-        }
+        hand = observation.hand.T_world_ee, self.hand_radius_m, LOAD_M if is_loaded else 0.0
+        hidden = {camera: hand_mask(view, *hand) for camera, view in sound.items()}
         known = {name: self.memory.objects[name] for name in names if name in self.memory.objects}
         self.before = tuple(one.without(displaced) for one in self.before)
-        standing = {
-            name: se3.apply(T, self.memory.objects[name].points)
-            for name, T in expected.items()
-            if name in self.memory.objects and len(self.memory.objects[name].points)
-        }
+        standing = self._standing(expected)
         look = look_at(
             sound, list(known), self.segmenter, hidden, expected, told_apart, standing, self.before
         )
@@ -174,6 +167,11 @@ class Perception:
                 comparable = {name: self.memory.objects[name] for name in wanted}
                 faults = disagreeing_cameras(look, comparable, estimates)
         return Detections(estimates, faults)
+
+    def _standing(self, expected: Mapping[str, Array]) -> dict[str, Array]:
+        """Points ``(n, 3)``, world, of the objects at some poses ``(4, 4)``, where their shape is known."""
+        points = {name: self.memory.objects[name].points for name in expected if name in self.memory.objects}
+        return {name: se3.apply(expected[name], own) for name, own in points.items() if len(own)}
 
     def _localise(self, known: Mapping[str, KnownObject], look: Look) -> dict[str, PoseEstimate]:
         """Find objects, but do not search again for what the same pictures did not show before."""

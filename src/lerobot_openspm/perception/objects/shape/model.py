@@ -133,7 +133,8 @@ class ShapeModel:
 
         What other things hide of a place where it is sought tells nothing.
         """
-        evidence, fits = _evidence(self, look), self._where_expected(look)
+        evidence = _evidence(self, look)
+        fits = self._where_expected(look, evidence)
         if not fits:
             prior = PosePrior(yaw=0.0 if self.yaw_period == 0 else np.inf)
             starts = list[tuple[Sequence[Evidence], list[Fit]]]()
@@ -154,12 +155,12 @@ class ShapeModel:
                 return replace(self._estimate(look, evidence, fits), status="not_found", tipped=True)
         return self._estimate(look, evidence, fits)
 
-    def _where_expected(self, look: Look) -> list[Fit]:
+    def _where_expected(self, look: Look, evidence: Sequence[Evidence]) -> list[Fit]:
         """The fit around where the object is expected, if it is plainly seen there, at least past others."""
         if (T_expected := look.expected.get(self.name)) is None:
             return []
         prior, enough = _nearby(self, T_expected), NEARBY_CONFIDENCE * self.typical_overlap
-        there = fit(_evidence(self, look), self.cloud, T_expected, prior, NEARBY_CUTS_PX)
+        there = fit(evidence, self.cloud, T_expected, prior, NEARBY_CUTS_PX)
         if there.score < enough and (among := self._among_others(look, T_expected)) is not look:
             there = fit(_evidence(self, among), self.cloud, T_expected, prior, NEARBY_CUTS_PX)
         return [there] if there.score >= enough else []
