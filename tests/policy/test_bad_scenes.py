@@ -122,12 +122,8 @@ def test_what_is_half_out_of_all_views_is_refused_for_that_alone(
     assert look(policy, env)[0].status is Status.RUNNING
 
 
-# The policy of the tests knows three objects, the fewest to compare; the front camera turned by 3 degrees is
-# not told by so few.
-@pytest.mark.parametrize(
-    ("camera", "kind"),
-    [("front", "2 cm"), ("side", "2 cm"), ("wrist", "2 cm"), ("side", "3 degrees"), ("wrist", "3 degrees")],
-)
+@pytest.mark.parametrize("kind", ["2 cm", "3 degrees"])
+@pytest.mark.parametrize("camera", ["front", "side", "wrist"])
 def test_a_wrong_calibration_is_reported_before_anything_moves(
     policy: OpenSPMPolicy, env: TabletopEnv, camera: str, kind: str
 ):

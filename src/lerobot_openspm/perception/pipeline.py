@@ -21,7 +21,7 @@ from lerobot_openspm.types import Detections, Fault, Mask, PoseEstimate, Segment
 # How exact the simulator's poses are taken to be (oracle ablation only): metres and radians.
 ORACLE_STD = 1e-4
 # So many objects are compared between views at most.
-MOST_COMPARED = 6
+MOST_COMPARED = 8
 # The first look is remembered and so many of the last ones, each from where the hand's camera was so far from
 # where it was before, metres, or turned by so much, radians.
 MOST_REMEMBERED, ELSEWHERE_M, ELSEWHERE_RAD = 3, 0.05, 0.3
@@ -219,13 +219,15 @@ def disagreeing_cameras(
     Args:
         look: What all cameras show.
         known: Objects by name.
-        estimates: Where all cameras together show them; each camera looks for them there first.
+        estimates: Where all cameras together show them. Each camera looks first where they were found.
     """
     if len(look.views) < 2 or len(known) < MIN_COMMON:
         return {}
-    expected = {name: one.T_world_obj for name, one in estimates.items() if one.status == "found"}
-    # Cameras that disagree much find hardly anything together.
-    names = list(expected if len(expected) >= MIN_COMMON else known)[:MOST_COMPARED]
+    together = [name for name, one in estimates.items() if one.status == "found"]
+    together.sort(key=lambda name: -estimates[name].confidence)
+    expected = {name: estimates[name].T_world_obj for name in together}
+    # Cameras that disagree much find little together, and that in wrong places; each finds more by itself.
+    names = [*together, *(name for name in known if name not in expected)][:MOST_COMPARED]
     places: dict[str, dict[str, list[Array]]] = {}
     for camera, view in look.views.items():
         instances = {name: {camera: found.get(camera, ())} for name, found in look.instances.items()}

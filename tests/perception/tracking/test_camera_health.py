@@ -132,9 +132,30 @@ def test_of_two_cameras_that_disagree_both_are_named():
     assert list(disagreements({"front": shown(1), "side": shown(2, (0.0, 0.02))})) == ["front", "side"]
 
 
-def test_too_few_objects_tell_nothing_of_the_cameras():
-    few = shown(2, (0.02, 0.0), NAMES[:2])
-    assert disagreements({"front": shown(1), "side": few}) == {}
+def test_one_object_tells_nothing_of_the_cameras():
+    one = shown(2, (0.02, 0.0), NAMES[:1])
+    assert disagreements({"front": shown(1), "side": one}) == {}
+
+
+@pytest.mark.parametrize(
+    ("second", "told"), [((0.021, 0.002), True), ((0.02, 0.01), False), ((0.0, 0.0), False)]
+)
+def test_two_objects_tell_of_a_camera_where_they_are_shifted_alike(second: tuple[float, float], told: bool):
+    front = {"bowl": [np.zeros(2)], "plate": [np.array([0.0, 0.2])]}
+    side = {"bowl": [np.array([0.02, 0.0])], "plate": [np.array([0.0, 0.2]) + second]}
+    assert list(disagreements({"front": front, "side": side})) == (["front", "side"] if told else [])
+
+
+def test_two_objects_that_are_shifted_alike_by_little_are_seen_badly():
+    front = {"bowl": [np.zeros(2)], "plate": [np.array([0.0, 0.2])]}
+    side = {name: [place + [0.01, 0.0] for place in places] for name, places in front.items()}
+    assert disagreements({"front": front, "side": side}) == {}
+
+
+def test_a_camera_with_two_objects_in_common_clears_no_other_one():
+    few = {"bowl": shown(3)["bowl"], "plate": [np.array([0.5, 0.5])]}
+    found = disagreements({"front": shown(1), "side": shown(2, (0.02, 0.0)), "wrist": few})
+    assert list(found) == ["front", "side"]
 
 
 def test_of_several_like_objects_any_may_be_the_one_that_the_other_camera_shows():
