@@ -8,7 +8,14 @@ from tests.control.test_going_back import KINDS, ON_PLATE, handle
 from tests.control.test_reach import chosen, scene
 from tests.memory.builders import entry, hand_pose, pick_and_place
 
-from lerobot_openspm.control.clearance import BESIDE, CLEARANCE_M, Way, crowding, lifted
+from lerobot_openspm.control.clearance import (
+    BESIDE,
+    CLEARANCE_M,
+    SAG_SHARE,
+    Way,
+    crowding,
+    lifted,
+)
 from lerobot_openspm.control.plan import Plan
 from lerobot_openspm.control.planning import MOST_IN_A_SCENE
 from lerobot_openspm.control.state import Status
@@ -27,24 +34,45 @@ def pillar(x, y, height):
     return np.column_stack([np.full(20, x), np.full(20, y), np.linspace(0, height, 20)])
 
 
+def sag(length, share=0.5):
+    """How far below its straight way the hand may go, at a share of a way of this length, metres."""
+    return SAG_SHARE * length * 4 * share * (1 - share)
+
+
+def over(top, start, goal, below=0.0):
+    """How high the hand crosses what stands by the middle of a way between two poses ``(4, 4)``, metres."""
+    return top + below + CLEARANCE_M + sag(float(np.linalg.norm((goal - start)[:2, 3])))
+
+
 def heights(*points, start=(0.0, 0.0, 0.1), goal=(0.4, 0.0, 0.1), below=0.0):
     return Way(np.array(start), np.array(goal), below).height_over(np.concatenate(points), RADIUS)
 
 
 def test_what_stands_beside_the_way_or_below_it_leaves_it_clear():
     assert heights(pillar(0.2, RADIUS + 0.01, 0.5)) is None
-    assert heights(pillar(0.2, 0.0, 0.1 - CLEARANCE_M - 0.01)) is None
+    assert heights(pillar(0.2, 0.0, 0.1 - CLEARANCE_M - sag(0.4) - 0.001)) is None
+    assert heights(pillar(0.2, 0.0, 0.1 - CLEARANCE_M - sag(0.4) + 0.001)) is not None
     assert heights(pillar(-RADIUS - 0.01, 0.0, 0.5)) is None
 
 
 def test_what_stands_in_the_way_is_crossed_above_its_top():
-    assert_allclose(heights(pillar(0.2, 0.05, 0.25), pillar(0.3, 0.0, 0.1)), 0.25 + CLEARANCE_M)
+    assert_allclose(heights(pillar(0.2, 0.05, 0.25), pillar(0.3, 0.0, 0.1)), 0.25 + CLEARANCE_M + sag(0.4))
+
+
+@pytest.mark.parametrize("length", [0.1, 0.4, 0.8])
+def test_a_long_way_passes_higher_over_its_middle_than_over_its_ends(length):
+    goal = (length, 0.0, 0.0)
+    middle, end = (
+        heights(pillar(x, RADIUS - 1e-9, 0.3), start=(0.0, 0.0, 0.0), goal=goal) for x in (length / 2, length)
+    )
+    assert_allclose(middle, 0.3 + CLEARANCE_M + sag(length))
+    assert end == pytest.approx(0.3 + CLEARANCE_M)
 
 
 def test_what_hangs_from_the_hand_has_to_clear_it_too():
-    low = pillar(0.2, 0.0, 0.05)
+    low = pillar(0.2, 0.0, 0.02)
     assert heights(low) is None
-    assert_allclose(heights(low, below=0.04), 0.05 + 0.04 + CLEARANCE_M)
+    assert_allclose(heights(low, below=0.04), 0.02 + 0.04 + CLEARANCE_M + sag(0.4))
 
 
 def test_a_hand_that_passes_high_enough_where_the_object_stands_need_not_rise():
@@ -72,16 +100,16 @@ def test_nothing_changes_where_nothing_is_in_the_way():
 def test_a_carried_object_is_lifted_over_a_post_and_then_goes_on_as_shown():
     plain, targets = carried_over(pillar(0.1, 0.0, 0.2))
     assert len(targets) == len(plain) + 2
-    rise, over = targets[4], targets[5]
-    assert [rise.key_pose.phase, over.key_pose.phase] == ["pre-place", "pre-place"]
+    rise, across = targets[4], targets[5]
+    assert [rise.key_pose.phase, across.key_pose.phase] == ["pre-place", "pre-place"]
     below = 0.03  # the bowl was grasped 3 cm above the table
-    for one in (rise, over):
-        assert_allclose(one.T_world_ee[2, 3], 0.2 + below + CLEARANCE_M)
+    for one in (rise, across):
+        assert_allclose(one.T_world_ee[2, 3], over(0.2, plain[3].T_world_ee, plain[4].T_world_ee, below))
         assert one.key_pose.closed
         assert not one.precise
     # Straight up from where it was lifted to, straight down to where it was to go.
     assert_allclose(rise.T_world_ee[:2, 3], plain[3].T_world_ee[:2, 3])
-    assert_allclose(over.T_world_ee[:2, 3], plain[4].T_world_ee[:2, 3])
+    assert_allclose(across.T_world_ee[:2, 3], plain[4].T_world_ee[:2, 3])
     kept = (*targets[:4], *targets[6:])
     assert_allclose([one.T_world_ee for one in kept], [one.T_world_ee for one in plain])
 
@@ -90,7 +118,7 @@ def test_an_empty_hand_comes_down_beyond_a_post_on_its_first_way():
     plain, targets = carried_over(pillar(-0.1, BESIDE * RADIUS - 0.01, 0.25))
     assert targets[0].key_pose.phase == "approach"
     assert_allclose(targets[0].T_world_ee[:2, 3], plain[0].T_world_ee[:2, 3])
-    assert_allclose(targets[0].T_world_ee[2, 3], 0.25 + CLEARANCE_M)
+    assert_allclose(targets[0].T_world_ee[2, 3], over(0.25, HOME, plain[0].T_world_ee))
 
 
 @pytest.mark.parametrize("is_half_turned", [False, True])
@@ -100,9 +128,10 @@ def test_a_hand_that_begins_too_low_rises_where_it_is_and_crosses_at_one_height(
     context = planning_context(points={"post": post}, hand_radius_m=0.05)
     plan = Plan(entry(), poses | {"post": np.eye(4)}, low, is_half_turned=is_half_turned)
     plain = plan.targets(context)
-    rise, over, *rest = context.clear(plan).targets(context)
-    for one, below in ((rise, low), (over, plain[0].T_world_ee)):
-        assert_allclose(one.T_world_ee[:3, 3], [*below[:2, 3], 0.25 + CLEARANCE_M], atol=1e-9)
+    rise, across, *rest = context.clear(plan).targets(context)
+    height = over(0.25, low, plain[0].T_world_ee)
+    for one, below in ((rise, low), (across, plain[0].T_world_ee)):
+        assert_allclose(one.T_world_ee[:3, 3], [*below[:2, 3], height], atol=1e-9)
         assert_allclose(one.T_world_ee[:3, :3], plain[0].T_world_ee[:3, :3], atol=1e-9)
     assert_allclose([one.T_world_ee for one in rest], [one.T_world_ee for one in plain], atol=1e-9)
 
@@ -128,11 +157,11 @@ def test_the_hand_rises_turned_as_it_grasped_also_where_it_puts_unturned():
     assert crossed == ["post"]
     targets = transfer(higher, poses, {}, HOME, turns=turns)
     i = next(i for i, one in enumerate(targets) if one.key_pose.phase == "pre-place")
-    lift, rise, over = targets[i - 1 : i + 2]
+    lift, rise, across = targets[i - 1 : i + 2]
     assert rise.key_pose.anchor.place == "bowl"
     assert_allclose(rise.T_world_ee[:3, :3], lift.T_world_ee[:3, :3], atol=1e-9)
     assert_allclose(rise.T_world_ee[:2, 3], lift.T_world_ee[:2, 3], atol=1e-9)
-    assert se3.distances(rise.T_world_ee, over.T_world_ee)[1] > 1
+    assert se3.distances(rise.T_world_ee, across.T_world_ee)[1] > 1
 
 
 @pytest.mark.parametrize("sub_task", [0, 1])
@@ -148,12 +177,13 @@ def test_the_hand_rises_where_it_leaves_one_sub_task_however_a_grasp_is_turned(s
     assert crossed == ["post"]
     targets = transfer(higher, poses, {}, HOME, turns=turns)
     first = next(i for i, one in enumerate(targets) if one.key_pose.phase == "retreat")
-    leaves, rise, over = targets[first : first + 3]
+    leaves, rise, across = targets[first : first + 3]
     assert_allclose(rise.T_world_ee[:2, 3], leaves.T_world_ee[:2, 3])
     assert_allclose(rise.T_world_ee[:3, :3], leaves.T_world_ee[:3, :3])
-    assert_allclose([rise.T_world_ee[2, 3], over.T_world_ee[2, 3]], 0.4 + CLEARANCE_M)
+    height = over(0.4, leaves.T_world_ee, across.T_world_ee)
+    assert_allclose([rise.T_world_ee[2, 3], across.T_world_ee[2, 3]], height)
     assert rise.key_pose.sub_task == 0
-    assert over.key_pose.sub_task == 1
+    assert across.key_pose.sub_task == 1
 
 
 def test_what_was_put_down_stands_there_and_no_longer_where_it_was():
@@ -168,7 +198,26 @@ def test_what_was_put_down_stands_there_and_no_longer_where_it_was():
 
 def test_a_box_is_in_the_way_of_what_runs_through_the_middle_of_its_side():
     box = BoxModel("crate", np.array([0.4, 0.3, 0.2]), 0.0, np.pi, 0.0, 0.9)
-    assert_allclose(heights(se3.apply(se3.from_yaw([0.2, 0.0, 0.0], 0.3), box.points)), 0.2 + CLEARANCE_M)
+    top = 0.2 + CLEARANCE_M + sag(0.4)
+    assert_allclose(heights(se3.apply(se3.from_yaw([0.2, 0.0, 0.0], 0.3), box.points)), top)
+
+
+def wide(x, height):
+    """Points of something 40 cm wide on the table."""
+    return np.concatenate([pillar(x + dx, 0.0, height) for dx in np.linspace(-0.2, 0.2, 21)])
+
+
+def test_a_hand_that_leaves_a_large_object_for_its_other_side_rises_over_it_all():
+    shown, poses = two_sub_tasks()
+    # The plate, on which the bowl is put, is between the hand and the cup.
+    poses |= {"plate": se3.from_yaw([0.5, -0.2, 0.0], 0.0), "cup": se3.from_yaw([-0.1, -0.2, 0.0], 0.0)}
+    plain = transfer(shown, poses, {}, HOME)
+    small, large = pillar(0.5, -0.2, 0.25), wide(0.35, 0.25) - [0.0, 0.2, 0.0]
+    assert lifted(shown, plain, HOME, {"plate": small}, RADIUS)[1] == []
+    higher, crossed = lifted(shown, plain, HOME, {"plate": np.concatenate([small, large])}, RADIUS)
+    assert crossed == ["plate"]
+    phases = [(one.phase, one.anchor.place, one.sub_task) for one in higher.key_poses]
+    assert ("retreat", "plate", 0) in phases[phases.index(("retreat", "plate", 0)) + 1 :]
 
 
 @pytest.mark.parametrize(("known", "asked"), [(MOST_IN_A_SCENE, MOST_IN_A_SCENE), (MOST_IN_A_SCENE + 1, 2)])

@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -80,6 +82,16 @@ def test_a_turned_grasp_takes_a_round_object_from_another_side_and_puts_it_to_th
         ]
         at = [se3.apply(T, np.array([[*middle, 0.0]]))[0] for T in carried]
         assert_allclose(at[1], at[0], atol=1e-9)
+
+
+def test_the_hand_leaves_what_it_did_before_as_shown_however_a_grasp_is_turned():
+    memory = entry()
+    leaves = key_pose("plate", hand_pose(0.0, 0.0, 0.3), "approach")
+    memory = replace(memory, key_poses=(leaves, *memory.key_poses))
+    turns = {0: Turn("bowl", memory.object_poses["bowl"], np.zeros(2), 1.0)}
+    shown, turned = (transfer(memory, memory.object_poses, {}, HOME, turns=one) for one in (None, turns))
+    assert_allclose(turned[0].T_world_ee, shown[0].T_world_ee)
+    assert se3.distances(turned[1].T_world_ee, shown[1].T_world_ee)[1] == pytest.approx(1.0)
 
 
 def test_an_anchor_with_the_worlds_axes_follows_the_place_and_not_the_turn():

@@ -17,7 +17,8 @@ from lerobot_openspm.perception.objects.shape.model import ShapeModel
 def model(name, seed=0, yaw_period=2 * np.pi):
     rng = np.random.default_rng(seed)
     return ShapeModel(
-        name, rng.normal(size=N_BINS).astype(np.float32), rng.normal(scale=0.05, size=(9, 3)).astype(np.float32),
+        name, rng.normal(size=N_BINS).astype(np.float32),
+        rng.normal(scale=0.05, size=(9, 3)).astype(np.float32),
         0.005, 0.01, yaw_period, 0.1, 0.2, 0.9,
     )  # fmt: skip
 

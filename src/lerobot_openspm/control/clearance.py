@@ -1,9 +1,10 @@
 """Clear of what stands about: the hand is lifted over it, and what it would be in at a key pose is told.
 
-Key poses say where the hand has to be, not how it gets there; on the way it goes straight. Where other
-objects stand elsewhere than in the demonstration, one may be in the way. Then the hand first rises, crosses
-above it and comes down: two more key poses, of the same objects as those before and after. This is the
-paper's check of the minimum distance, for objects.
+Key poses say where the hand has to be, not how it gets there; on the way it goes nearly straight. Where other
+objects stand elsewhere than in the demonstration, one may be in the way, and so may a large one that the hand
+leaves or goes to from another side. Then the hand first rises, crosses above it and comes down: two more key
+poses, of the same objects as those before and after. This is the paper's check of the minimum distance, for
+objects.
 """
 
 from __future__ import annotations
@@ -29,13 +30,17 @@ UPRIGHT = 0.9
 SHORTEST_M = 0.03
 # The hand stays this far above what it crosses, metres, ...
 CLEARANCE_M = 0.03
-# ... and passes beside it at this many times its radius: a hand is wider across its fingers than on average.
+# ... and in the middle of a way as much higher as this share of its length: it goes up to that far below the
+# straight way.
+SAG_SHARE = 0.1
+# It passes beside what stands about at this many times its radius: a hand is wider across its fingers than on
+# average.
 BESIDE = 1.5
 # What is put down comes straight down over this height, metres. What is this near to it, seen from above, is
 # in its way.
 FROM_ABOVE_M, OVER_M = 0.35, 0.01
 # So many places of a way are compared with what stands about.
-STEPS = 24
+STEPS = 25
 # Where the fingers close and open, the hand is beside objects.
 FINGERS_MOVE = ("grasp", "release")
 # Palm and fingers in the hand's frame, which is between the fingertips: half their length along x and y as
@@ -48,7 +53,7 @@ NOISE_POINTS, SAME_THING_M = 5, 0.02
 
 @dataclass(frozen=True)
 class Way:
-    """The straight way of the hand to a key pose.
+    """The nearly straight way of the hand to a key pose.
 
     Attributes:
         start: Where the fingertips are ``(3,)``, world.
@@ -85,10 +90,17 @@ class Way:
         places = self.start + share * (self.goal - self.start)
         apart = np.linalg.norm(points[None, :, :2] - places[:, None, :2], axis=-1)
         is_under = apart < radius
-        lowest = places[:, None, 2] - self.below - CLEARANCE_M
-        if not (is_under & (points[None, :, 2] > lowest)).any():
+        sag = SAG_SHARE * self.length * 4 * share * (1 - share)
+        needed = points[None, :, 2] + sag + self.below + CLEARANCE_M
+        if not (is_under & (needed > places[:, None, 2])).any():
             return None
-        return float(points[is_under.any(0), 2].max()) + self.below + CLEARANCE_M
+        return float(needed[is_under].max())
+
+    def between(self, points: Array, radius: float) -> Array:
+        """Those of points ``(n, 3)`` that are neither near its start nor near its goal, seen from above."""
+        ends = np.stack([self.start, self.goal])[:, None, :2]
+        apart = np.linalg.norm(points[None, :, :2] - ends, axis=-1)
+        return points[(apart > radius).all(0)]
 
 
 @dataclass
@@ -151,7 +163,12 @@ def lifted(
         if -T[2, 2] > UPRIGHT and pose.phase in CROSSING and way.length > SHORTEST_M:
             previous = entry.key_poses[i - 1] if i else None
             near = {grasped, *pose.anchor.objects, *(previous.anchor.objects if previous else ())}
-            others = {name: own for name, own in standing.points.items() if name not in near}
+            held = grasped if standing.is_held else None
+            others = {
+                name: way.between(own, BESIDE * radius) if name in near else own
+                for name, own in standing.points.items()
+                if name != held
+            }
             height, names = way.crossing(others, BESIDE * radius)
             if height > way.start[2]:
                 rise = height - way.start[2]

@@ -161,6 +161,7 @@ def _turned(targets: Sequence[Target], sub_task: int, turn: Turn, shown: Mapping
     """Key poses that grasp an object turned about its axis, and put it where they would have put it.
 
     The hand turns about the axis where it stands, and from the grasp on where the hand has carried it to.
+    What it leaves before the grasp it leaves as it was shown.
 
     Args:
         targets: The key poses as they are.
@@ -173,7 +174,7 @@ def _turned(targets: Sequence[Target], sub_task: int, turn: Turn, shown: Mapping
     axis, radians, is_put = turn.T_world_obj, turn.radians, False
     for i, target in enumerate(targets):
         pose = target.key_pose
-        if pose.sub_task != sub_task:
+        if pose.sub_task != sub_task or (T_ee_obj is None and turn.name not in pose.anchor.objects):
             continue
         if pose.phase in ARRIVING and pose.anchor.place != turn.name and not is_put:
             radians, is_put = _put_radians(turn, target, shown), True

@@ -148,7 +148,7 @@ def test_two_objects_tell_of_a_camera_where_they_are_shifted_alike(second: tuple
 
 def test_two_objects_that_are_shifted_alike_by_little_are_seen_badly():
     front = {"bowl": [np.zeros(2)], "plate": [np.array([0.0, 0.2])]}
-    side = {name: [place + [0.01, 0.0] for place in places] for name, places in front.items()}
+    side = {name: [place + np.array([0.01, 0.0]) for place in places] for name, places in front.items()}
     assert disagreements({"front": front, "side": side}) == {}
 
 

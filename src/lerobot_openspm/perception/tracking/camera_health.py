@@ -33,8 +33,8 @@ BEST_SHARE, FEW, DISAGREE_M = 0.35, 5, 0.007
 AS_ONE_SHARE = 0.5
 # So many objects must be seen by both, ...
 MIN_COMMON = 2
-# ... and of two, which any shift and turn could lead to one another, both must be shifted by this much, metres,
-# and alike: by vectors that differ by this share of their length at most.
+# ... and of two, which some shift and turn always explain, both must be shifted by this much, metres, and
+# alike: by vectors that differ by this share of their length at most.
 TWO_SHIFTED_M, ALIKE_SHARE = 0.014, 0.25
 
 
