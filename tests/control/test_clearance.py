@@ -30,9 +30,9 @@ def pillar(x, y, height):
     return np.column_stack([np.full(20, x), np.full(20, y), np.linspace(0, height, 20)])
 
 
-def sag(length, share=0.5):
-    """How far below its straight way the hand may go, at a share of a way of this length, metres."""
-    return SAG_SHARE * length * 4 * share * (1 - share)
+def sag(length):
+    """How far below the middle of a straight way of this length the hand may go, metres."""
+    return SAG_SHARE * length
 
 
 def over(top, start, goal, below=0.0):

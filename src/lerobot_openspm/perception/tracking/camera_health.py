@@ -31,10 +31,10 @@ BEST_SHARE, FEW, DISAGREE_M = 0.35, 5, 0.007
 # A camera that is off shifts and turns objects as one: for most of them that leaves at most this share of how
 # far they are apart. Errors of single objects are left as they are.
 AS_ONE_SHARE = 0.5
-# So many objects must be seen by both, ...
-MIN_COMMON = 2
-# ... and of two, which some shift and turn always explain, both must be shifted by this much, metres, and
-# alike: by vectors that differ by this share of their length at most.
+# So many objects, seen by both, tell of two cameras: whether they agree, and by any shift and turn that they
+# do not. Fewer, but at least so many, tell only that they do not: each must be shifted by this much, metres,
+# and alike, by vectors that differ by this share of their length at most.
+ENOUGH_COMMON, MIN_COMMON = 3, 2
 TWO_SHIFTED_M, ALIKE_SHARE = 0.014, 0.25
 
 
@@ -116,7 +116,9 @@ def disagreements(places: Mapping[str, Mapping[str, Sequence[Array]]]) -> dict[s
     apart = {pair: np.linalg.norm(a - b, axis=1) for pair, (a, b) in pairs.items()}
     differing = {pair for pair, one in apart.items() if _agreed(one) > DISAGREE_M}
     off = {pair: pair in differing and _moved_as_one(*places) for pair, places in pairs.items()}
-    agreeing = {camera for pair in apart.keys() - differing if len(apart[pair]) > 2 for camera in pair}
+    agreeing = {
+        camera for pair in apart.keys() - differing if len(apart[pair]) >= ENOUGH_COMMON for camera in pair
+    }
     suspects = {camera for pair, is_off in off.items() if is_off for camera in pair}
     found: dict[str, str] = {}
     for camera in sorted(suspects - agreeing):
@@ -143,7 +145,7 @@ def _nearest(a: Mapping[str, Sequence[Array]], b: Mapping[str, Sequence[Array]])
 
 def _moved_as_one(a: Array, b: Array) -> bool:
     """Whether some shift and turn in the plane lead from most of the places ``(n, 2)`` to the others."""
-    if len(a) == 2:
+    if len(a) < ENOUGH_COMMON:
         shifts = np.linalg.norm(b - a, axis=1)
         differ = np.linalg.norm((b - a)[1] - (b - a)[0])
         return bool(shifts.min() > TWO_SHIFTED_M and differ <= ALIKE_SHARE * shifts.min())
@@ -152,7 +154,7 @@ def _moved_as_one(a: Array, b: Array) -> bool:
         R = se3.from_yaw(np.zeros(3), turn)[:2, :2]
         left = (a - (a[i] + a[j]) / 2) @ R.T + (b[i] + b[j]) / 2 - b
         explained = np.linalg.norm(left, axis=1) <= AS_ONE_SHARE * np.linalg.norm(a - b, axis=1)
-        if explained.sum() >= max(3, len(a) // 2 + 1):
+        if explained.sum() >= max(ENOUGH_COMMON, len(a) // 2 + 1):
             return True
     return False
 
