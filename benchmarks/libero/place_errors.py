@@ -12,6 +12,7 @@ from benchmarks.stages import LIBERO
 from benchmarks.truth import pose_error, true_period, upright
 
 from lerobot_openspm.cli.pipeline import rate
+from lerobot_openspm.geometry import se3
 from lerobot_openspm.geometry.se3 import Array
 from lerobot_openspm.perception.objects.base import KnownObject
 from lerobot_openspm.perception.objects.patches.model import PatchModel
@@ -46,13 +47,15 @@ def judged(
         return row
     period, model = true_period(name, LIBERO), models[name]
     shows_yaw = period > 0 and model.yaw_period > 0 and not isinstance(model, PatchModel)
-    errors = [pose_error(T, estimate.T_world_obj, period) for T in there]
+    # However a round thing is found turned, its middle stays; its frame may lie beside that, and does not.
+    point = np.asarray(model.points, float).mean(0) if period == 0 and len(model.points) else np.zeros(3)
+    middle = se3.transform(np.eye(3), np.array([*point[:2], 0.0]))
+    there, found = [T @ middle for T in there], [T @ middle for T in (estimate.T_world_obj, *estimate.others)]
+    errors = [pose_error(T, found[0], period) for T in there]
     nearest = int(np.argmin([metres for metres, _ in errors]))
     metres, radians = errors[nearest]
-    off = estimate.T_world_obj[:3, 3] - there[nearest][:3, 3]
-    apart = [
-        min(pose_error(T, one, 0.0)[0] for one in (estimate.T_world_obj, *estimate.others)) for T in there
-    ]
+    off = found[0][:3, 3] - there[nearest][:3, 3]
+    apart = [min(pose_error(T, one, 0.0)[0] for one in found) for T in there]
     return {
         **row,
         "mm": round(1000 * metres, 1),
