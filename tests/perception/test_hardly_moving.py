@@ -10,7 +10,7 @@ from tests.perception.drawn_world import demonstration, draw_poses
 
 from lerobot_openspm.perception.objects.kinds import learn_objects
 from lerobot_openspm.perception.objects.patches.model import PatchModel
-from lerobot_openspm.perception.objects.patches.stillness import hardly_moving
+from lerobot_openspm.perception.objects.patches.stillness import hardly_moving, often_at
 from lerobot_openspm.perception.objects.surface.backdrop import Backdrop, Colour
 from lerobot_openspm.perception.objects.surface.model import SurfaceModel
 from lerobot_openspm.perception.objects.surface.sight import Surface
@@ -62,6 +62,37 @@ def test_places_that_are_touched_twice_count_together():
 def test_where_one_place_lies_of_another_says_nothing():
     apart = scenes({"cabinet": NEAR_M}, touches=1, places=6)
     assert hardly_moving(["cabinet"], apart) == {"cabinet": 0.5}
+
+
+def touched_at(*middles: tuple[float, int], side: float = NEAR_M) -> list[DemonstrationScene]:
+    """Scenes in which a bowl is touched about some places, each so often."""
+    return [
+        DemonstrationScene({}, (ContactCue("bowl", np.array([x + away, away, 0.1]), "grasp"),))
+        for x, touches in middles
+        for away in np.linspace(-side, side, touches)
+    ]
+
+
+def test_what_tasks_begin_with_at_a_few_places_is_learned_where_it_is_shown_most_often():
+    shown = touched_at((0.0, 8), (0.2, 10), (0.4, 9))
+    assert hardly_moving(["bowl"], shown)["bowl"] < 0.01
+    assert often_at("bowl", shown) == shown[8:18]
+    thrown_off = touched_at((0.0, 8), (0.2, 10), (0.4, 9), (0.7, 1))
+    assert often_at("bowl", thrown_off) == thrown_off[8:18]
+
+
+@pytest.mark.parametrize(
+    "shown",
+    [
+        touched_at((0.0, 10)),
+        touched_at((0.0, 4), (0.2, 1)),
+        touched_at((0.0, 10), (0.3, 10), side=FAR_M),
+        touched_at((0.0, 8), *((0.2 + 0.1 * i, 1) for i in range(8))),
+    ],
+    ids=["one place", "too few touches", "moved about each place", "moved about the table"],
+)
+def test_no_place_is_where_it_is_shown_most_often(shown: list[DemonstrationScene]):
+    assert often_at("bowl", shown) == []
 
 
 def patches(name: str) -> PatchModel:

@@ -38,9 +38,9 @@ from lerobot_openspm.types import (
 
 logger = logging.getLogger(__name__)
 
-# How many demonstrations of a task are filmed, and of all tasks as far as there is one of each; from one
-# picture to the next so many frames.
-FILMED_PER_TASK, FILMED, FILM_STEP = 3, 60, 4
+# How many demonstrations of a task are filmed at most, and of all tasks as far as there is one of each; from
+# one picture to the next so many frames.
+FILMED_PER_TASK, FILMED, FILM_STEP = 10, 30, 4
 # The hand may touch an object so many frames before the motion to a contact begins.
 FRAMES_BEFORE_CONTACT = 4
 # What the hand takes hold of or pushes has its surface within this distance of the hand, seen from above.

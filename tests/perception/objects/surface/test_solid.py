@@ -97,6 +97,20 @@ def test_a_solid_rises_to_what_pictures_show_above_it_but_not_to_what_is_beyond_
     assert filled.sum(-1).max() == layers
 
 
+@pytest.mark.parametrize(("seen_by", "rises"), [(3, False), (4, True)])
+def test_few_pictures_do_not_tell_that_what_is_behind_a_solid_is_its_own(seen_by, rises):
+    frames = []
+    for place in PLACES[:seen_by]:
+        view, shown = picture(looking_down(*place), 16.5 * CELL, np.full((4, 4, 3), 90), CELL)
+        frames.append(Frame("hand", view, shown, None, {"mat": np.eye(4)}))
+    space = block(4, 17)
+    solid = Solid(space.x, space.z, space.filled & (np.arange(19) < 2))
+    backdrop = Backdrop(Colour(np.zeros(3), np.eye(3)), 0.0, np.array([[-1.0, -1.0], [1.0, 1.0]]))
+    carved = Carved(space.x, space.z, space.filled)
+    filled = fill_silhouettes(Frames("mat", frames), carved, solid, Depths({"mat": solid}), backdrop).filled
+    assert (filled.sum(-1).max() > 2) == rises
+
+
 def test_only_frames_in_which_nothing_has_moved_are_untouched():
     view, shown = picture(looking_down(*PLACES[0]), 0.0, np.zeros((1, 1, 3)), CELL)
     frames = [Frame("hand", view, shown, None, {}, is_untouched) for is_untouched in (True, False)]

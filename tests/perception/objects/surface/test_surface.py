@@ -1,6 +1,7 @@
 """Surfaces are learned from films of a hand that passes over objects, which are found wherever they stand."""
 
 import dataclasses
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -22,10 +23,11 @@ from lerobot_openspm.perception.objects.base import Look, localise_all
 from lerobot_openspm.perception.objects.kinds import learn_objects
 from lerobot_openspm.perception.objects.surface import model as model_module
 from lerobot_openspm.perception.objects.surface.compare import correlation
+from lerobot_openspm.perception.objects.surface.learn import _first_poses
 from lerobot_openspm.perception.objects.surface.model import SurfaceModel
 from lerobot_openspm.perception.objects.surface.search import Place, _areas, _ranked
 from lerobot_openspm.perception.objects.surface.sight import Surface
-from lerobot_openspm.types import Moment
+from lerobot_openspm.types import ContactCue, DemonstrationScene, Moment, PoseEstimate
 
 
 def test_what_hardly_moves_and_was_filmed_is_known_by_its_surface(models):
@@ -36,6 +38,20 @@ def test_what_hardly_moves_and_was_filmed_is_known_by_its_surface(models):
     assert 0 <= models["cup"].backdrop.table_height < 0.03
     assert models["cup"].surface.is_round
     assert not models["block"].surface.is_round
+
+
+def test_a_demonstration_shows_what_patches_are_sure_of():
+    """Where another can stands in the place of the soup, the patches of the soup agree by 0.79."""
+    told = {"soup": 0.79, "basket": 0.92, "milk": 0.43}
+
+    def near(share):
+        seen = PoseEstimate("found", np.eye(4), np.eye(4), share)
+        return SimpleNamespace(localise=lambda look: seen)
+
+    scene = DemonstrationScene(
+        views_at({}, looking_down(*HOME)), (ContactCue("basket", np.zeros(3), "release"),)
+    )
+    assert _first_poses(scene, {name: near(share) for name, share in told.items()}).keys() == {"basket"}
 
 
 @pytest.mark.parametrize(("name", "height", "radius"), [("block", 0.05, 0.055), ("cup", 0.06, 0.04)])

@@ -24,7 +24,7 @@ from lerobot_openspm.geometry.se3 import Array
 from lerobot_openspm.perception.objects.base import Examples, Kind, KnownObject, Look
 from lerobot_openspm.perception.objects.patches.match import Patch, Probe, as_seen, cut, match
 from lerobot_openspm.perception.objects.patches.model import PatchModel, from_record
-from lerobot_openspm.perception.objects.patches.stillness import hardly_moving, places_of
+from lerobot_openspm.perception.objects.patches.stillness import hardly_moving, often_at, places_of
 from lerobot_openspm.types import ContactCue, DemonstrationScene, View
 
 # A place touched less often says nothing of how far its object moves.
@@ -105,8 +105,7 @@ def learn_patches(examples: Examples) -> dict[str, PatchModel]:
     """Learn the objects that hardly move; where a segmenter finds the objects, none."""
     if examples.segmenter is not None:
         return {}
-    scenes, still = examples.scenes, hardly_moving(examples.names, examples.scenes, examples.known)
-    candidates = [_candidate(name, scenes) for name in examples.names if still[name] >= 0.5]
+    candidates = [_candidate(name, scenes) for name, scenes in _still_in(examples).items()]
     # What many patches agree on is claimed first: what they follow is not another object.
     candidates.sort(key=lambda one: -max((len(group) for group in one.groups), default=0))
     learned: dict[str, PatchModel] = {}
@@ -119,6 +118,22 @@ def learn_patches(examples: Examples) -> dict[str, PatchModel]:
         else:
             examples.leave_out(one.name, ELSEWHERE if one.groups else UNFOLLOWED)
     return learned
+
+
+def _still_in(examples: Examples) -> dict[str, Sequence[DemonstrationScene]]:
+    """By name, the demonstrations in which an object hardly moves, and those that do not touch it.
+
+    An object that tasks begin with at a few places is learned where it is shown most often.
+    """
+    still = hardly_moving(examples.names, examples.scenes, examples.known)
+    found: dict[str, Sequence[DemonstrationScene]] = {}
+    for name in examples.names:
+        if still[name] >= 0.5:
+            found[name] = examples.scenes
+        elif often := often_at(name, examples.scenes):
+            others = [scene for scene in examples.scenes if all(cue.name != name for cue in scene.cues)]
+            found[name] = [*often, *others]
+    return found
 
 
 # What hardly moves is learned with its surface, which calls learn_patches; here nothing is left to learn.

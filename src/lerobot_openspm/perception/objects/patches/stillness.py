@@ -11,6 +11,7 @@ from __future__ import annotations
 from collections.abc import Collection, Iterable, Sequence
 
 import numpy as np
+from scipy.cluster.hierarchy import fclusterdata
 from scipy.stats import chi2
 
 from lerobot_openspm.perception.objects.base import KnownObject
@@ -19,6 +20,9 @@ from lerobot_openspm.types import ContactCue, DemonstrationScene
 # The hand's target moves with the object; if its standard deviation along an axis is below this, patches do.
 # It is that of a uniform distribution within 3 cm of the middle, about as far as a patch is sought.
 MAX_STD_M = 0.03 / np.sqrt(3)
+# Where tasks begin with an object at different places, these are so far apart at least, metres, each is shown
+# so often, and this share of the demonstrations begin at one of them.
+APART_M, MIN_SHOWN, AT_PLACES_SHARE = 0.05, 3, 0.8
 
 
 def hardly_moving(
@@ -43,6 +47,27 @@ def hardly_moving(
         own = told.get(name, 0.5)
         found[name] = own * prior / (own * prior + (1 - own) * (1 - prior))
     return found
+
+
+def often_at(name: str, scenes: Sequence[DemonstrationScene]) -> list[DemonstrationScene]:
+    """The demonstrations in which an object stands where it is shown most often, if it has a few such places.
+
+    None of them where it is moved about, or is always at one place.
+    """
+    shown = [scene for scene in scenes if any(cue.name == name for cue in scene.cues)]
+    touched = [next(cue for cue in scene.cues if cue.name == name).point_world[:2] for scene in shown]
+    if len(shown) < 2 * MIN_SHOWN:
+        return []
+    labels = fclusterdata(np.stack(touched), APART_M, criterion="distance", method="single")
+    groups = [
+        [scene for scene, own in zip(shown, labels, strict=True) if own == i] for i in np.unique(labels)
+    ]
+    groups = [group for group in groups if len(group) >= MIN_SHOWN]
+    if len(groups) < 2 or sum(map(len, groups)) < AT_PLACES_SHARE * len(shown):
+        return []
+    if any((_hardly_moves(group, name) or 0.0) < 0.5 for group in groups):
+        return []
+    return max(groups, key=len)
 
 
 def _hardly_moves(scenes: Sequence[DemonstrationScene], name: str) -> float | None:

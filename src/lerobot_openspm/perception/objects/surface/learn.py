@@ -46,6 +46,8 @@ ROUNDS = 2
 # Of an object whose colours vary less together than this with what the demonstrations' first pictures show,
 # the pattern tells nothing; from the second value on it tells all.
 PATTERN_SEEN = 0.55, 0.8
+# A demonstration in which patches agree less than this may show something else where an object stood.
+SHOWN_SHARE = 0.85
 # In so many of the demonstrations it is measured what looks most like the object without it; what is this
 # near to it is hidden for that, pixels of a picture 256 wide.
 RIVAL_SCENES, MARGIN_PX = 6, 6
@@ -108,7 +110,7 @@ SURFACE = Kind(SurfaceModel.kind, learn_surfaces, from_record)
 def _first_poses(scene: DemonstrationScene, near: Mapping[str, PatchModel]) -> dict[str, Array]:
     look = Look(scene.views)
     found = {name: model.localise(look) for name, model in near.items()}
-    return {name: one.T_world_obj for name, one in found.items() if one.status == "found"}
+    return {name: one.T_world_obj for name, one in found.items() if one.confidence >= SHOWN_SHARE}
 
 
 def _frames(

@@ -24,8 +24,9 @@ from lerobot_openspm.perception.objects.surface.carving import Carved, Frame, Fr
 from lerobot_openspm.perception.objects.surface.relief import disagreement
 from lerobot_openspm.types import Mask
 
-# A cell is filled if this share of the views that see it have something there that nothing else explains.
-FILLED_SHARE, MIN_FILLED = 0.5, 2
+# A cell is filled if this share of the views that see it have something there that nothing else explains. Few
+# views do not tell: things that no task touches are seen behind it.
+FILLED_SHARE, MIN_FILLED = 0.5, 4
 # A cell of the surface is taken out where pictures differ by more than this about it, CIELAB.
 INCONSISTENT = 14.0
 # So often at most; what is behind a cell that was taken out is looked at next.
