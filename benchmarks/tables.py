@@ -116,7 +116,10 @@ def _headlines() -> str:
     ]
     there = [row for row in rows if row is not None]
     if not there:
-        return "Nothing is measured on the present code; `make figures` measures it."
+        return (
+            "Nothing is measured of the headline figures on the present code; `make figures` measures it. "
+            "docs/results.md has the others."
+        )
     heads = ["From camera images", "Demonstrations", "Success", "95 % interval", "Episodes", "Learning, s"]
     return table(heads, there)
 

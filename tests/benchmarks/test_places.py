@@ -20,9 +20,8 @@ T_SIM_OBJ = se3.from_yaw([0.01, 0.0, -0.02], 0.3)
 
 class Known:
     yaw_period = 2 * np.pi
-    points = se3.apply(
-        se3.inverse(T_SIM_OBJ), np.array([[0.03, 0.0, 0.0], [-0.03, 0.0, 0.05]])
-    )  # its axis is the true one
+    # About the simulator's axis.
+    points = se3.apply(se3.inverse(T_SIM_OBJ), np.array([[0.03, 0.0, 0.0], [-0.03, 0.0, 0.05]]))
 
 
 MODELS = {"black bowl": Known(), "milk": Known()}

@@ -27,7 +27,7 @@ from lerobot_openspm.perception.objects.surface.learn import _first_poses
 from lerobot_openspm.perception.objects.surface.model import SurfaceModel
 from lerobot_openspm.perception.objects.surface.search import Place, _areas, _ranked
 from lerobot_openspm.perception.objects.surface.sight import Surface
-from lerobot_openspm.types import ContactCue, DemonstrationScene, Moment, PoseEstimate
+from lerobot_openspm.types import DemonstrationScene, Moment, PoseEstimate
 
 
 def test_what_hardly_moves_and_was_filmed_is_known_by_its_surface(models):
@@ -48,9 +48,7 @@ def test_a_demonstration_shows_what_patches_are_sure_of():
         seen = PoseEstimate("found", np.eye(4), np.eye(4), share)
         return SimpleNamespace(localise=lambda look: seen)
 
-    scene = DemonstrationScene(
-        views_at({}, looking_down(*HOME)), (ContactCue("basket", np.zeros(3), "release"),)
-    )
+    scene = DemonstrationScene(views_at({}, looking_down(*HOME)), ())
     assert _first_poses(scene, {name: near(share) for name, share in told.items()}).keys() == {"basket"}
 
 
