@@ -16,23 +16,26 @@ from lerobot_openspm.perception.objects.kinds import learn_objects
 from lerobot_openspm.perception.objects.patches.learn import learn_patches
 from lerobot_openspm.perception.objects.patches.match import correlations
 from lerobot_openspm.perception.objects.patches.model import PatchModel
+from lerobot_openspm.perception.objects.shape.model import ShapeModel
 from lerobot_openspm.types import ContactCue, DemonstrationScene
 
 MIDDLES = {"block": (0.02, -0.15, 0.4), "cup": (0.0, 0.15, 0.0), "distractor": (-0.02, 0.0, 0.0)}
 
 
-def poses(rng):
-    """Everything within 15 mm of its usual place, never turned."""
-    return {
+def poses(rng, aside_m=0.0):
+    """Everything within 15 mm of its usual place, never turned, but the block so far from it."""
+    placed = {
         name: se3.from_yaw([x + dx, y + dy, 0.0], yaw)
         for (name, (x, y, yaw)), (dx, dy) in zip(
             MIDDLES.items(), rng.uniform(-0.015, 0.015, (3, 2)), strict=True
         )
     }
+    placed["block"][0, 3] += aside_m
+    return placed
 
 
-def demonstration(rng):
-    placed = poses(rng)
+def demonstration(rng, aside_m=0.0):
+    placed = poses(rng, aside_m)
     grasp = placed["cup"][:3, 3] + [0.03, 0.0, 0.05] + rng.normal(0, 0.003, 3)
     release = placed["block"][:3, 3] + [0, 0, 0.12] + rng.normal(0, 0.003, 3)
     return DemonstrationScene(
@@ -107,6 +110,16 @@ def test_what_is_known_already_is_not_learned_again_under_another_name():
     again = [dataclasses.replace(scenes[0], cues=(mug,)), *scenes[1:]]
     assert "mug" in learn_patches(examples(["mug"], again))
     assert learn_patches(examples(["mug"], again, [known])) == {}
+
+
+def test_what_begins_at_a_few_places_is_learned_by_its_shape_where_nothing_was_filmed():
+    rng = np.random.default_rng(8)
+    scenes = [demonstration(rng, aside) for aside in (-0.12,) * 4 + (0.08,) * 6]
+    learned = learn_objects(scenes, np.random.default_rng(0)).models
+    assert isinstance(learned["cup"], PatchModel)
+    assert isinstance(learned["block"], ShapeModel)
+    assert "block" not in learn_patches(examples(["block", "cup"], scenes))
+    assert "block" in learn_patches(examples(["block", "cup"], scenes), at_few_places=True)
 
 
 @pytest.mark.parametrize("noise", [0.001, 0.003])

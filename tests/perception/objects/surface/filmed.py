@@ -23,10 +23,11 @@ def views_at(poses, T_world_ee):
     )
 
 
-def demonstration(rng, touched=("cup", "block")):
+def demonstration(rng, touched=("cup", "block"), aside_m=0.0):
     """The hand comes from one side to the cup, grasps it, and carries it over the block.
 
-    Or it touches the distractor; only what is named is told to have been touched.
+    Or it touches the distractor; only what is named is told to have been touched. The block begins so far
+    from its usual place, along the table.
     """
     poses = {
         name: se3.from_yaw([x + dx, y + dy, 0.0], yaw)
@@ -34,6 +35,7 @@ def demonstration(rng, touched=("cup", "block")):
             MIDDLES.items(), rng.uniform(-0.012, 0.012, (3, 2)), strict=True
         )
     }
+    poses["block"][0, 3] += aside_m
     grasp = poses["cup"][:3, 3] + [0.03, 0.0, 0.05] + rng.normal(0, 0.002, 3)
     release = poses["block"][:3, 3] + [0, 0, 0.12] + rng.normal(0, 0.002, 3)
     touch = poses["distractor"][:3, 3] + [0.02, 0.0, 0.04]

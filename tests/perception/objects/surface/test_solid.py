@@ -80,12 +80,16 @@ def test_what_pictures_disagree_about_is_taken_out_down_to_where_they_agree():
     assert (np.abs(heights - 4) <= 2).mean() > 0.85
 
 
-@pytest.mark.parametrize(("reach_m", "layers"), [(1.0, 17), (0.05, 2)])
-def test_a_solid_rises_to_what_pictures_show_above_it_but_not_to_what_is_beyond_the_table(reach_m, layers):
+@pytest.mark.parametrize(
+    ("reach_m", "pictures", "layers"),
+    [(1.0, 9, 17), (0.05, 9, 2), (1.0, 4, 17), (1.0, 3, 2)],
+    ids=["above it", "beyond the table", "enough pictures", "too few pictures"],
+)
+def test_a_solid_rises_to_what_enough_pictures_show_above_it(reach_m, pictures, layers):
     # Two layers are filled, and the pictures show a small plate at the height of the seventeenth.
     texture = np.full((4, 4, 3), 90)
     frames = []
-    for place in PLACES:
+    for place in PLACES[:pictures]:
         view, shown = picture(looking_down(*place), 16.5 * CELL, texture, CELL)
         frames.append(Frame("hand", view, shown, None, {"mat": np.eye(4)}))
     space = block(4, 17)
@@ -95,20 +99,6 @@ def test_a_solid_rises_to_what_pictures_show_above_it_but_not_to_what_is_beyond_
     carved = Carved(space.x, space.z, space.filled)
     filled = fill_silhouettes(Frames("mat", frames), carved, solid, Depths({"mat": solid}), backdrop).filled
     assert filled.sum(-1).max() == layers
-
-
-@pytest.mark.parametrize(("seen_by", "rises"), [(3, False), (4, True)])
-def test_few_pictures_do_not_tell_that_what_is_behind_a_solid_is_its_own(seen_by, rises):
-    frames = []
-    for place in PLACES[:seen_by]:
-        view, shown = picture(looking_down(*place), 16.5 * CELL, np.full((4, 4, 3), 90), CELL)
-        frames.append(Frame("hand", view, shown, None, {"mat": np.eye(4)}))
-    space = block(4, 17)
-    solid = Solid(space.x, space.z, space.filled & (np.arange(19) < 2))
-    backdrop = Backdrop(Colour(np.zeros(3), np.eye(3)), 0.0, np.array([[-1.0, -1.0], [1.0, 1.0]]))
-    carved = Carved(space.x, space.z, space.filled)
-    filled = fill_silhouettes(Frames("mat", frames), carved, solid, Depths({"mat": solid}), backdrop).filled
-    assert (filled.sum(-1).max() > 2) == rises
 
 
 def test_only_frames_in_which_nothing_has_moved_are_untouched():

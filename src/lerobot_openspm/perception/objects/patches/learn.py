@@ -24,7 +24,7 @@ from lerobot_openspm.geometry.se3 import Array
 from lerobot_openspm.perception.objects.base import Examples, Kind, KnownObject, Look
 from lerobot_openspm.perception.objects.patches.match import Patch, Probe, as_seen, cut, match
 from lerobot_openspm.perception.objects.patches.model import PatchModel, from_record
-from lerobot_openspm.perception.objects.patches.stillness import hardly_moving, often_at, places_of
+from lerobot_openspm.perception.objects.patches.stillness import LIKELY, hardly_moving, often_at, places_of
 from lerobot_openspm.types import ContactCue, DemonstrationScene, View
 
 # A place touched less often says nothing of how far its object moves.
@@ -101,11 +101,19 @@ class _Candidate:
     groups: list[list[_Trail]]
 
 
-def learn_patches(examples: Examples) -> dict[str, PatchModel]:
-    """Learn the objects that hardly move; where a segmenter finds the objects, none."""
+def learn_patches(examples: Examples, at_few_places: bool = False) -> dict[str, PatchModel]:
+    """Learn the objects that hardly move; where a segmenter finds the objects, none.
+
+    Args:
+        examples: The demonstrations, and the objects to learn.
+        at_few_places: Also those that tasks begin with at a few places, each where it is shown most often.
+    """
     if examples.segmenter is not None:
         return {}
-    candidates = [_candidate(name, scenes) for name, scenes in _still_in(examples).items()]
+    shown: dict[str, Sequence[DemonstrationScene]] = dict.fromkeys(still_objects(examples), examples.scenes)
+    if at_few_places:
+        shown |= {name: _often(name, examples) for name in examples.names if name not in shown}
+    candidates = [_candidate(name, scenes) for name, scenes in shown.items() if scenes]
     # What many patches agree on is claimed first: what they follow is not another object.
     candidates.sort(key=lambda one: -max((len(group) for group in one.groups), default=0))
     learned: dict[str, PatchModel] = {}
@@ -120,20 +128,17 @@ def learn_patches(examples: Examples) -> dict[str, PatchModel]:
     return learned
 
 
-def _still_in(examples: Examples) -> dict[str, Sequence[DemonstrationScene]]:
-    """By name, the demonstrations in which an object hardly moves, and those that do not touch it.
-
-    An object that tasks begin with at a few places is learned where it is shown most often.
-    """
+def still_objects(examples: Examples) -> list[str]:
+    """Those of the objects that hardly move between all demonstrations."""
     still = hardly_moving(examples.names, examples.scenes, examples.known)
-    found: dict[str, Sequence[DemonstrationScene]] = {}
-    for name in examples.names:
-        if still[name] >= 0.5:
-            found[name] = examples.scenes
-        elif often := often_at(name, examples.scenes):
-            others = [scene for scene in examples.scenes if all(cue.name != name for cue in scene.cues)]
-            found[name] = [*often, *others]
-    return found
+    return [name for name in examples.names if still[name] >= LIKELY]
+
+
+def _often(name: str, examples: Examples) -> list[DemonstrationScene]:
+    """The demonstrations of an object where it is shown most often, and those that do not touch it."""
+    often = often_at(name, examples.scenes)
+    others = [scene for scene in examples.scenes if all(cue.name != name for cue in scene.cues)]
+    return [*often, *others] if often else []
 
 
 # What hardly moves is learned with its surface, which calls learn_patches; here nothing is left to learn.

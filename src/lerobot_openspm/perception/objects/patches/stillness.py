@@ -20,6 +20,8 @@ from lerobot_openspm.types import ContactCue, DemonstrationScene
 # The hand's target moves with the object; if its standard deviation along an axis is below this, patches do.
 # It is that of a uniform distribution within 3 cm of the middle, about as far as a patch is sought.
 MAX_STD_M = 0.03 / np.sqrt(3)
+# From this probability on, an object counts as one that hardly moves.
+LIKELY = 0.5
 # Where tasks begin with an object at different places, these are so far apart at least, metres, each is shown
 # so often, and this share of the demonstrations begin at one of them.
 APART_M, MIN_SHOWN, AT_PLACES_SHARE = 0.05, 3, 0.8
@@ -65,7 +67,7 @@ def often_at(name: str, scenes: Sequence[DemonstrationScene]) -> list[Demonstrat
     groups = [group for group in groups if len(group) >= MIN_SHOWN]
     if len(groups) < 2 or sum(map(len, groups)) < AT_PLACES_SHARE * len(shown):
         return []
-    if any((_hardly_moves(group, name) or 0.0) < 0.5 for group in groups):
+    if any((_hardly_moves(group, name) or 0.0) < LIKELY for group in groups):
         return []
     return max(groups, key=len)
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import cv2
@@ -13,7 +13,7 @@ from scipy.spatial import KDTree
 from lerobot_openspm.geometry import se3
 from lerobot_openspm.geometry.se3 import Array
 from lerobot_openspm.perception.objects.base import Examples, Kind, Look
-from lerobot_openspm.perception.objects.patches.learn import learn_patches
+from lerobot_openspm.perception.objects.patches.learn import learn_patches, still_objects
 from lerobot_openspm.perception.objects.patches.model import PatchModel
 from lerobot_openspm.perception.objects.surface.backdrop import Backdrop, Float32, learn_backdrop
 from lerobot_openspm.perception.objects.surface.carving import Carved, Frame, Frames, carve, silhouette
@@ -59,18 +59,32 @@ FirstSights = Sequence[tuple[Mapping[str, View], Array]]
 
 
 def learn_surfaces(examples: Examples) -> dict[str, SurfaceModel | PatchModel]:
-    """Learn what hardly moves between demonstrations: its patches, and its surface where there are films."""
-    near = learn_patches(examples)
-    return {**near, **_learn_surfaces(near, examples)}
+    """Learn what hardly moves between demonstrations: its patches, and its surface where there are films.
+
+    What tasks begin with at a few places is kept only with its surface, which finds it anywhere: patches find
+    it at one of these places.
+    """
+    near = learn_patches(examples, at_few_places=True)
+    surfaces, why = _learn_surfaces(near, examples)
+    still = still_objects(examples)
+    alone = {name: model for name, model in near.items() if name not in surfaces and name in still}
+    if alone and why:
+        logger.warning("found only about where they were shown, since %s: %s", why, ", ".join(sorted(alone)))
+    for name in near.keys() - surfaces.keys() - alone.keys():
+        examples.leave_out(name, f"it begins at a few places, and {why or 'there are no films of it'}")
+    return {**alone, **surfaces}
 
 
-def _learn_surfaces(near: Mapping[str, PatchModel], examples: Examples) -> dict[str, SurfaceModel]:
+def _learn_surfaces(
+    near: Mapping[str, PatchModel], examples: Examples
+) -> tuple[dict[str, SurfaceModel], str]:
+    """Surfaces by name, and why the others have none; that is empty where there are no films."""
     films = [(scene, scene.film()) for scene in examples.scenes if near and scene.film is not None]
-    backdrop = learn_backdrop(_pictures(films), examples.floor) if films else None
+    if not films:
+        return {}, ""
+    backdrop = learn_backdrop(_pictures(films), examples.floor)
     if backdrop is None:
-        if films:
-            _warn_of(near, "no camera of the hand shows a table")
-        return {}
+        return {}, "no camera of the hand shows a table"
     scenes = [scene for scene, _ in films]
     first = [_first_poses(scene, near) for scene in scenes]
     touched = {name: _touched(name, scenes, first) for name in near}
@@ -84,14 +98,7 @@ def _learn_surfaces(near: Mapping[str, PatchModel], examples: Examples) -> dict[
         models[name] = SurfaceModel(name, surface, backdrop, heights[name], typical, rival, near[name])
         logger.info("surface of %s: %d coloured points, agreement %.2f, without it %.2f",
                     name, len(surface.coloured), typical, rival)  # fmt: skip
-    _warn_of(near.keys() - models.keys(), "the hand's camera shows too little of its surface")
-    return models
-
-
-def _warn_of(names: Collection[str], why: str) -> None:
-    """Say which objects are known by patches alone."""
-    if names:
-        logger.warning("found only about where they were shown, since %s: %s", why, ", ".join(sorted(names)))
+    return models, "the hand's camera shows too little of its surface"
 
 
 def _pictures(films: Sequence[tuple[DemonstrationScene, Sequence[Moment]]]) -> dict[str, list[View]]:
