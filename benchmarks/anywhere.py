@@ -77,7 +77,8 @@ def look(checkpoint: Path, root: Path, task: str, seed: int) -> Row:
         for own, name in _taken_away(world, list(T_sim_obj)):
             with _without(world, own):
                 views, _ = observe(policy, world).usable_views(cameras)
-                gone.append((name, detect(views, objects)[name].status != "not_found"))
+                estimate = detect(views, objects)[name]
+                gone.append((name, estimate.status != "not_found", estimate.confidence))
     return {"found": found, "gone": gone, "drawn": len(drawn), "tried": len(tried)}
 
 
@@ -120,8 +121,9 @@ def _without(world: TabletopWorld, name: str) -> Generator[None]:
 def summarise(rows: Sequence[Row]) -> dict[str, Any]:
     """Errors of all objects and of those that the task needs, false finds, and whether confidence holds."""
     found = [one for row in rows for one in row["found"]]
-    gone = [is_found for row in rows for _, is_found in row["gone"]]
+    gone = [is_found for row in rows for _, is_found, _ in row["gone"]]
     sure = [one for one in found if one[3] > CONFIDENT and one[4] is not None]
+    mistaken = sum(is_found and told > CONFIDENT for row in rows for _, is_found, told in row["gone"])
     right = [one for one in sure if one[4] <= RIGHT_M and (not one[2] or one[5] <= RIGHT_RAD)]
     return {
         "looks": len(rows),
@@ -129,7 +131,7 @@ def summarise(rows: Sequence[Row]) -> dict[str, Any]:
         "poses": _errors(found),
         "poses_needed": _errors([one for one in found if one[1]]),
         "false_finds": rate(sum(gone), len(gone)),
-        "confident_and_right": rate(len(right), len(sure)),
+        "confident_and_right": rate(len(right), len(sure) + mistaken),
     }
 
 

@@ -113,22 +113,23 @@ def _headlines() -> str:
             _headline("LIBERO-GOAL", name, "mine_and_train_s")
             for name in ("libero_goal", "libero_few_shot_3", "libero_few_shot_1")
         ),
+        _headline("LIBERO-PRO, objects exchanged", "libero_goal_swap"),
+        _headline("LIBERO-PRO, other words", "libero_goal_lan"),
     ]
     there = [row for row in rows if row is not None]
     if not there:
-        return (
-            "Nothing is measured of the headline figures on the present code; `make figures` measures it. "
-            "docs/results.md has the others."
-        )
+        return "Nothing is measured of the headline figures on the present code; `make figures` measures it."
     heads = ["From camera images", "Demonstrations", "Success", "95 % interval", "Episodes", "Learning, s"]
     return table(heads, there)
 
 
-def _headline(what: str, name: str, seconds: str) -> list[Any] | None:
+def _headline(what: str, name: str, seconds: str = "") -> list[Any] | None:
+    """A result's row; `seconds` names how long it learned, where that is not another row's."""
     result = quoted(name)
     if result is None:
         return None
-    return [what, result["demonstrations"], *_rate(result), _in_s(result[seconds], result)]
+    learned_s = result[seconds] if seconds else None
+    return [what, result["demonstrations"], *_rate(result), _in_s(learned_s, result)]
 
 
 def _taught(what: str) -> list[Any] | None:

@@ -81,11 +81,13 @@ def test_a_section_is_marked_with_what_it_quotes_and_where_that_comes_from(resul
 def test_readme_has_a_row_for_what_was_measured_alone(results):
     put(results, "tabletop", **RATE, demonstrations=7, train_s=30.4)
     put(results, "libero_few_shot_3", **RATE, demonstrations=3, mine_and_train_s=None)
+    put(results, "libero_goal_swap", **RATE, demonstrations=10)
     page = tables.with_headlines(f"{tables.BEGIN}\n{tables.END}")
     rows = [line for line in page.splitlines() if "50.0 %" in line]
     assert [row.split(" <!--")[0] for row in rows] == [
         "| Tabletop | 7 | 50.0 % | 15.0 to 85.0 % | 4 | 30",
         "| LIBERO-GOAL | 3 | 50.0 % | 15.0 to 85.0 % | 4 | -",
+        "| LIBERO-PRO, objects exchanged | 10 | 50.0 % | 15.0 to 85.0 % | 4 | -",
     ]
     assert ("tabletop", "success") in MARK.findall(rows[0])
 

@@ -92,7 +92,7 @@ def test_first_looks_tell_errors_false_finds_and_whether_confidence_holds():
             ["stove", True, True, 0.99, 0.004, 0.5],
             ["rack", False, True, 0.90, None, None],
         ],
-        "gone": [["plate", False], ["box", True]],
+        "gone": [["plate", False, 0.0], ["box", True, 0.97], ["cup", True, 0.80]],
         "drawn": 5,
         "tried": 2,
     }
@@ -102,5 +102,6 @@ def test_first_looks_tell_errors_false_finds_and_whether_confidence_holds():
     assert told["poses"]["position_mm_mean"] == 3.0
     assert told["poses"]["unknown"] == 1
     assert told["poses_needed"]["yaw_deg_mean"] == round(float(np.rad2deg(0.5)), 2)
-    assert (told["false_finds"]["success"], told["false_finds"]["n"]) == (0.5, 2)
-    assert (told["confident_and_right"]["success"], told["confident_and_right"]["n"]) == (0.5, 2)
+    assert (told["false_finds"]["success"], told["false_finds"]["n"]) == (2 / 3, 3)
+    # The bowl is right; the stove is turned, and the box is not there.
+    assert (told["confident_and_right"]["success"], told["confident_and_right"]["n"]) == (1 / 3, 3)

@@ -15,7 +15,7 @@ from lerobot_openspm.control.clearance import (
     lifted,
 )
 from lerobot_openspm.control.plan import Plan
-from lerobot_openspm.control.planning import MOST_IN_A_SCENE
+from lerobot_openspm.control.planning import MIN_SHOWN, MOST_IN_A_SCENE, USUAL_M
 from lerobot_openspm.control.state import Status
 from lerobot_openspm.control.transfer import Turn, transfer
 from lerobot_openspm.geometry import se3
@@ -214,6 +214,38 @@ def test_a_hand_that_leaves_a_large_object_for_its_other_side_rises_over_it_all(
     assert crossed == ["plate"]
     phases = [(one.phase, one.anchor.place, one.sub_task) for one in higher.key_poses]
     assert ("retreat", "plate", 0) in phases[phases.index(("retreat", "plate", 0)) + 1 :]
+
+
+FOOT = {name: np.zeros((1, 3)) for name in ("bowl", "plate")}
+AMONG = {
+    "bowl": se3.from_yaw([-0.2, 0.0, 0.0], 0.0),
+    "plate": se3.from_yaw([0.2, 0.0, 0.0], 0.0),
+    "post": se3.from_yaw([0.0, 0.0, 0.0], 0.0),
+}
+
+
+def moved_by(metres, *names):
+    """Everything a little aside of its usual place, and some of it by so much more, along the table."""
+    aside = {name: 0.01 + metres * (name in names) for name in AMONG}
+    return {name: se3.transform(np.eye(3), [0.0, aside[name], 0.0]) @ T for name, T in AMONG.items()}
+
+
+@pytest.mark.parametrize(
+    ("poses", "shown", "rises"),
+    [
+        (moved_by(0.0), [AMONG] * MIN_SHOWN, False),
+        (moved_by(USUAL_M, "bowl"), [AMONG] * MIN_SHOWN, True),
+        (moved_by(USUAL_M, "post"), [AMONG] * MIN_SHOWN, True),
+        (moved_by(0.0), [AMONG] * (MIN_SHOWN - 1), True),
+        (moved_by(0.0), [AMONG] * MIN_SHOWN + [moved_by(USUAL_M, "post")], True),
+    ],
+    ids=["all is as shown", "bowl elsewhere", "post elsewhere", "rarely shown", "post moved about"],
+)
+def test_what_stands_as_ever_is_not_in_the_way_that_was_shown(poses, shown, rises):
+    entries = [entry(object_poses=one) for one in shown]
+    context = planning_context(*entries, points={"post": pillar(0.0, 0.0, 0.2), **FOOT}, hand_radius_m=0.05)
+    plan = Plan(entries[0], poses, hand_pose(-0.2, 0.0, 0.3))
+    assert (context.clear(plan) is not plan) == rises
 
 
 @pytest.mark.parametrize(("known", "asked"), [(MOST_IN_A_SCENE, MOST_IN_A_SCENE), (MOST_IN_A_SCENE + 1, 2)])

@@ -9,7 +9,7 @@ objects.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -143,8 +143,12 @@ def lifted(
     T_world_ee: Array,
     points: Mapping[str, Array],
     radius: float,
+    usual: Collection[str] = (),
 ) -> tuple[MemoryEntry, list[str]]:
     """An entry with further key poses where its ways run into what stands about, and what that is.
+
+    A way between objects that stand as they always did was shown, and with it that what stands as ever is
+    not in the way.
 
     Args:
         entry: What is to be executed.
@@ -152,6 +156,7 @@ def lifted(
         T_world_ee: Where the hand is ``(4, 4)``.
         points: Points ``(n, 3)`` in the world of the objects that were found, by name.
         radius: Of the hand, metres.
+        usual: The objects that stand where they did in all demonstrations.
     """
     poses: list[MemoryKeyPose] = []
     crossed: dict[str, None] = {}
@@ -163,11 +168,12 @@ def lifted(
         if -T[2, 2] > UPRIGHT and pose.phase in CROSSING and way.length > SHORTEST_M:
             previous = entry.key_poses[i - 1] if i else None
             near = {grasped, *pose.anchor.objects, *(previous.anchor.objects if previous else ())}
-            held = grasped if standing.is_held else None
+            is_shown = previous and previous.sub_task == pose.sub_task and near - {""} <= set(usual)
+            left_out = {grasped if standing.is_held else "", *(usual if is_shown else ())}
             others = {
                 name: way.between(own, BESIDE * radius) if name in near else own
                 for name, own in standing.points.items()
-                if name != held
+                if name not in left_out
             }
             height, names = way.crossing(others, BESIDE * radius)
             if height > way.start[2]:

@@ -38,6 +38,9 @@ MUCH_MORE = 2
 OTHERWISE_RAD = np.deg2rad(85)
 # A memory that knows more objects than this knows several scenes, and not all objects are looked for.
 MOST_IN_A_SCENE = 20
+# An object usually stands at one place if so many demonstrations at least show it, all of them this near to
+# that, metres and radians. Patches reach as far.
+MIN_SHOWN, USUAL_M, USUAL_RAD = 3, 0.035, np.deg2rad(15)
 
 
 @dataclass(frozen=True)
@@ -96,6 +99,20 @@ class PlanningContext:
             low, high = np.percentile(points, (5, 95), axis=0)
             feet[name] = np.array([*(low + high)[:2] / 2, low[2]])
         return feet
+
+    @cached_property
+    def usual(self) -> dict[str, Array]:
+        """Where the objects stood ``(4, 4)`` that hardly moved between all demonstrations, by name."""
+        usual: dict[str, Array] = {}
+        for name in self.points:
+            shown = [entry.object_poses[name] for entry in self.entries if name in entry.object_poses]
+            if len(shown) < MIN_SHOWN:
+                continue
+            places = np.stack(shown)[:, :3, 3]
+            middle = shown[int(np.linalg.norm(places - np.median(places, axis=0), axis=1).argmin())]
+            if all(_is_at(T, middle) for T in shown):
+                usual[name] = middle
+        return usual
 
     @property
     def surfaces(self) -> dict[str, Array]:
@@ -241,7 +258,8 @@ class PlanningContext:
         points, targets = self._points(plan), plan.targets(self)
         if plan.is_half_turned:  # key poses are kept as the hand was before
             targets = half_turned(targets)
-        entry, crossed = lifted(plan.entry, targets, plan.T_world_ee, points, self.hand_radius_m)
+        usual = [name for name, T in self.usual.items() if _is_at(plan.object_poses.get(name), T)]
+        entry, crossed = lifted(plan.entry, targets, plan.T_world_ee, points, self.hand_radius_m, usual)
         if not crossed:
             return plan
         higher, problems = replace(plan, entry=entry).followed(self)
@@ -252,6 +270,14 @@ class PlanningContext:
             )  # fmt: skip
             return plan
         return higher
+
+
+def _is_at(T: Array | None, T_usual: Array) -> bool:
+    """Whether a pose ``(4, 4)`` is known, and near to another one."""
+    if T is None:
+        return False
+    metres, radians = se3.distances(T, T_usual)
+    return bool(metres <= USUAL_M and radians <= USUAL_RAD)
 
 
 def _amount(way: tuple[Plan, Mapping[str, int]]) -> int:
