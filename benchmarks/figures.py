@@ -108,6 +108,8 @@ PLACES = {
     "libero_goal_patches": "--suite=libero_goal --scenes=10 --kinds=patches",
     "libero_goal_shape": "--suite=libero_goal --scenes=10 --kinds=shape",
     "libero_goal_exchanged": "--suite=libero_goal --exchanged=true --scenes=10",
+    "libero_goal_exchanged_demos_3": "--suite=libero_goal --exchanged=true --demos=3 --scenes=10",
+    "libero_goal_exchanged_demos_1": "--suite=libero_goal --exchanged=true --demos=1 --scenes=10",
     "libero_goal_exchanged_patches": "--suite=libero_goal --exchanged=true --scenes=10 --kinds=patches",
     "libero_goal_exchanged_shape": "--suite=libero_goal --exchanged=true --scenes=10 --kinds=shape",
 }

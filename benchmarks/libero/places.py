@@ -99,7 +99,8 @@ class PlacesConfig:
     def name(self) -> str:
         """The figure's name."""
         kinds = "" if self.kinds == "all" else "_" + "_".join(self.asked())
-        return f"places_{self.suite}{'_exchanged' * self.exchanged}{kinds}{'_tuning' * self.tuning}"
+        demos = "" if self.demos == DEMOS else f"_demos_{self.demos}"
+        return f"places_{self.suite}{'_exchanged' * self.exchanged}{demos}{kinds}{'_tuning' * self.tuning}"
 
     @property
     def first_seed(self) -> int:
@@ -245,7 +246,10 @@ def main(config: PlacesConfig) -> dict[str, Any]:
     rows = resume(folder / "scenes.jsonl", jobs, look_at_scene, config.workers)
     for told in learned["objects"].values():
         del told["T_sim_obj"]
-    about = {"seed": config.first_seed, "n": len(rows), "exchanged": config.exchanged, "kinds": config.kinds}
+    about = {
+        "seed": config.first_seed, "n": len(rows), "demonstrations": config.demos,
+        "exchanged": config.exchanged, "kinds": config.kinds,
+    }  # fmt: skip
     measured = {**about, "learned": learned, **summary(rows)}
     return measured if config.tuning else write(config.name, measured, config.workers)
 

@@ -92,7 +92,11 @@ def libero_sections() -> list[str]:
             section("The things of libero_spatial, found by a first look", "places_libero_spatial", _places),
             section("The things of libero_object, found by a first look", "places_libero_object", _places),
             section("Things of LIBERO-GOAL that changed places", "places_libero_goal_exchanged", _places),
-            section("Kinds of objects", [n for n in FIGURES if n.startswith("places_libero_goal")], _kinds),
+            section(
+                "Kinds of objects, and how many demonstrations",
+                [n for n in FIGURES if n.startswith("places_libero_goal")],
+                _kinds,
+            ),
             section("Few demonstrations", [*few, "libero_goal"], _few_shot),
             section("A new task by memory alone", new, _new_tasks),
             section("Loss over epochs", "libero_losses", _losses),
@@ -233,7 +237,8 @@ def _places(result: Quoted) -> str:
 
 def _kinds(results: list[Quoted]) -> str:
     rows = {
-        f"{result['kinds']}, {'exchanged' if result['exchanged'] else 'as in LIBERO'}": {
+        f"{result['kinds']}, {'exchanged' if result['exchanged'] else 'as in LIBERO'}, "
+        f"{result['demonstrations']} a task": {
             "learned": _count_learned(result), "sure": result["sure"],
             "spent": result["first_look_cpu_ms"]["median"], **result["all"],
         }
@@ -246,9 +251,9 @@ def _kinds(results: list[Quoted]) -> str:
         "First look, ms": "spent",
     }
     note = (
-        "The kinds that are asked to learn, and where things stand in the scenes: as LIBERO draws them, or "
-        "in one another's places. All things that the hand touched, the same scenes and the same "
-        "demonstrations for every kind. Boxes are learned from a segmenter's masks and are not compared."
+        "The kinds that are asked to learn, where things stand in the scenes, as LIBERO draws them or in one "
+        "another's places, and from how many demonstrations a task. All things that the hand touched, the "
+        "same scenes for all. Boxes are learned from a segmenter's masks and are not compared."
     )
     return f"{grid(rows, columns, 'Kinds')}\n\n{note}"
 

@@ -137,6 +137,7 @@ def test_another_suite_is_refused_by_name():
 
 def test_kinds_are_named_by_the_figure_and_unknown_ones_refused():
     assert PlacesConfig(exchanged=True).name == "places_libero_goal_exchanged"
+    assert PlacesConfig(exchanged=True, demos=3).name == "places_libero_goal_exchanged_demos_3"
     some = PlacesConfig(exchanged=True, kinds="patches,shape")
     assert some.name == "places_libero_goal_exchanged_patches_shape"
     with pytest.raises(ValueError, match=r"no kinds \['sphere'\], expected all or some of surface, patches"):

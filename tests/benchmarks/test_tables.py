@@ -98,16 +98,15 @@ def test_kinds_of_objects_are_compared_line_by_line(results):
         put(
             results,
             "places_libero_goal" + "_shape" * (kinds == "shape"),
-            n=4, kinds=kinds, exchanged=False, sure=RATE, first_look_cpu_ms={"median": 310.0},
+            n=4, kinds=kinds, exchanged=False, demonstrations=10, sure=RATE,
+            first_look_cpu_ms={"median": 310.0},
             learned={"objects": {"bowl": bowl, "milk": {**bowl, "learned": None}}},
             all={"found": found, "within_10_mm": RATE, "position_mm_median": 4.2},
         )  # fmt: skip
     page = tables.results_page()
-    assert (
-        "| all, as in LIBERO | 1 of 2 | 50.0 % | 50.0 % | 15.0 to 85.0 % | 4.2 | 50.0 % of 4 | 310.0 |"
-        in page
-    )
-    assert "| shape, as in LIBERO | 1 of 2 | - | 50.0 %" in page
+    told = "1 of 2 | 50.0 % | 50.0 % | 15.0 to 85.0 % | 4.2 | 50.0 % of 4 | 310.0 |"
+    assert f"| all, as in LIBERO, 10 a task | {told}" in page
+    assert "| shape, as in LIBERO, 10 a task | 1 of 2 | - | 50.0 %" in page
 
 
 def test_failures_are_told_apart_by_rule(results):
