@@ -57,6 +57,12 @@ def under_another(simulator: TabletopSimulator) -> None:
     put(simulator, (*simulator.object_poses()["cabinet"][:2, 3], 0.08))
 
 
+def tipped(simulator: TabletopSimulator) -> None:
+    place = simulator.object_poses()["bowl"][:2, 3]
+    turn = Rotation.from_euler("x", 60, degrees=True).as_matrix()
+    simulator.put("bowl", se3.transform(turn, np.array([*place, 0.06])))
+
+
 def look(policy: OpenSPMPolicy, env: TabletopEnv, steps: int = 1) -> tuple[EpisodeState, np.ndarray]:
     """What becomes of an episode in a scene that nobody changes, and the actions ``(steps, 7)``."""
     policy.reset()
@@ -88,6 +94,7 @@ def hold_still(policy: OpenSPMPolicy, env: TabletopEnv) -> EpisodeState:
         (in_the_hand, Status.OBJECT_NOT_FOUND, "the fingers are around something"),
         (in_the_hand_at_home, Status.OBJECT_NOT_FOUND, "the fingers are around something"),
         (under_another, Status.OBJECT_NOT_FOUND, "cannot find the bowl"),
+        (tipped, Status.OBJECT_NOT_FOUND, "has tipped over"),
     ],
     ids=lambda one: getattr(one, "__name__", ""),
 )
