@@ -266,8 +266,7 @@ def test_pictures_that_tell_a_place_vaguely_are_no_evidence(models):
     assert np.sqrt(clear.covariance[:2, :2].diagonal()).max() < 0.004
 
 
-def from_the_front(scene):
-    """What the fixed camera shows of a demonstration."""
+def from_the_front(scene):  # as the fixed camera shows it
     view = {"front": scene.views["front"]}
     return dataclasses.replace(scene, views=view, film=lambda: [Moment(view, frozenset())])
 
@@ -275,17 +274,16 @@ def from_the_front(scene):
 def test_nothing_is_learned_of_surfaces_without_a_camera_in_the_hand():
     rng = np.random.default_rng(1)
     scenes = [from_the_front(demonstration(rng)) for _ in range(6)]
-    learned = learn_objects(scenes, np.random.default_rng(0)).models
-    assert {name: type(model) for name, model in learned.items()} == {"block": PatchModel, "cup": PatchModel}
+    models = learn_objects(scenes, np.random.default_rng(0)).models
+    assert {name: type(model) for name, model in models.items()} == {"block": PatchModel, "cup": PatchModel}
 
 
 def test_what_begins_at_a_few_places_is_known_by_its_surface():
     rng = np.random.default_rng(1)
     scenes = [demonstration(rng, aside_m=aside) for aside in (-0.15,) * 4 + (0.1,) * 6]
     learned = learn_objects(scenes, np.random.default_rng(0)).models
-    assert {name: type(model) for name, model in learned.items()} == {
-        "block": SurfaceModel, "cup": SurfaceModel,
-    }  # fmt: skip
+    assert learned.keys() == {"block", "cup"}
+    assert all(isinstance(model, SurfaceModel) for model in learned.values())
 
 
 def test_what_begins_at_a_few_places_is_not_known_at_one_of_them_alone():
