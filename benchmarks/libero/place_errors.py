@@ -26,23 +26,25 @@ NEAR_M, NEAR_RAD, SURE = 0.010, np.deg2rad(10), 0.95
 def judged(
     name: str,
     estimate: PoseEstimate,
+    meant: PoseEstimate,
     poses: Mapping[str, Array],
     T_sim_obj: Array,
     models: Mapping[str, KnownObject],
 ) -> Row:
-    """An estimate beside the truth; of several of a kind, beside the one that it is nearest to.
+    """An estimate beside the truth; of several of a kind, that of the one that the instruction is about.
 
     Args:
         name: What was sought, by the instructions' name.
         estimate: What was found.
-        poses: The simulator's poses ``T_world_obj`` of everything in the scene, by its names.
+        meant: The same, or where the one stands that the instruction is about.
+        poses: The simulator's poses ``T_world_obj`` of everything in the scene, by its names. Of several of a
+            kind, instructions are about the first.
         T_sim_obj: The learned frame in the simulator's upright one.
         models: What was learned, by name.
     """
     there = [upright(T) @ T_sim_obj for T in _of_kind(name, poses, models)]
-    # Two of a kind explain the pictures equally well, as they should.
-    is_found = estimate.status == "found" or (estimate.status == "ambiguous" and len(there) > 1)
-    row: Row = {"found": is_found, "confidence": round(float(estimate.confidence), 4), "of": len(there)}
+    is_found = meant.status == "found"
+    row: Row = {"found": is_found, "confidence": round(float(meant.confidence), 4), "of": len(there)}
     if not is_found or not there:
         return row
     period, model = true_period(name, LIBERO), models[name]
@@ -51,10 +53,9 @@ def judged(
     point = np.asarray(model.points, float).mean(0) if period == 0 and len(model.points) else np.zeros(3)
     middle = se3.transform(np.eye(3), np.array([*point[:2], 0.0]))
     there, found = [T @ middle for T in there], [T @ middle for T in (estimate.T_world_obj, *estimate.others)]
-    errors = [pose_error(T, found[0], period) for T in there]
-    nearest = int(np.argmin([metres for metres, _ in errors]))
-    metres, radians = errors[nearest]
-    off = found[0][:3, 3] - there[nearest][:3, 3]
+    T_found = meant.T_world_obj @ middle
+    metres, radians = pose_error(there[0], T_found, period)
+    off = T_found[:3, 3] - there[0][:3, 3]
     apart = [min(pose_error(T, one, 0.0)[0] for one in found) for T in there]
     return {
         **row,

@@ -37,8 +37,10 @@ from lerobot_openspm.envs.collection import SUMMARY_FILE
 from lerobot_openspm.envs.libero.simulator import DO_NOTHING, OBJECTS, SUITE, LiberoSimulator
 from lerobot_openspm.envs.seeds import TUNING_SEED_START
 from lerobot_openspm.envs.suites import find_suite
+from lerobot_openspm.episodes import new_episode
 from lerobot_openspm.errors import OpenSPMError
 from lerobot_openspm.files import write_json
+from lerobot_openspm.language.names import TABLE_NAMES
 from lerobot_openspm.memory.io import read_memory, write_memory
 from lerobot_openspm.memory.memory import Memory
 from lerobot_openspm.mining import objects as mining_objects
@@ -51,7 +53,7 @@ from lerobot_openspm.perception.objects.surface.learn import SURFACE
 from lerobot_openspm.perception.observation import Observation
 from lerobot_openspm.perception.pipeline import Perception
 from lerobot_openspm.training import dataset_processor, memory_of
-from lerobot_openspm.types import Hand, PoseEstimate
+from lerobot_openspm.types import Detections, Hand, PoseEstimate
 
 FIRST_SEED, FIRST_TUNING_SEED = 20_000, TUNING_SEED_START + 600_000
 # LIBERO at times draws two things into each other, and one is thrown off: it still moves after half a second.
@@ -176,11 +178,13 @@ def look_at_scene(config: PlacesConfig, folder: Path, task: str, number: int) ->
     memory, frames = _memory(folder)
     simulator, seed = draw(task, config.first_seed + number, config.exchanged)
     poses = simulator.object_poses()
-    estimates, spent_s = look(memory, simulator, several_of_a_kind(poses, memory.objects))
+    seen = observe(memory, simulator)
+    estimates, spent_s = look(memory, seen, several_of_a_kind(poses, memory.objects))
+    meant = sorted_out(memory, seen, estimates)
     found = {
         name: not_known(name, poses, memory.objects)
         if T is None or name not in estimates
-        else judged(name, estimates[name], poses, T, memory.objects)
+        else judged(name, estimates[name], meant[name], poses, T, memory.objects)
         for name, T in frames.items()
     }
     return {"task": task, "seed": seed, "look_cpu_ms": round(1000 * spent_s), "objects": found}
@@ -214,22 +218,36 @@ def is_still(simulator: LiberoSimulator) -> bool:
     return all(np.linalg.norm(after[name][:3, 3] - T[:3, 3]) < STILL_M for name, T in before.items())
 
 
-def look(
-    memory: Memory, simulator: LiberoSimulator, told_apart: Collection[str]
-) -> tuple[Mapping[str, PoseEstimate], float]:
-    """A first look for all objects of a memory, and the processor's seconds that it took.
-
-    Of the names that words tell apart every one is sought.
-    """
+def observe(memory: Memory, simulator: LiberoSimulator) -> Observation:
+    """What a policy with this memory sees of a scene now."""
     if memory.layouts is None:
         raise OpenSPMError("the memory does not say how its robot's state is laid out; mine it again")
     layout, state = memory.layouts[0], simulator.state().astype(float)
     hand = Hand(layout.poses(state), float(layout.openings(state)))
     images = dict(LazyImages(LiberoWorld(simulator), tuple(memory.cameras)))
-    seen = Observation(simulator.instruction, state, hand, images, None)
+    return Observation(simulator.instruction, state, hand, images, None)
+
+
+def look(
+    memory: Memory, seen: Observation, told_apart: Collection[str]
+) -> tuple[Mapping[str, PoseEstimate], float]:
+    """A first look for all objects of a memory, and the processor's seconds that it took.
+
+    Of the names that words tell apart every one is sought.
+    """
     perception, begin = Perception(memory, OpenSPMConfig().hand_radius_m), time.process_time()
     found = perception.detect(seen, list(memory.objects), {}, 0.0, told_apart).estimates
     return found, time.process_time() - begin
+
+
+def sorted_out(
+    memory: Memory, seen: Observation, estimates: Mapping[str, PoseEstimate]
+) -> Mapping[str, PoseEstimate]:
+    """What was found of the objects that the instruction is about, as the policy sorts them out at first."""
+    episode = new_episode(seen, memory, memory.entries, OpenSPMConfig(), TABLE_NAMES, None)
+    episode.controller.advance(seen.hand)  # reads the instruction
+    episode.controller.scene.take_in(Detections(estimates, {}), seen.hand)
+    return episode.controller.scene.detections.estimates
 
 
 def main(config: PlacesConfig) -> dict[str, Any]:

@@ -224,9 +224,9 @@ def _places(result: Quoted) -> str:
     note = (
         f"All that the hand touched in {learned['episodes']} demonstrations, and in how many it took hold of "
         "it. Seeded scenes that none of them shows; the hand is somewhere else in each. Shares are of the "
-        "scenes that hold the thing, whether it was learned or not; of several of a kind the nearest counts, "
-        "and their column says in how many scenes each of them is within 10 mm. Of a round thing it is the "
-        "middle of the learned surface that is compared. "
+        "scenes that hold the thing, whether it was learned or not; of several of a kind the one that the "
+        "instruction is about counts, as the policy tells it, and their column says in how many scenes each "
+        "of them is within 10 mm. Of a round thing it is the middle of the learned surface that is compared. "
         f"{percent(sure)} of {sure['n']} estimates with a confidence above 0.95 are within 10 mm and 10 "
         f"degrees. Learning the objects took {learned['learn_objects_s']:.0f} s of the "
         f"{learned['seconds']:.0f} s of mining. A first look at all of them takes {spent['median']:.0f} ms "

@@ -35,8 +35,8 @@ def at(x: float, yaw: float = 0.0) -> np.ndarray:
     return se3.from_yaw([x, 0.0, 0.9], yaw)
 
 
-def row(name, found, poses):
-    return judged(name, found, poses, T_SIM_OBJ, MODELS)
+def row(name, found, poses, meant=None):
+    return judged(name, found, meant or found, poses, T_SIM_OBJ, MODELS)
 
 
 def test_errors_are_those_of_the_learned_frame():
@@ -49,16 +49,22 @@ def test_errors_are_those_of_the_learned_frame():
     assert is_right(told)
 
 
-def test_of_two_of_a_kind_the_nearest_counts_and_no_yaw_of_a_round_one():
+def test_of_two_of_a_kind_that_which_is_meant_counts_and_no_yaw_of_a_round_one():
     poses = {"bowl": at(0.0), "bowl_2": at(0.3)}
-    one = estimate(at(0.304, 1.0) @ T_SIM_OBJ, "ambiguous")
-    both = estimate(at(0.3) @ T_SIM_OBJ, "ambiguous", others=[at(0.001) @ T_SIM_OBJ])
-    told = row("black bowl", one, poses)
-    assert told["found"]
-    assert told["of"] == 2
-    assert told["deg"] is None
-    assert told["near"] == 1
-    assert row("black bowl", both, poses)["near"] == 2
+    first, second = at(0.004, 1.0) @ T_SIM_OBJ, at(0.3) @ T_SIM_OBJ
+    both = estimate(second, "ambiguous", others=[first])
+    told = row("black bowl", both, poses, estimate(first))
+    assert (told["found"], told["of"], told["deg"], told["near"]) == (True, 2, None, 2)
+    assert is_right(told)
+    other = row("black bowl", both, poses, estimate(second))
+    assert other["mm"] > 290
+    assert row("black bowl", estimate(second), poses, estimate(second))["near"] == 1
+
+
+def test_of_two_of_a_kind_that_no_words_tell_apart_none_is_found():
+    both = estimate(at(0.3), "ambiguous", others=[at(0.0)])
+    told = row("black bowl", both, {"bowl": at(0.0), "bowl_2": at(0.3)})
+    assert told == {"found": False, "confidence": 0.99, "of": 2}
 
 
 def test_however_a_round_thing_is_found_turned_its_middle_counts():
@@ -123,7 +129,10 @@ def test_every_thing_that_the_hand_touched_is_in_a_scenes_row(tmp_path: Path, mo
     simulator = SimpleNamespace(object_poses=lambda: poses)
     monkeypatch.setattr(places, "read_memory", lambda _: SimpleNamespace(objects={"milk": Known()}))
     monkeypatch.setattr(places, "draw", lambda *_: (simulator, 7))
-    monkeypatch.setattr(places, "look", lambda *_: ({"milk": estimate(poses["milk"] @ T_SIM_OBJ)}, 0.1))
+    found = {"milk": estimate(poses["milk"] @ T_SIM_OBJ)}
+    monkeypatch.setattr(places, "observe", lambda *_: None)
+    monkeypatch.setattr(places, "look", lambda *_: (found, 0.1))
+    monkeypatch.setattr(places, "sorted_out", lambda *_: found)
     row = look_at_scene(PlacesConfig("libero_object"), tmp_path, "a task", 3)
     assert (row["seed"], row["look_cpu_ms"]) == (7, 100)
     assert row["objects"]["milk"]["mm"] == 0.0
