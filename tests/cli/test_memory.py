@@ -10,7 +10,7 @@ import pytest
 from tests.cli.conftest import Openspm
 from tests.memory.builders import entry, robot
 from tests.memory.memories import LAYOUTS, a_memory, merged_entry, same
-from tests.perception.builders import model
+from tests.perception.builders import model, patch_model
 
 from lerobot_openspm.cli.memory import COMMANDS
 from lerobot_openspm.geometry.camera import cameras_to_dict
@@ -99,8 +99,23 @@ def test_show(openspm: Openspm, memory: Path):
     assert code == 0
     assert out.count(" mm, ") == len(merged_entry().key_poses) == out.count("  spread ")
     assert "done when the bowl is within 20.0 mm of 0.0 0.0 10.0 mm from the plate (axes of the plate)" in out
-    assert json.loads(out.splitlines()[-1]) == {"entries": 1, "shown": 1, "per_task": {shown.language: 1}}
+    told = json.loads(out.splitlines()[-1])
+    assert told.pop("objects") == dict.fromkeys(OBJECTS, "shape")
+    assert told == {"entries": 1, "shown": 1, "per_task": {shown.language: 1}}
     assert "holds nothing from 'elsewhere#1'" in refused(openspm, memory, "show", "--source=elsewhere#1")
+
+
+def test_show_says_where_an_object_is_found(openspm: Openspm, memory: Path):
+    write_memory(replace(made(), objects={**OBJECTS, "stove": patch_model("stove")}), memory)
+    _, out, _ = openspm("memory", "show", f"--path={memory}", "--limit=1")
+    where = {
+        line.split("'")[1]: line.partition(": found ")[2] for line in out.splitlines() if "known by" in line
+    }
+    assert where == {
+        **dict.fromkeys(OBJECTS, "anywhere at the height where it stood in the demonstrations"),
+        "stove": "only within 3.5 cm of where it stood in the demonstrations",
+    }
+    assert json.loads(out.splitlines()[-1])["objects"]["stove"] == "patches"
 
 
 def test_what_is_removed_is_named_and_kept_as_superseded(openspm: Openspm, memory: Path):

@@ -17,6 +17,10 @@ from lerobot_openspm.geometry import se3
 from lerobot_openspm.memory.entry import MemoryEntry, MemoryKeyPose, Outcome
 from lerobot_openspm.memory.exchange import write_entries_file
 from lerobot_openspm.memory.io import read_memory, write_memory
+from lerobot_openspm.perception.objects.base import KnownObject
+from lerobot_openspm.perception.objects.patches.match import REACH_M
+from lerobot_openspm.perception.objects.patches.model import PatchModel
+from lerobot_openspm.perception.objects.surface.model import SurfaceModel
 
 
 @dataclass
@@ -82,7 +86,7 @@ def list_entries(args: list[str]) -> None:
 
 
 def show(args: list[str]) -> None:
-    """Print entries with all their numbers and what could not be learned, then one JSON object."""
+    """Print entries with all their numbers, how objects are known and what is not, then one JSON object."""
     config = draccus.parse(ShowConfig, args=args)
     memory = read_memory(Path(config.path))
     wanted = (
@@ -98,11 +102,15 @@ def show(args: list[str]) -> None:
         )
     for entry in shown:
         print("\n".join(_table(entry)), end="\n\n")
+    for model in memory.objects.values():
+        print(_known_by(model))
     for one in memory.not_learned:
         print(one)
     per_task = Counter(entry.language for entry in memory.entries)
     told = {"not_learned": [vars(one) for one in memory.not_learned]} if memory.not_learned else {}
-    print(json.dumps({"entries": len(memory.entries), "shown": len(shown), "per_task": per_task, **told}))
+    counts = {"entries": len(memory.entries), "shown": len(shown), "per_task": per_task}
+    known_by = {name: model.kind for name, model in memory.objects.items()}
+    print(json.dumps({**counts, "objects": known_by, **told}))
 
 
 def export(args: list[str]) -> None:
@@ -129,6 +137,18 @@ def export(args: list[str]) -> None:
     else:
         write_memory(chosen, output)
     print(json.dumps({"entries": len(entries), "output": str(output)}))
+
+
+def _known_by(model: KnownObject) -> str:
+    """By what an object is known, and so where it is found, as a line."""
+    match model:
+        case SurfaceModel():
+            where = "anywhere"
+        case PatchModel():
+            where = f"only within {100 * REACH_M:.1f} cm of where it stood in the demonstrations"
+        case _:
+            where = "anywhere at the height where it stood in the demonstrations"
+    return f"{model.name!r} is known by its {model.kind}: found {where}"
 
 
 def _line(entry: MemoryEntry) -> str:

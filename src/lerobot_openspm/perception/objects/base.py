@@ -189,9 +189,11 @@ class KnownObject(Protocol):
     """An object that was learned. Every kind of object implements this.
 
     Attributes:
+        kind: By what it is known, as records name it.
         sought_again: Whether the kind finds more once the others are found: on top of them, in them, behind.
     """
 
+    kind: ClassVar[str]
     sought_again: ClassVar[bool]
 
     @property
