@@ -180,6 +180,9 @@ FIGURES: dict[str, Figure] = {
         f"places_{name}": _libero("places", "libero/place_errors", "truth", "calls", options=options)
         for name, options in PLACES.items()
     },
+    "wrong_calibration_libero": _libero(
+        "wrong_calibration", "libero/places", "calls", "truth", "libero/place_errors"
+    ),
     "libero_few_shot_3": _libero("few_shot", options="--demos=3"),
     "libero_few_shot_1": _libero("few_shot", options="--demos=1 --states=10"),
     "libero_ablations": _with(
