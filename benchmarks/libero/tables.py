@@ -279,7 +279,7 @@ def _wrong_calibration(result: Quoted) -> str:
     note = (
         "Seeded scenes of libero_goal in which one camera at a time is not where its calibration says. Axes "
         "are the camera's own; it looks along its z. Told: at the first look, before anything moves, some "
-        "camera is not believed. Named: it is the one that is off. `image` stands in the room, `image2` goes "
+        "camera is not believed. Named: that which is off alone. `image` stands in the room, `image2` goes "
         "with the hand. With both where they should be, one is not believed in "
         f"{percent(right)} of {right['n']} scenes."
     )

@@ -1,4 +1,4 @@
-"""Whether a camera that is not where its calibration says is told at the first look, and by its name.
+"""Whether a camera that is not where its calibration says is told at the first look, and it alone.
 
     python -m benchmarks.libero.wrong_calibration
 
@@ -102,13 +102,13 @@ def look_at_scene(config: WrongCalibrationConfig, checkpoint: Path, task: str, n
 
 
 def summary(rows: Sequence[Row]) -> dict[str, Any]:
-    """How often a wrong camera was told, and was the one that was named; and how often nothing was wrong."""
+    """How often a wrong camera was told, and it alone was named; and how often one was told without an error."""
     cameras: dict[str, Any] = {}
     for camera, by_error in rows[0]["off"].items():
         cameras[camera] = {
             error: {
                 **rate(sum(bool(row["off"][camera][error]) for row in rows), len(rows)),
-                "named": sum(camera in row["off"][camera][error] for row in rows),
+                "named": sum(row["off"][camera][error] == [camera] for row in rows),
             }
             for error in by_error
         }

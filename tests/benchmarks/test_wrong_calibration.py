@@ -66,8 +66,9 @@ def test_every_camera_and_error_is_looked_at_and_counted(monkeypatch: pytest.Mon
         assert (row["success"], row["named"]) == ((1.0, 2) if error.startswith("2 cm") else (0.0, 0))
 
 
-def test_a_camera_that_is_named_in_anothers_place_is_told_but_not_named():
-    row = {"right": [], "off": {FRONT: {"2 cm along x": ["observation.images.wrist"]}}}
+@pytest.mark.parametrize("told", [["observation.images.wrist"], [FRONT, "observation.images.wrist"]])
+def test_an_error_for_which_another_camera_is_blamed_too_is_told_but_not_named(told: list[str]):
+    row = {"right": [], "off": {FRONT: {"2 cm along x": told}}}
     counted = summary([row, {"right": [FRONT], "off": {FRONT: {"2 cm along x": []}}}])
     assert counted["cameras"][FRONT]["2 cm along x"]["success"] == 0.5
     assert counted["cameras"][FRONT]["2 cm along x"]["named"] == 0
