@@ -102,7 +102,7 @@ def look_at_scene(config: WrongCalibrationConfig, checkpoint: Path, task: str, n
 
 
 def summary(rows: Sequence[Row]) -> dict[str, Any]:
-    """How often a wrong camera was told, and it alone was named; and how often one was told without an error."""
+    """How often a wrong camera was told, how often it alone, and how often one that was right."""
     cameras: dict[str, Any] = {}
     for camera, by_error in rows[0]["off"].items():
         cameras[camera] = {
