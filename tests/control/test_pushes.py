@@ -3,6 +3,7 @@
 from dataclasses import replace
 
 import numpy as np
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose
@@ -10,14 +11,16 @@ from tests.control.acting import HAND, Perception, controller, observe, shifted,
 from tests.memory.builders import entry, hand_pose, key_pose, robot
 
 from lerobot_openspm.control.executor import MAX_ATTEMPTS, Executor
+from lerobot_openspm.control.plan import Plan
+from lerobot_openspm.control.planning import PlanningContext
 from lerobot_openspm.control.pushes import push_paths
 from lerobot_openspm.control.scene import LEFT_BEHIND_M, OUTRUN_M
 from lerobot_openspm.control.state import EpisodeState, Status
-from lerobot_openspm.control.transfer import Target, transfer
+from lerobot_openspm.control.transfer import Target, transfer, turn_about
 from lerobot_openspm.geometry import se3
 from lerobot_openspm.memory.entry import Anchor, Outcome
 from lerobot_openspm.perception.tracking.tracker import TrackStatus
-from lerobot_openspm.types import Hand
+from lerobot_openspm.types import Hand, Symmetry
 
 INSTRUCTION = "push the plate to the front of the stove"
 LAYOUT = {"plate": se3.from_yaw([0.3, 0.1, 0.0], 0.0), "stove": se3.from_yaw([-0.1, 0.0, 0.0], 0.0)}
@@ -72,6 +75,26 @@ def test_from_wherever_the_plate_stands_the_hand_leads_it_to_its_place(x, y, yaw
     lead = way / np.linalg.norm(way)
     assert_allclose(inside[:2], object_poses["plate"][:2, 3] + 0.03 * lead, atol=1e-9)
     assert_allclose(done[:2], goal[:2] + LEAD_M * lead, atol=1e-9)
+
+
+@pytest.mark.parametrize("yaw", [0.0, 1.0, 2.5])
+def test_a_round_thing_is_pushed_to_its_place_however_it_was_found_turned(yaw):
+    middle = np.array([0.04, 0.0])  # its frame lies beside its middle
+    round_plate = {"plate": Symmetry(middle, 0.0)}
+    context = PlanningContext((), {"plate": 2 * np.pi, "stove": 2 * np.pi}, robot(), symmetries=round_plate)
+    memory = push()
+    now = LAYOUT | {"plate": LAYOUT["plate"] @ turn_about(middle, yaw)}
+    plan = Plan(memory, now, HAND.T_world_ee)
+    for target, expected in zip(
+        plan.targets(context), transfer(memory, LAYOUT, {}, HAND.T_world_ee), strict=True
+    ):
+        assert_allclose(target.T_world_ee, expected.T_world_ee, atol=1e-9)
+    goal = se3.from_yaw(se3.apply(LAYOUT["stove"], GOAL[None])[0], 0.0)
+    (outcome,) = memory.outcomes
+    # On its way it turned once more.
+    ended = now | {"plate": goal @ turn_about(middle, 2.0)}
+    assert outcome.is_met(plan.as_if_in_place(ended, round_plate))
+    assert not outcome.is_met(plan.as_if_in_place(ended, {}))
 
 
 def test_the_height_of_a_push_is_that_of_what_stands_still():

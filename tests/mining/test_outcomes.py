@@ -1,13 +1,30 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 from numpy.testing import assert_allclose
-from tests.mining.test_anchors import SUB_TASKS, demonstrations
+from tests.memory.builders import hand_pose, robot
+from tests.mining.episodes import push
+from tests.mining.test_anchors import SUB_TASKS, demonstrations, key_pose
+from tests.perception.builders import model
 
 from lerobot_openspm.geometry import se3
 from lerobot_openspm.language.instruction import parse_instruction
 from lerobot_openspm.memory.entry import WORLD
+from lerobot_openspm.mining import objects
 from lerobot_openspm.mining.anchors import Demonstration
-from lerobot_openspm.mining.outcomes import LEAST_TOLERANCE_M, MOST_SPREAD_M, carried_to, outcomes
+from lerobot_openspm.mining.key_poses import find_key_poses
+from lerobot_openspm.mining.mined import MinedEpisode
+from lerobot_openspm.mining.outcomes import (
+    LEAST_TOLERANCE_M,
+    MOST_SPREAD_M,
+    carried_to,
+    outcomes,
+    pushed_to,
+)
+from lerobot_openspm.types import DemonstrationScene, PoseEstimate
 
 PUSH = parse_instruction("push the plate to the front of the stove")
 
@@ -39,6 +56,75 @@ def test_what_was_not_seen_at_the_start_has_no_end():
     (shown,) = demonstrations(1)
     unseen = Demonstration(shown.key_poses, {"plate": shown.object_poses["plate"]})
     assert carried_to(unseen, SUB_TASKS) == {}
+
+
+ANGLES = np.linspace(0, 2 * np.pi, 72, endpoint=False)
+# The rim of a plate whose frame's origin is beside its middle.
+PLATE = {"plate": np.stack([0.07 * np.cos(ANGLES) + 0.04, 0.07 * np.sin(ANGLES), 0 * ANGLES], axis=-1)}
+
+
+def hand_pushes(plate, *ways, start="behind"):
+    """A demonstration in which the hand comes down behind a plate, or above it, and pushes it along ways."""
+    middle = se3.apply(plate, np.array([[0.04, 0.0, 0.0]]))[0, :2]
+    heading = ways[0] / np.linalg.norm(ways[0])
+    hand = middle + (-0.07 if start == "behind" else 0.03) * heading
+    points = [hand, *(hand + way for way in np.cumsum(ways, axis=0))]
+    poses = tuple(key_pose("push" if i else "approach", hand_pose(*p, 0.02), 0) for i, p in enumerate(points))
+    return Demonstration(poses, {"plate": plate, "stove": np.eye(4)}), points[-1]
+
+
+@given(st.floats(-np.pi, np.pi), st.floats(-np.pi, np.pi), st.floats(0.05, 0.3))
+def test_what_is_pushed_ends_just_ahead_of_the_hand(yaw, heading, metres):
+    plate = se3.from_yaw([0.4, 0.1, 0.02], yaw)
+    way = metres * np.array([np.cos(heading), np.sin(heading)])
+    shown, _ = hand_pushes(plate, way)
+    end = pushed_to(shown, PUSH, PLATE)["plate"]
+    assert_allclose(end[:3, 3] - plate[:3, 3], [*way, 0.0], atol=1e-3)
+    assert_allclose(end[:3, :3], plate[:3, :3], atol=1e-12)
+
+
+def test_a_push_that_turns_leaves_the_object_ahead_of_its_last_stretch():
+    plate = se3.from_yaw([0.4, 0.1, 0.02], 0.3)
+    shown, hand = hand_pushes(plate, np.array([0.2, 0.0]), np.array([0.0, 0.1]))
+    end = pushed_to(shown, PUSH, PLATE)["plate"]
+    middle = se3.apply(end, np.array([[0.04, 0.0, 0.0]]))[0, :2]
+    assert_allclose(middle - hand, [0.0, 0.07], atol=1e-3)
+
+
+def test_what_is_dragged_along_from_above_is_not_told():
+    shown, _ = hand_pushes(se3.from_yaw([0.4, 0.1, 0.02], 0.0), np.array([0.2, 0.0]), start="above")
+    assert pushed_to(shown, PUSH, PLATE) == {}
+
+
+@pytest.mark.parametrize("points", [{}, {"plate": np.zeros((0, 3))}], ids=["unknown", "without a surface"])
+def test_the_end_of_a_push_needs_the_shape_of_what_is_pushed(points):
+    shown, _ = hand_pushes(se3.from_yaw([0.4, 0.1, 0.02], 0.0), np.array([0.2, 0.0]))
+    assert pushed_to(shown, PUSH, points) == {}
+
+
+@pytest.mark.parametrize(("n_seen", "is_by_images"), [(0, False), (1, False), (2, True), (4, True)])
+def test_most_final_pictures_or_none_tell_where_what_is_pushed_ends(monkeypatch, n_seen, is_by_images):
+    task = "push the plate to the front of the stove"
+    drawer, at = push(plate=(0.1, -0.1))
+    episode = drawer.episode(0, task)
+    item = MinedEpisode(episode, tuple(find_key_poses(episode, robot())), PUSH)
+    stands, sprang = se3.from_yaw([0.1 - 0.04, -0.1 + 0.07, 0.0], 0.0), se3.from_yaw([0.3, 0.3, 0.0], 1.0)
+    plate = replace(model("plate"), points=PLATE["plate"].astype(np.float32))
+    scenes = [DemonstrationScene({"first": i}, (), {"last": i}) for i in range(4)]
+
+    def seen(views, sought, segmenter):
+        T, sure = (stands, 1.0) if "first" in views else (sprang, 1.0 if views["last"] < n_seen else 0.5)
+        return {"plate": PoseEstimate("found", T, 1e-6 * np.eye(4), sure)}
+
+    monkeypatch.setattr(objects, "detect", seen)
+    found = objects.find_objects(scenes, [item] * 4, {"plate": plate}, np.random.default_rng(0))
+    if is_by_images:
+        assert [list(ends) for ends in found.ends] == [["plate"]] * n_seen + [[]] * (4 - n_seen)
+        assert all(ends["plate"] is sprang for ends in found.ends[:n_seen])
+    else:
+        pushed = episode.T_world_ee[at["push"], :2, 3] - episode.T_world_ee[at["approach"], :2, 3]
+        for ends in found.ends:
+            assert_allclose(ends["plate"][:2, 3] - stands[:2, 3], pushed, atol=2e-3)
 
 
 @pytest.mark.parametrize("n", [1, 3, 10])

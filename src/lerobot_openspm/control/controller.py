@@ -187,7 +187,7 @@ class EpisodeController:
         for i in range(before, state.index):
             scene.pass_key_pose(state.plan, executor.targets[i], executor.targets[i + 1], hand)
         if (target := executor.target) is not None:
-            scene.meet(target, hand)
+            scene.meet(state.plan, target, hand)
         if state.status is Status.DONE:
             scene.tracker.release(scene.tracker.held, hand.T_world_ee)
             return self._look_at_outcome(hand)

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from lerobot_openspm.control.feasibility import Miss, check_reach, check_transfer
-from lerobot_openspm.control.pushes import pushed_by_landmark
+from lerobot_openspm.control.pushes import pushed, pushed_by_landmark
 from lerobot_openspm.control.transfer import (
     HALF_TURN,
     RETREAT_M,
@@ -145,10 +145,12 @@ class Plan:
     ) -> dict[str, Array]:
         """Object poses as outcomes are told: what was put aside moved back, what is round turned as shown.
 
-        A round thing is turned by as much as before the hand took it along.
+        A round thing that was carried is turned by as much as before the hand took it along; what was pushed
+        may have turned on its way.
         """
         back = se3.from_yaw(np.array([-self.aside[0], -self.aside[1], 0.0]), 0.0)
-        turns = turns_as_shown(self.entry, self.object_poses, symmetries)
+        pushes = {name: T for name, T in object_poses.items() if name in pushed(self.entry)}
+        turns = turns_as_shown(self.entry, {**self.object_poses, **pushes}, symmetries)
         aside = {one.target for one in self._puts}
         shown = {name: T @ turns[name] if name in turns else T for name, T in object_poses.items()}
         return {name: back @ T if name in aside else T for name, T in shown.items()}

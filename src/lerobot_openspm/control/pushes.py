@@ -91,6 +91,11 @@ def pushed_by_landmark(entry: MemoryEntry) -> dict[int, str]:
     }
 
 
+def pushed(entry: MemoryEntry) -> frozenset[str]:
+    """What an entry's pushes move, where it is known to where."""
+    return frozenset(outcome.target for outcome in _push_outcomes(entry))
+
+
 def _push_outcomes(entry: MemoryEntry) -> list[Outcome]:
     """The outcomes of an entry's pushes.
 

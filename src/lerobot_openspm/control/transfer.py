@@ -9,7 +9,7 @@ from typing import Literal
 import numpy as np
 
 from lerobot_openspm.control.placing import ARRIVING, carried_outcomes, placing_position
-from lerobot_openspm.control.pushes import PushPath, push_paths
+from lerobot_openspm.control.pushes import PushPath, push_paths, pushed
 from lerobot_openspm.geometry import se3
 from lerobot_openspm.geometry.se3 import Array
 from lerobot_openspm.memory.entry import CONTACT_PHASES, Axis, MemoryEntry, MemoryKeyPose
@@ -73,9 +73,10 @@ def transfer_pose(T_world_obj: Array, T_obj_ee: Array) -> Array:
 def as_shown(
     entry: MemoryEntry, object_poses: Mapping[str, Array], symmetries: Mapping[str, Symmetry]
 ) -> dict[str, Array]:
-    """Object poses ``T_world_obj`` ``(4, 4)`` with the round things that an entry grasps turned as shown.
+    """Object poses ``T_world_obj`` ``(4, 4)`` with the round things that an entry moves turned as shown.
 
-    A bottle with a label is found turned by any angle, and is grasped and put down as if it were not.
+    A bottle with a label is found turned by any angle, and is grasped and put down as if it were not. A plate
+    that is pushed is told by its frame's origin, which may lie beside its middle.
 
     Args:
         entry: The entry.
@@ -89,8 +90,9 @@ def as_shown(
 def turns_as_shown(
     entry: MemoryEntry, object_poses: Mapping[str, Array], symmetries: Mapping[str, Symmetry]
 ) -> dict[str, Array]:
-    """By name, turns ``(4, 4)`` about its axis: they bring round things that an entry carries to as shown."""
-    known = set(entry.carried.values()) & symmetries.keys() & object_poses.keys() & entry.object_poses.keys()
+    """By name, turns ``(4, 4)`` about its axis: they bring round things that an entry moves to as shown."""
+    moved = {*entry.carried.values(), *pushed(entry)}
+    known = moved & symmetries.keys() & object_poses.keys() & entry.object_poses.keys()
     turns: dict[str, Array] = {}
     for name in (name for name in known if symmetries[name].turn == 0):
         yaw = se3.yaw_of(entry.object_poses[name]) - se3.yaw_of(object_poses[name])

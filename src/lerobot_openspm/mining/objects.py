@@ -21,7 +21,7 @@ from lerobot_openspm.mining.anchors import Demonstration, sub_task_of
 from lerobot_openspm.mining.dataset import Demonstrations
 from lerobot_openspm.mining.key_poses import KeyPose
 from lerobot_openspm.mining.mined import MinedEpisode
-from lerobot_openspm.mining.outcomes import carried_to
+from lerobot_openspm.mining.outcomes import carried_to, pushed_to
 from lerobot_openspm.perception.objects.base import KnownObject, ShapeBackend
 from lerobot_openspm.perception.objects.kinds import learn_objects
 from lerobot_openspm.perception.oracle import name_simulator_poses
@@ -150,33 +150,63 @@ def find_objects(
         logger.info("learning what these look like: %s", ", ".join(named))
         learned, unlearned = learn_objects(scenes, rng, known.values(), segmenter, shape, shapes)
         models |= learned
-    found, ends = [], []
+    found: list[dict[str, Array]] = []
     for scene, item in tqdm(zip(scenes, mined, strict=True), "Finding objects", len(scenes), unit="episode"):
         wanted = dict.fromkeys(name for sub_task in item.sub_tasks for name in sub_task.objects)
         sought = {name: models[name] for name in wanted if name in models}
         estimates = detect(scene.views, sought, segmenter)
         places = {name: place_touched(models[name], one, scene.cues) for name, one in estimates.items()}
         found.append({name: T for name, T in places.items() if T is not None})
-        ends.append(_ends(scene, item, found[-1], models, segmenter))
+    ends = _ends(scenes, mined, found, models, segmenter)
     return FoundObjects(models, found, ends, unlearned)
 
 
 def _ends(
+    scenes: Sequence[DemonstrationScene],
+    mined: Sequence[MinedEpisode],
+    poses: Sequence[Mapping[str, Array]],
+    models: Mapping[str, KnownObject],
+    segmenter: Segmenter | None,
+) -> list[dict[str, Array]]:
+    """Final poses of what each episode moves: of what is carried by the hand's path.
+
+    Of what is pushed by the images, if they show it at the end of most of a task's demonstrations, else by
+    the hand's path. They are not mixed: things spring ahead of the hand, and only images show how far.
+    """
+    seen = [_seen_ends(*one, models, segmenter) for one in zip(scenes, mined, strict=True)]
+    tasks = [item.episode.task for item in mined]
+    shown = Counter((task, name) for task, ends in zip(tasks, seen, strict=True) for name in ends)
+    episodes = Counter(tasks)
+    by_images = {key for key, n in shown.items() if 2 * n >= episodes[key[0]]}
+    found: list[dict[str, Array]] = []
+    for item, starts, ends in zip(mined, poses, seen, strict=True):
+        task, demonstration = item.episode.task, Demonstration(item.key_poses, starts)
+        points = {name: np.asarray(models[name].points, float) for name in starts}
+        pushed = pushed_to(demonstration, item.sub_tasks, points)
+        found.append(
+            {
+                **carried_to(demonstration, item.sub_tasks),
+                **{name: T for name, T in pushed.items() if (task, name) not in by_images},
+                **{name: T for name, T in ends.items() if (task, name) in by_images},
+            }
+        )
+    return found
+
+
+def _seen_ends(
     scene: DemonstrationScene,
     item: MinedEpisode,
-    poses: Mapping[str, Array],
     models: Mapping[str, KnownObject],
     segmenter: Segmenter | None,
 ) -> dict[str, Array]:
-    """Final poses of what an episode moves: carried objects by the hand's path, pushed ones by the images."""
-    carried = carried_to(Demonstration(item.key_poses, poses), item.sub_tasks)
+    """Final poses of what an episode pushes, as far as the images show them clearly."""
     pushed = {sub_task_of(p, item.sub_tasks).target for p in item.key_poses if p.phase == "push"}
     sought = {name: models[name] for name in sorted(pushed) if name in models}
     if not sought or scene.later_views is None:
-        return carried
+        return {}
     seen = detect(scene.later_views, sought, segmenter)
     sure = {k: e for k, e in seen.items() if e.status == "found" and e.confidence >= MIN_END_CONFIDENCE}
-    return {**carried, **{name: estimate.T_world_obj for name, estimate in sure.items()}}
+    return {name: estimate.T_world_obj for name, estimate in sure.items()}
 
 
 def place_touched(model: KnownObject, estimate: PoseEstimate, touched: Sequence[ContactCue]) -> Array | None:

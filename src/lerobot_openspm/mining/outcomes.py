@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from itertools import pairwise
 
 import numpy as np
 
@@ -16,6 +17,8 @@ from lerobot_openspm.types import SubTask
 FOUND_AGAIN_M = 0.010
 # The tolerance is never smaller, however well the demonstrations agree.
 LEAST_TOLERANCE_M = 0.020
+# The direction of a push shorter than this is not known.
+LEAST_PUSH_M = 0.020
 # Demonstrations that leave the target further apart than this do not show where it belongs.
 MOST_SPREAD_M = 0.050
 
@@ -38,6 +41,62 @@ def carried_to(demonstration: Demonstration, sub_tasks: Sequence[SubTask]) -> di
         elif pose.phase == "release":
             T_ee_obj = None
     return carried
+
+
+def pushed_to(
+    demonstration: Demonstration, sub_tasks: Sequence[SubTask], points: Mapping[str, Array]
+) -> dict[str, Array]:
+    """Where the hand left what it pushed: just ahead of the hand, in the direction of the last stretch.
+
+    No image is needed, so this also works for demonstrations that end with the hand above the object. How it
+    turned on its way is not known: its pose is as it stood, only elsewhere.
+
+    Args:
+        demonstration: Its key poses, and its objects' poses at the start.
+        sub_tasks: What the instruction asks for.
+        points: Points ``(n, 3)`` of the objects' surfaces in their frames, by name.
+
+    Returns:
+        ``T_world_obj`` ``(4, 4)`` by name, of what the hand met from behind; what it drags along from above
+        is not told.
+    """
+    poses = {name: T for name, T in demonstration.object_poses.items() if len(points.get(name, ()))}
+    pushed: dict[str, Array] = {}
+    for before, pose in pairwise(demonstration.key_poses):
+        target = sub_task_of(pose, sub_tasks).target
+        if pose.phase != "push" or target not in poses:
+            continue
+        start, end = before.T_world_ee[:2, 3], pose.T_world_ee[:2, 3]
+        if np.linalg.norm(end - start) < LEAST_PUSH_M:
+            continue
+        poses[target], is_behind = _pushed(poses[target], points[target], start, end)
+        if before.phase == "push" or is_behind:
+            pushed[target] = poses[target]
+        else:
+            del poses[target]
+    return pushed
+
+
+def _pushed(T_world_obj: Array, points: Array, start: Array, end: Array) -> tuple[Array, bool]:
+    """An object with the hand right behind it at the end of a straight push.
+
+    Args:
+        T_world_obj: Where it was ``(4, 4)``.
+        points: Points ``(n, 3)`` of its surface in its frame.
+        start: Where the hand begins, x and y ``(2,)`` in the world.
+        end: Where the hand ends ``(2,)``.
+
+    Returns:
+        Its pose ``(4, 4)``, and whether the hand began behind its middle.
+    """
+    ahead = (end - start) / np.linalg.norm(end - start)
+    axes = np.stack([ahead, [-ahead[1], ahead[0]]])
+    outline = se3.apply(T_world_obj, points)[:, :2] @ axes.T
+    low, high = outline.min(axis=0), outline.max(axis=0)
+    middle = (low + high) / 2
+    moved = T_world_obj.copy()
+    moved[:2, 3] += end - np.array([low[0], middle[1]]) @ axes
+    return moved, float(start @ ahead) < middle[0]
 
 
 def outcomes(
