@@ -27,6 +27,8 @@ LAYOUT = {"plate": se3.from_yaw([0.3, 0.1, 0.0], 0.0), "stove": se3.from_yaw([-0
 GOAL = np.array([0.22, 0.0, 0.0])
 # The hand leads the plate by this much: it drags it by its rim.
 LEAD_M = 0.07
+# The middle of a plate whose frame lies beside it.
+BESIDE = np.array([0.04, 0.0])
 
 
 def push(goal=GOAL, shown=GOAL):
@@ -79,11 +81,10 @@ def test_from_wherever_the_plate_stands_the_hand_leads_it_to_its_place(x, y, yaw
 
 @pytest.mark.parametrize("yaw", [0.0, 1.0, 2.5])
 def test_a_round_thing_is_pushed_to_its_place_however_it_was_found_turned(yaw):
-    middle = np.array([0.04, 0.0])  # its frame lies beside its middle
-    round_plate = {"plate": Symmetry(middle, 0.0)}
+    round_plate = {"plate": Symmetry(BESIDE, 0.0)}
     context = PlanningContext((), {"plate": 2 * np.pi, "stove": 2 * np.pi}, robot(), symmetries=round_plate)
     memory = push()
-    now = LAYOUT | {"plate": LAYOUT["plate"] @ turn_about(middle, yaw)}
+    now = LAYOUT | {"plate": LAYOUT["plate"] @ turn_about(BESIDE, yaw)}
     plan = Plan(memory, now, HAND.T_world_ee)
     for target, expected in zip(
         plan.targets(context), transfer(memory, LAYOUT, {}, HAND.T_world_ee), strict=True
@@ -92,7 +93,7 @@ def test_a_round_thing_is_pushed_to_its_place_however_it_was_found_turned(yaw):
     goal = se3.from_yaw(se3.apply(LAYOUT["stove"], GOAL[None])[0], 0.0)
     (outcome,) = memory.outcomes
     # On its way it turned once more.
-    ended = now | {"plate": goal @ turn_about(middle, 2.0)}
+    ended = now | {"plate": goal @ turn_about(BESIDE, 2.0)}
     assert outcome.is_met(plan.as_if_in_place(ended, round_plate))
     assert not outcome.is_met(plan.as_if_in_place(ended, {}))
 
@@ -258,8 +259,11 @@ def pushing(one, perception, ahead_m):
     return Hand(T, 0.0)
 
 
-def test_the_plate_goes_along_from_where_the_hand_meets_its_rim():
-    perception, one = Perception(LAYOUT), controller(push(), instruction=INSTRUCTION)
+@pytest.mark.parametrize("yaw", [0.0, 1.0, 2.5])
+def test_the_plate_goes_along_from_where_the_hand_meets_its_rim_however_it_is_turned(yaw):
+    now = LAYOUT | {"plate": LAYOUT["plate"] @ turn_about(BESIDE, yaw)}
+    perception = Perception(now)
+    one = controller(push(), instruction=INSTRUCTION, symmetries={"plate": Symmetry(BESIDE, 0.0)})
     hand = pushing(one, perception, 0.5 * (LEAD_M - 0.03))
     watch(one, perception, hand, 1)
     assert one.scene.tracker.held == frozenset()
