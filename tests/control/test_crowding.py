@@ -17,6 +17,7 @@ from lerobot_openspm.control.transfer import transfer
 from lerobot_openspm.geometry import se3
 from lerobot_openspm.memory.compose import Candidate
 from lerobot_openspm.memory.retrieval import Scored
+from lerobot_openspm.types import Symmetry
 
 
 def at_key_pose(context, poses, home, phase, along):
@@ -181,6 +182,32 @@ def test_a_load_is_put_down_beside_what_overhangs_its_place_no_further_than_coun
         assert_allclose(target.T_world_ee[:3, 3] - before.T_world_ee[:3, 3], aside, atol=1e-12)
 
 
+@pytest.mark.parametrize("is_round", [True, False])
+def test_what_is_put_on_something_round_is_turned_clear_of_what_stands_beside_it(is_round):
+    context, poses, home = scene(None, 0.0)
+    shown = replace(context.entries[0], outcomes=(ON_PLATE,))
+    symmetries = {"plate": Symmetry(np.zeros(2), 0.0)} if is_round else {}
+    context = replace(context, entries=(shown,), symmetries=symmetries)
+    _, place = at_key_pose(context, poses, home, "release", (0.0, 0.09))
+    context, poses = replace(context, points={"post": POST}, hand_radius_m=RADIUS), poses | {"post": place}
+    plan, problems = chosen(context, poses, home)
+    assert (bool(plan.around), any(plan.aside), problems) == (is_round, not is_round, [])
+    assert not crowding(plan.entry, plan.targets(context), {"post": se3.apply(place, POST)}, RADIUS)
+    # The load ends where it was to end, and up to there nothing changes.
+    own, straight = plan.targets(context), replace(plan, around=0.0).targets(context)
+    loads = [se3.inverse(one[2].T_world_ee) @ poses["bowl"] for one in (own, straight)]
+    for i, (target, before) in enumerate(zip(own, straight, strict=True)):
+        if i < 4:
+            assert_allclose(target.T_world_ee, before.T_world_ee)
+        ends = [one.T_world_ee @ load for one, load in zip((target, before), loads, strict=True)]
+        assert_allclose(ends[0][:3, 3], ends[1][:3, 3], atol=1e-9)
+        turn = plan.around if i >= 4 else 0.0
+        assert_allclose(ends[0][:3, :3], se3.from_yaw(np.zeros(3), turn)[:3, :3] @ ends[1][:3, :3], atol=1e-9)
+    # Beside a place that has moved, things may stand otherwise.
+    moved = {"plate": se3.from_yaw([0.05, 0.0, 0.0], 0.0) @ poses["plate"]}
+    assert plan.following(moved).around == 0
+
+
 def test_a_handle_is_no_load():
     cabinet = {"cabinet": np.eye(4)}
     shown = handle(KINDS["slide"])
@@ -200,7 +227,7 @@ def test_what_was_put_aside_is_where_it_should_be_until_its_place_moves():
     assert_allclose(plan.as_if_in_place(ended, {})["plate"], poses["plate"], atol=1e-12)
     # What is pushed was not put aside.
     pushed = replace(plan, entry=replace(shown, key_poses=shown.key_poses[3:]))
-    assert pushed.asides() == []
+    assert pushed.otherwise_put(context) == []
     assert_allclose(pushed.as_if_in_place(ended, {})["bowl"], ended["bowl"])
     for name, metres, aside in (("plate", 0.01, 0.02), ("plate", 0.05, 0.0), ("bowl", 0.05, 0.02)):
         there = {name: se3.from_yaw([metres, 0.0, 0.0], 0.0) @ poses[name]}

@@ -16,7 +16,7 @@ from lerobot_openspm.control.transfer import RETREAT_M, transfer
 from lerobot_openspm.geometry import se3
 from lerobot_openspm.geometry.arm import load_arm
 from lerobot_openspm.memory.compose import Candidate
-from lerobot_openspm.memory.entry import Anchor, Axis
+from lerobot_openspm.memory.entry import WORLD, Anchor, Axis
 from lerobot_openspm.types import Hand, Symmetry
 
 
@@ -56,15 +56,36 @@ def test_a_hand_that_the_joints_cannot_turn_so_far_is_turned_about_the_object(pa
 
 
 @pytest.mark.parametrize(
-    ("turn", "expected"), [(np.pi, [0, 180]), (np.pi / 2, [0, 90, -90, 180]), (2.0, [0]), (None, [0])]
+    ("turn", "expected"), [(np.pi, [180]), (np.pi / 2, [90, -90, 180]), (2.0, []), (None, [])]
 )
 def test_grasps_are_turned_by_what_the_shape_allows(panda, turn, expected):
     context, poses, home = scene(panda, 0.0, turn=turn)
     if turn is None:
         context = replace(context, symmetries={})
     ways = Plan(context.entries[0], poses, home).turns(context)
-    assert_allclose(np.rad2deg([way.turned for way in ways]), expected)
-    assert all(way.put == "turned" for way in ways)
+    told = [(round(np.rad2deg(way.turned)), way.put) for way in ways]
+    assert told == [
+        (0, "turned"),
+        *((degrees, put) for degrees in expected for put in ("turned", "as_shown")),
+    ]
+
+
+def test_what_is_found_half_turned_is_grasped_as_it_was_shown_and_put_as_it_was_shown():
+    # It looks the same so, and the hand that puts it there keeps its direction in the world.
+    context, poses, home = scene(None, 0.0, turn=np.pi)
+    (shown,) = context.entries
+    in_world = {
+        i: replace(pose, anchor=Anchor("plate", WORLD)) for i, pose in enumerate(shown.key_poses[4:], 4)
+    }
+    shown = replace(shown, key_poses=tuple(in_world.get(i, pose) for i, pose in enumerate(shown.key_poses)))
+    context = replace(context, entries=(shown,))
+    straight, problems = chosen(context, poses, home)
+    assert (straight.turned, problems) == (0, [])
+    flipped = poses | {"bowl": poses["bowl"] @ se3.from_yaw(np.zeros(3), np.pi)}
+    plan, problems = chosen(context, flipped, home)
+    assert (plan.turned, plan.put, problems) == (pytest.approx(np.pi), "as_shown", [])
+    for own, before in zip(plan.targets(context), straight.targets(context), strict=True):
+        assert_allclose(own.T_world_ee, before.T_world_ee, atol=1e-9)
 
 
 @pytest.mark.parametrize("turn", [0.0, np.pi])

@@ -85,6 +85,15 @@ def test_a_limit_keeps_the_arm_from_a_pose(tmp_path):
     assert metres > 0.05 or radians > 0.5
 
 
+def test_the_room_of_joints_is_that_of_the_nearest_to_its_limit(tmp_path):
+    arm = load_arm(planar(tmp_path, upper="1.0"))
+    low, high = np.stack([joint.limits for joint in arm.joints]).T
+    assert arm.room(arm.middle) == pytest.approx((high - low).min() / 2)
+    assert arm.room(np.array([0.0, 0.9])) == pytest.approx(0.1)
+    assert arm.room(np.array([low[0] + 0.05, 0.9])) == pytest.approx(0.05)
+    assert_allclose(arm.base, arm.joints[0].T_before_joint[:3, 3])
+
+
 @pytest.mark.parametrize(
     ("changes", "told"),
     [

@@ -91,8 +91,9 @@ def test_a_push_that_turns_leaves_the_object_ahead_of_its_last_stretch():
     assert_allclose(middle - hand, [0.0, 0.07], atol=1e-3)
 
 
-def test_what_is_dragged_along_from_above_is_not_told():
-    shown, _ = hand_pushes(se3.from_yaw([0.4, 0.1, 0.02], 0.0), np.array([0.2, 0.0]), start="above")
+@pytest.mark.parametrize("first", [[], [np.array([0.01, 0.0])]], ids=["at once", "after a short stretch"])
+def test_what_is_dragged_along_from_above_is_not_told(first):
+    shown, _ = hand_pushes(se3.from_yaw([0.4, 0.1, 0.02], 0.0), *first, np.array([0.2, 0.0]), start="above")
     assert pushed_to(shown, PUSH, PLATE) == {}
 
 

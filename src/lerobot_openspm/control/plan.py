@@ -10,6 +10,7 @@ import numpy as np
 
 from lerobot_openspm.control.feasibility import Miss, check_reach, check_transfer
 from lerobot_openspm.control.pushes import pushed, pushed_by_landmark
+from lerobot_openspm.control.putting import put_aside, put_turned
 from lerobot_openspm.control.transfer import (
     HALF_TURN,
     RETREAT_M,
@@ -18,7 +19,6 @@ from lerobot_openspm.control.transfer import (
     Turn,
     as_shown,
     half_turned,
-    put_aside,
     transfer,
     turns_as_shown,
 )
@@ -63,6 +63,7 @@ class Plan:
             reach is not checked by them.
         retreat_m: How far the hand backs off at the end of a demonstration that was cut before it did.
         aside: How far beside its place what is carried is put down, x and y in the world, metres.
+        around: How far it is turned where it is put on or in something round, radians.
         not_meant: By name, poses ``T_world_obj`` ``(4, 4)`` of others of its kind, which stand about.
     """
 
@@ -75,6 +76,7 @@ class Plan:
     stance: Array | None = None
     retreat_m: float = RETREAT_M
     aside: tuple[float, float] = (0.0, 0.0)
+    around: float = 0.0
     not_meant: Mapping[str, Sequence[Array]] = field(default_factory=dict[str, Sequence[Array]])
 
     def targets(
@@ -97,6 +99,9 @@ class Plan:
         targets = transfer(entry, *scene, gone, turns, self.retreat_m)
         if any(self.aside):
             targets = put_aside(targets, np.array(self.aside))
+        if self.around:
+            landmarks = self._round_ones(context)
+            targets = put_turned(targets, self.around, entry.carried, object_poses, landmarks)
         return half_turned(targets) if self.is_half_turned else targets
 
     def symmetric_grasps(self, context: PlanningContext) -> dict[int, str]:
@@ -106,11 +111,11 @@ class Plan:
     def turns(self, context: PlanningContext) -> list[Plan]:
         """The plan with its grasps turned as the objects' shapes allow, the least first; as it is at first.
 
-        What is round is put down as it was shown too, the hand being turned only where it grasps, and with
-        the hand as it grasped it, where the landmark is turned.
+        It is put down as it was shown too, the hand being turned only where it grasps. What is round is also
+        put with the hand as it grasped it, where the landmark is turned.
         """
         least = [context.symmetries[name].turn for name in self.symmetric_grasps(context).values()]
-        puts: tuple[Put, ...] = ("turned",) if any(least) else ("turned", "as_shown", "kept")
+        puts: tuple[Put, ...] = ("turned", "as_shown") if any(least) else ("turned", "as_shown", "kept")
         turns = [
             radians
             for radians in TURNS
@@ -119,11 +124,17 @@ class Plan:
         ways = [replace(self, turned=radians, put=put) for radians in turns for put in puts]
         return [self, *(way for way in ways if way.turned or way.put == "kept")]
 
-    def asides(self) -> list[Plan]:
-        """The plan, putting down what is carried beside its place, no further than counts as there."""
+    def otherwise_put(self, context: PlanningContext) -> list[Plan]:
+        """The plan, putting down what is carried turned, where its landmark is round, or beside its place.
+
+        It is put no further beside it than counts as there.
+        """
+        landmarks = (one.anchor.place for one in self._puts)
+        is_round = any(name in self._round_ones(context) for name in landmarks)
+        ways: list[Plan] = [replace(self, around=radians) for radians in TURNS if radians and is_round]
         most = min((one.tolerance_m for one in self._puts), default=0.0)
         yaws = np.linspace(0, 2 * np.pi, ASIDE_DIRECTIONS, endpoint=False)
-        return [
+        return ways + [
             replace(self, aside=(metres * float(np.cos(yaw)), metres * float(np.sin(yaw))))
             for metres in ASIDE_M
             for yaw in yaws
@@ -137,8 +148,12 @@ class Plan:
         """
         ends = {name for one in self._puts for name in one.anchor.objects} & moved.keys()
         went = [se3.distance(moved[name], self.object_poses.get(name, NOWHERE)) for name in ends]
-        aside = self.aside if all(metres < ASIDE_KEPT_M for metres in went) else (0.0, 0.0)
-        return replace(self, object_poses={**self.object_poses, **moved}, aside=aside)
+        plan = replace(self, object_poses={**self.object_poses, **moved})
+        return (
+            plan
+            if all(metres < ASIDE_KEPT_M for metres in went)
+            else replace(plan, aside=(0.0, 0.0), around=0.0)
+        )
 
     def as_if_in_place(
         self, object_poses: Mapping[str, Array], symmetries: Mapping[str, Symmetry]
@@ -154,6 +169,10 @@ class Plan:
         aside = {one.target for one in self._puts}
         shown = {name: T @ turns[name] if name in turns else T for name, T in object_poses.items()}
         return {name: back @ T if name in aside else T for name, T in shown.items()}
+
+    def _round_ones(self, context: PlanningContext) -> list[str]:
+        """What looks the same however it is turned."""
+        return [name for name, symmetry in context.symmetries.items() if symmetry.turn == 0]
 
     @property
     def _puts(self) -> list[Outcome]:

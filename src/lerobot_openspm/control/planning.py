@@ -15,9 +15,10 @@ from lerobot_openspm.control.feasibility import (
     find_stance,
     geometric_score,
 )
+from lerobot_openspm.control.joint_room import led_out, ways_out
 from lerobot_openspm.control.plan import Plan
 from lerobot_openspm.control.pushes import pushed_by_landmark
-from lerobot_openspm.control.transfer import as_shown, half_turned
+from lerobot_openspm.control.transfer import as_shown
 from lerobot_openspm.geometry import se3
 from lerobot_openspm.geometry.se3 import Array
 from lerobot_openspm.language.meaning import means_the_same
@@ -227,9 +228,9 @@ class PlanningContext:
     def _beside(
         self, plan: Plan, inside: Mapping[str, int], points: Mapping[str, Array]
     ) -> list[tuple[Plan, dict[str, int]]]:
-        """The plan that puts things down a little beside their place, if that is much clearer."""
+        """The plan that puts things down turned or a little beside their place, if that is much clearer."""
         ways = list[tuple[Plan, dict[str, int]]]()
-        for way in plan.asides():
+        for way in plan.otherwise_put(self):
             targets = way.targets(self)
             if not way.check(self, targets):
                 ways.append((way, crowding(way.entry, targets, points, self.hand_radius_m)))
@@ -251,13 +252,12 @@ class PlanningContext:
         return found
 
     def clear(self, plan: Plan) -> Plan:
-        """A plan whose ways are lifted over what stands about.
+        """A plan whose ways leave the arm's joints room, and are lifted over what stands about.
 
-        Where the arm cannot follow the lifted ways, the plan stays as it is, and that is said.
+        Where the arm cannot follow such ways, the plan stays as it is, and that is said.
         """
+        plan = self._with_room(plan)
         points, targets = self._points(plan), plan.targets(self)
-        if plan.is_half_turned:  # key poses are kept as the hand was before
-            targets = half_turned(targets)
         usual = [name for name, T in self.usual.items() if _is_at(plan.object_poses.get(name), T)]
         entry, crossed = lifted(plan.entry, targets, plan.T_world_ee, points, self.hand_radius_m, usual)
         if not crossed:
@@ -270,6 +270,25 @@ class PlanningContext:
             )  # fmt: skip
             return plan
         return higher
+
+    def _with_room(self, plan: Plan) -> Plan:
+        """A plan that is led out where the arm's joints have no room."""
+        if self.robot.arm is None or plan.stance is None:
+            return plan
+        key_poses = plan.entry.key_poses
+        targets = plan.targets(self)[: len(key_poses)]
+        out = ways_out(targets, self.robot.arm, plan.stance)
+        if not out:
+            return plan
+        further, problems = replace(plan, entry=led_out(plan.entry, targets, out)).followed(self)
+        if problems:
+            where = " and ".join(f"{key_poses[i].phase} at {key_poses[i].anchor.place}" for i in out)
+            logger.warning(
+                "%r: a joint comes near its limit on the way to %s: led further out, %s",
+                plan.entry.language, where, "; ".join(problems),
+            )  # fmt: skip
+            return plan
+        return further
 
 
 def _is_at(T: Array | None, T_usual: Array) -> bool:

@@ -70,6 +70,11 @@ class Arm:
         """The middle ``(n,)`` of every joint's range, radians."""
         return self._limits.mean(1)
 
+    @property
+    def base(self) -> Array:
+        """Where the arm stands ``(3,)``: its first joint, in the world, metres."""
+        return self.joints[0].T_before_joint[:3, 3]
+
     def ee_pose(self, angles: Array) -> Array:
         """``T_world_ee`` ``(4, 4)`` at joint angles ``(n,)``, radians."""
         return self._frames(np.asarray(angles, float)[None])[1][0]
@@ -105,8 +110,17 @@ class Arm:
         """
         rest = angles = self.stance(T_world_ee) if stance is None else stance
         for pose in poses:
-            angles, _ = self._sought(pose, np.stack([angles, rest]), rest)
+            angles = self.onwards(pose, angles, rest)
             yield self.miss(pose, angles)
+
+    def onwards(self, T_world_ee: Array, start: Array, rest: Array) -> Array:
+        """Joint angles ``(n,)`` as :meth:`angles_for`, sought from where the arm is and from rest alone."""
+        return self._sought(T_world_ee, np.stack([start, rest]), rest)[0]
+
+    def room(self, angles: Array) -> float:
+        """How far the joint that is nearest to a limit is from it at joint angles ``(n,)``, radians."""
+        low, high = self._limits.T
+        return float(np.minimum(angles - low, high - angles).min())
 
     def miss(self, T_world_ee: Array, angles: Array) -> tuple[float, float]:
         """How far, metres and radians, the hand is from a pose ``(4, 4)`` at joint angles ``(n,)``."""

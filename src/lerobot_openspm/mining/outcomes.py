@@ -70,7 +70,7 @@ def pushed_to(
         if np.linalg.norm(end - start) < LEAST_PUSH_M:
             continue
         poses[target], is_behind = _pushed(poses[target], points[target], start, end)
-        if before.phase == "push" or is_behind:
+        if (before.phase == "push" and target in pushed) or is_behind:
             pushed[target] = poses[target]
         else:
             del poses[target]
