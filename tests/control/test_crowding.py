@@ -186,26 +186,60 @@ def test_a_load_is_put_down_beside_what_overhangs_its_place_no_further_than_coun
 def test_what_is_put_on_something_round_is_turned_clear_of_what_stands_beside_it(is_round):
     context, poses, home = scene(None, 0.0)
     shown = replace(context.entries[0], outcomes=(ON_PLATE,))
-    symmetries = {"plate": Symmetry(np.zeros(2), 0.0)} if is_round else {}
+    # The bowl's frame is at its rim, and it cannot be grasped from another side.
+    middle = np.array([0.0, 0.05])
+    symmetries = {"bowl": Symmetry(middle, 2.0)} | ({"plate": Symmetry(np.zeros(2), 0.0)} if is_round else {})
     context = replace(context, entries=(shown,), symmetries=symmetries)
     _, place = at_key_pose(context, poses, home, "release", (0.0, 0.09))
     context, poses = replace(context, points={"post": POST}, hand_radius_m=RADIUS), poses | {"post": place}
     plan, problems = chosen(context, poses, home)
     assert (bool(plan.around), any(plan.aside), problems) == (is_round, not is_round, [])
     assert not crowding(plan.entry, plan.targets(context), {"post": se3.apply(place, POST)}, RADIUS)
-    # The load ends where it was to end, and up to there nothing changes.
     own, straight = plan.targets(context), replace(plan, around=0.0).targets(context)
-    loads = [se3.inverse(one[2].T_world_ee) @ poses["bowl"] for one in (own, straight)]
+    T_ee_load = se3.inverse(own[2].T_world_ee) @ poses["bowl"]
+    axis = np.array([[*middle, 0.0]])
     for i, (target, before) in enumerate(zip(own, straight, strict=True)):
-        if i < 4:
-            assert_allclose(target.T_world_ee, before.T_world_ee)
-        ends = [one.T_world_ee @ load for one, load in zip((target, before), loads, strict=True)]
-        assert_allclose(ends[0][:3, 3], ends[1][:3, 3], atol=1e-9)
         turn = plan.around if i >= 4 else 0.0
-        assert_allclose(ends[0][:3, :3], se3.from_yaw(np.zeros(3), turn)[:3, :3] @ ends[1][:3, :3], atol=1e-9)
-    # Beside a place that has moved, things may stand otherwise.
+        ends, ended = target.T_world_ee @ T_ee_load, before.T_world_ee @ T_ee_load
+        assert_allclose(ends[:3, :3], se3.from_yaw(np.zeros(3), turn)[:3, :3] @ ended[:3, :3], atol=1e-9)
+        if target.key_pose.phase != "retreat":
+            assert_allclose(se3.apply(ends, axis), se3.apply(ended, axis), atol=1e-9)
+    # The hand backs off as it was shown, turned with what it let go of.
+    backs = [se3.inverse(one[-2].T_world_ee) @ one[-1].T_world_ee for one in (own, straight)]
+    assert_allclose(*backs, atol=1e-9)
+    # It is where it should be, its frame turned about its middle or not.
+    ended = [
+        plan.as_if_in_place({"bowl": one[5].T_world_ee @ T_ee_load}, symmetries) for one in (own, straight)
+    ]
+    unturned = replace(plan, around=0.0, aside=(0.0, 0.0)).targets(context)[5].T_world_ee @ T_ee_load
+    assert_allclose(ended[0]["bowl"], unturned, atol=1e-9)
+
+
+def test_a_place_keeps_its_way_to_be_put_at_until_it_moves_and_not_where_it_turns():
+    context, poses, home = scene(None, 0.0)
+    shown = replace(context.entries[0], outcomes=(ON_PLATE,))
+    plan = replace(Plan(shown, poses, home), around=1.0)
+    turned = {"plate": poses["plate"] @ se3.from_yaw(np.zeros(3), 2.0)}
     moved = {"plate": se3.from_yaw([0.05, 0.0, 0.0], 0.0) @ poses["plate"]}
-    assert plan.following(moved).around == 0
+    assert [plan.following(there).around for there in (turned, moved)] == [1.0, 0.0]
+
+
+@pytest.mark.parametrize("middle", [(0.0, 0.0), (0.0, 0.05)])
+def test_a_box_that_is_grasped_turned_and_put_as_shown_is_where_it_should_be(middle):
+    context, poses, home = scene(None, 0.0)
+    shown, symmetries = (
+        replace(context.entries[0], outcomes=(ON_PLATE,)),
+        {"bowl": Symmetry(np.array(middle), np.pi)},
+    )
+    context = replace(context, entries=(shown,), symmetries=symmetries)
+    plan = Plan(shown, poses, home)
+    ends: list[np.ndarray] = []
+    for way in (plan, replace(plan, turned=np.pi), replace(plan, turned=np.pi, put="as_shown")):
+        targets = way.targets(context)
+        end = targets[5].T_world_ee @ se3.inverse(targets[2].T_world_ee) @ poses["bowl"]
+        ends.append(way.as_if_in_place({"bowl": end}, symmetries)["bowl"])
+    assert_allclose(ends[1], ends[0], atol=1e-9)
+    assert_allclose(ends[2], ends[0], atol=1e-9)
 
 
 def test_a_handle_is_no_load():

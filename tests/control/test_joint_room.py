@@ -10,11 +10,10 @@ from tests.geometry.test_arm import LIBERO
 from tests.memory.builders import hand_pose, robot
 
 from lerobot_openspm.control.feasibility import find_stance
-from lerobot_openspm.control.joint_room import ABOVE_M, OUT_M, ROOM_RAD, led_out, ways_out
+from lerobot_openspm.control.joint_room import OUT_M, ROOM_RAD, ways_out
 from lerobot_openspm.control.plan import Plan
 from lerobot_openspm.geometry import se3
 from lerobot_openspm.geometry.arm import load_arm
-from lerobot_openspm.memory.entry import CONTACT_PHASES
 from lerobot_openspm.types import Symmetry
 
 HOME = hand_pose(-0.2, 0.0, 1.17)
@@ -26,12 +25,13 @@ def panda(request):
     return load_arm(request.config.rootpath / LIBERO)
 
 
-def planned(panda, bowl, turned=0.0, is_half_turned=False):
-    """A context with a Panda, and a plan to carry a bowl from a place to a plate in front of the arm."""
-    context = planning_context(symmetries={"bowl": Symmetry(np.zeros(2), np.pi)})
+def planned(panda, bowl, plate=FAR, turned=0.0, is_half_turned=False):
+    """A context with a Panda, and a plan to carry a bowl from a place to a plate."""
+    context = planning_context(symmetries={"bowl": Symmetry(np.zeros(2), np.pi / 2)})
     wide = robot(workspace=np.array([[-2.0, -2.0, 0.0], [2.0, 2.0, 2.0]]), arm=panda)
     context = replace(context, robot=wide)
-    poses = {"bowl": se3.from_yaw(bowl, -0.3 + turned), "plate": se3.from_yaw([-0.05, -0.1, 0.9], -0.3)}
+    yaw = -0.3 - turned - np.pi * is_half_turned  # so that the hand is turned as it is at home
+    poses = {"bowl": se3.from_yaw(bowl, yaw), "plate": se3.from_yaw(plate, yaw)}
     plan = Plan(context.entries[0], poses, HOME, turned=turned, is_half_turned=is_half_turned)
     return context, replace(plan, stance=find_stance(context.robot, HOME))
 
@@ -42,50 +42,53 @@ def room(panda, T_world_ee, start):
     return panda.room(angles)
 
 
-@pytest.mark.parametrize(("turned", "is_half_turned"), [(0.0, False), (np.pi, False), (np.pi, True)])
-def test_close_to_the_base_the_hand_passes_by_further_out(panda, turned, is_half_turned):
-    context, plan = planned(panda, NEAR, turned, is_half_turned)
-    before = plan.targets(context)
-    out = ways_out(before[: len(plan.entry.key_poses)], panda, plan.stance)
-    assert out
-    led = replace(plan, entry=led_out(plan.entry, before, out))
-    after = iter(led.targets(context))
-    for i, target in enumerate(before):
-        T, here = target.T_world_ee, next(after)
-        if i - 1 in out and i not in out and target.key_pose.phase == "approach":
-            # From further out it goes to above what it takes hold of, and straight down.
-            assert not here.precise
-            assert_allclose(here.T_world_ee[:3, 3] - T[:3, 3], [0.0, 0.0, ABOVE_M], atol=1e-9)
-            here = next(after)
-        assert_allclose(here.T_world_ee[:3, 3] - T[:3, 3], out.get(i, np.zeros(3)), atol=1e-9)
-        assert_allclose(here.T_world_ee[:3, :3], T[:3, :3], atol=1e-9)
-        assert here.precise == target.precise
-        if i in out:
-            assert target.key_pose.phase not in CONTACT_PHASES
-            assert room(panda, T, plan.stance) < ROOM_RAD
+@pytest.mark.parametrize(("turned", "is_half_turned"), [(0.0, False), (np.pi, False), (0.0, True)])
+def test_close_to_the_base_the_hand_rises_further_out_with_what_it_has_grasped(panda, turned, is_half_turned):
+    context, plan = planned(panda, NEAR, FAR, turned, is_half_turned)
+    led = context.clear(plan)
+    assert led.out
+    for i, (here, was) in enumerate(zip(led.targets(context), plan.targets(context), strict=True)):
+        away = here.T_world_ee[:3, 3] - was.T_world_ee[:3, 3]
+        assert_allclose(away, led.out.get(i, np.zeros(3)), atol=1e-9)
+        assert_allclose(here.T_world_ee[:3, :3], was.T_world_ee[:3, :3], atol=1e-9)
+        if i in led.out:
+            assert here.key_pose.phase == "lift"
+            assert room(panda, was.T_world_ee, plan.stance) < ROOM_RAD
             assert room(panda, here.T_world_ee, plan.stance) >= ROOM_RAD - 0.01
-            ahead = (T[:3, 3] - panda.base)[:2]
-            assert out[i][:2] @ ahead == pytest.approx(np.linalg.norm(out[i]) * np.linalg.norm(ahead))
-            assert np.linalg.norm(out[i]) <= max(OUT_M) + 1e-9
-    assert next(after, None) is None
+            ahead = (was.T_world_ee[:3, 3] - panda.base)[:2]
+            assert away[:2] @ ahead == pytest.approx(np.linalg.norm(away) * np.linalg.norm(ahead))
+            assert np.linalg.norm(away) <= max(OUT_M) + 1e-9
 
 
-def test_where_the_joints_have_room_nothing_changes(panda):
-    context, plan = planned(panda, FAR)
-    assert ways_out(plan.targets(context), panda, plan.stance) == {}
+def test_where_it_arrives_close_to_the_base_the_hand_goes_as_it_was_shown(panda):
+    context, plan = planned(panda, FAR, NEAR)
+    rooms = [room(panda, one.T_world_ee, plan.stance) for one in plan.targets(context)]
+    assert min(rooms) < ROOM_RAD
     assert context.clear(plan) is plan
 
 
-def test_a_plan_is_led_out_where_the_arm_is_known(panda):
+def test_where_the_joints_have_room_or_are_not_known_nothing_changes(panda):
+    context, plan = planned(panda, FAR)
+    assert context.clear(plan) is plan
     context, plan = planned(panda, NEAR)
-    key_poses = context.clear(plan).entry.key_poses
-    assert len(key_poses) > len(plan.entry.key_poses)
-    assert context.clear(replace(plan, stance=None)).entry.key_poses == plan.entry.key_poses
+    unknown = replace(plan, stance=None)
+    assert context.clear(unknown) is unknown
+
+
+def test_a_grasp_from_another_side_is_led_out_anew(panda):
+    context, plan = planned(panda, NEAR)
+    led = context.clear(plan)
+    other = context.otherwise(led)
+    assert other.turned != led.turned
+    for i, by in other.out.items():
+        straight = replace(other, out={}).targets(context)[i].T_world_ee[:3, 3]
+        assert by @ (straight - panda.base) > 0
+    assert other.out
 
 
 def test_where_no_place_further_out_has_room_the_hand_goes_as_it_was_shown(panda):
     *joints, last = panda.joints
-    stiff = replace(panda, joints=(*joints, replace(last, limits=last.limits * 0.0 + [0.6, 1.0])))
+    stiff = replace(panda, joints=(*joints, replace(last, limits=np.array([0.6, 1.0]))))
     context, plan = planned(stiff, NEAR)
     assert plan.stance is not None
     assert ways_out(plan.targets(context), stiff, plan.stance) == {}
@@ -93,6 +96,6 @@ def test_where_no_place_further_out_has_room_the_hand_goes_as_it_was_shown(panda
 
 def test_a_way_out_that_cannot_be_followed_is_not_taken_and_that_is_said(panda, caplog, monkeypatch):
     context, plan = planned(panda, NEAR)
-    monkeypatch.setattr("lerobot_openspm.control.feasibility.MAX_JUMP_M", 0.01)
+    monkeypatch.setattr(Plan, "followed", lambda self, context: (self, ["too far"] if self.out else []))
     assert context.clear(plan) is plan
-    assert "a joint comes near its limit on the way to approach at bowl" in caplog.text
+    assert "a joint comes near its limit as the hand rises: led further out, too far" in caplog.text

@@ -63,11 +63,11 @@ ANGLES = np.linspace(0, 2 * np.pi, 72, endpoint=False)
 PLATE = {"plate": np.stack([0.07 * np.cos(ANGLES) + 0.04, 0.07 * np.sin(ANGLES), 0 * ANGLES], axis=-1)}
 
 
-def hand_pushes(plate, *ways, start="behind"):
+def hand_pushes(plate, *ways, start="behind", behind_m=0.07):
     """A demonstration in which the hand comes down behind a plate, or above it, and pushes it along ways."""
     middle = se3.apply(plate, np.array([[0.04, 0.0, 0.0]]))[0, :2]
     heading = ways[0] / np.linalg.norm(ways[0])
-    hand = middle + (-0.07 if start == "behind" else 0.03) * heading
+    hand = middle + (-behind_m if start == "behind" else 0.03) * heading
     points = [hand, *(hand + way for way in np.cumsum(ways, axis=0))]
     poses = tuple(key_pose("push" if i else "approach", hand_pose(*p, 0.02), 0) for i, p in enumerate(points))
     return Demonstration(poses, {"plate": plate, "stove": np.eye(4)}), points[-1]
@@ -95,6 +95,25 @@ def test_a_push_that_turns_leaves_the_object_ahead_of_its_last_stretch():
 def test_what_is_dragged_along_from_above_is_not_told(first):
     shown, _ = hand_pushes(se3.from_yaw([0.4, 0.1, 0.02], 0.0), *first, np.array([0.2, 0.0]), start="above")
     assert pushed_to(shown, PUSH, PLATE) == {}
+
+
+@pytest.mark.parametrize("short", [0.005, 0.019])
+def test_a_short_stretch_at_the_beginning_of_a_push_from_behind_does_not_hide_it(short):
+    plate, axis = se3.from_yaw([0.4, 0.1, 0.02], 0.0), np.array([1.0, 0.0])
+    # Shallower than the stretch, which passes its middle.
+    strip = {"plate": PLATE["plate"] * [0.1, 1.0, 1.0] + [0.036, 0.0, 0.0]}
+    shown, hand = hand_pushes(plate, short * axis, 0.2 * axis, behind_m=0.008)
+    assert_allclose(pushed_to(shown, PUSH, strip)["plate"][0, 3], hand[0] - 0.033, atol=1e-3)
+
+
+def test_what_is_dragged_back_after_a_push_is_not_told():
+    plate = se3.from_yaw([0.4, 0.1, 0.02], 0.0)
+    pushed, _ = hand_pushes(plate, np.array([0.1, 0.0]))
+    there = se3.from_yaw([0.1, 0.0, 0.0], 0.0) @ plate
+    for ways in ([np.array([0.1, 0.0])], [np.array([0.01, 0.0]), np.array([0.2, 0.0])]):
+        dragged, _ = hand_pushes(there, *ways, start="above")
+        both = replace(pushed, key_poses=pushed.key_poses + dragged.key_poses)
+        assert pushed_to(both, PUSH, PLATE) == {}
 
 
 @pytest.mark.parametrize("points", [{}, {"plate": np.zeros((0, 3))}], ids=["unknown", "without a surface"])

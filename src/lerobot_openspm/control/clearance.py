@@ -178,8 +178,7 @@ def lifted(
             height, names = way.crossing(others, BESIDE * radius)
             if height > way.start[2]:
                 rise = height - way.start[2]
-                start = shifted(target, way.start - way.goal + np.array([0.0, 0.0, rise]))
-                poses.append(_above(previous, rise, pose) if previous else start)
+                poses.append(_above(previous, rise, pose) if previous else _risen(pose, T, way.start, rise))
             if height > way.goal[2]:
                 poses.append(_raised(pose, height - way.goal[2]))
             crossed |= dict.fromkeys(names)
@@ -264,11 +263,12 @@ def _above(previous: MemoryKeyPose, rise: float, towards: MemoryKeyPose) -> Memo
     )
 
 
-def shifted(target: Target, by: Array) -> MemoryKeyPose:
-    """A target's key pose, passed by and shifted by ``(3,)`` in the world, metres."""
-    own = target.key_pose.T_obj_ee
-    T = se3.transform(own[:3, :3], own[:3, 3] + target.R_world_anchor.T @ by)
-    return replace(target.key_pose, T_obj_ee=T, n_steps=1, dwell=False, axis=None, covariance=None)
+def _risen(first: MemoryKeyPose, T_world_ee: Array, start: Array, rise: float) -> MemoryKeyPose:
+    """A key pose above the place ``(3,)`` where the hand begins, turned as at its first one ``(4, 4)``."""
+    R_world_anchor = T_world_ee[:3, :3] @ first.T_obj_ee[:3, :3].T
+    away = start + np.array([0.0, 0.0, rise]) - T_world_ee[:3, 3]
+    T = se3.transform(first.T_obj_ee[:3, :3], first.T_obj_ee[:3, 3] + R_world_anchor.T @ away)
+    return replace(first, T_obj_ee=T, n_steps=1, dwell=False, axis=None, covariance=None)
 
 
 def _below(T_world_ee: Array, points: Array | None) -> float:

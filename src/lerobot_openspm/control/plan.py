@@ -20,6 +20,7 @@ from lerobot_openspm.control.transfer import (
     as_shown,
     half_turned,
     transfer,
+    turn_about,
     turns_as_shown,
 )
 from lerobot_openspm.geometry import se3
@@ -64,6 +65,7 @@ class Plan:
         retreat_m: How far the hand backs off at the end of a demonstration that was cut before it did.
         aside: How far beside its place what is carried is put down, x and y in the world, metres.
         around: How far it is turned where it is put on or in something round, radians.
+        out: How far ``(3,)`` beside key poses the hand passes by, by their index, in the world, metres.
         not_meant: By name, poses ``T_world_obj`` ``(4, 4)`` of others of its kind, which stand about.
     """
 
@@ -77,6 +79,7 @@ class Plan:
     retreat_m: float = RETREAT_M
     aside: tuple[float, float] = (0.0, 0.0)
     around: float = 0.0
+    out: Mapping[int, Array] = field(default_factory=dict[int, Array])
     not_meant: Mapping[str, Sequence[Array]] = field(default_factory=dict[str, Sequence[Array]])
 
     def targets(
@@ -100,8 +103,9 @@ class Plan:
         if any(self.aside):
             targets = put_aside(targets, np.array(self.aside))
         if self.around:
-            landmarks = self._round_ones(context)
-            targets = put_turned(targets, self.around, entry.carried, object_poses, landmarks)
+            targets = put_turned(targets, self.around, entry.carried, object_poses, context.symmetries)
+        if self.out:
+            targets = tuple(_beside(target, self.out.get(i)) for i, target in enumerate(targets))
         return half_turned(targets) if self.is_half_turned else targets
 
     def symmetric_grasps(self, context: PlanningContext) -> dict[int, str]:
@@ -129,8 +133,9 @@ class Plan:
 
         It is put no further beside it than counts as there.
         """
-        landmarks = (one.anchor.place for one in self._puts)
-        is_round = any(name in self._round_ones(context) for name in landmarks)
+        symmetries = context.symmetries
+        onto = [symmetries.get(one.anchor.place) for one in self._puts if one.target in symmetries]
+        is_round = any(landmark is not None and landmark.turn == 0 for landmark in onto)
         ways: list[Plan] = [replace(self, around=radians) for radians in TURNS if radians and is_round]
         most = min((one.tolerance_m for one in self._puts), default=0.0)
         yaws = np.linspace(0, 2 * np.pi, ASIDE_DIRECTIONS, endpoint=False)
@@ -147,7 +152,7 @@ class Plan:
         Beside a place that has moved, things may stand otherwise.
         """
         ends = {name for one in self._puts for name in one.anchor.objects} & moved.keys()
-        went = [se3.distance(moved[name], self.object_poses.get(name, NOWHERE)) for name in ends]
+        went = [se3.distances(moved[name], self.object_poses.get(name, NOWHERE))[0] for name in ends]
         plan = replace(self, object_poses={**self.object_poses, **moved})
         return (
             plan
@@ -158,7 +163,7 @@ class Plan:
     def as_if_in_place(
         self, object_poses: Mapping[str, Array], symmetries: Mapping[str, Symmetry]
     ) -> dict[str, Array]:
-        """Object poses as outcomes are told: what was put aside moved back, what is round turned as shown.
+        """Object poses as outcomes are told: what was put aside or turned moved back, what is round as shown.
 
         A round thing that was carried is turned by as much as before the hand took it along; what was pushed
         may have turned on its way.
@@ -166,13 +171,13 @@ class Plan:
         back = se3.from_yaw(np.array([-self.aside[0], -self.aside[1], 0.0]), 0.0)
         pushes = {name: T for name, T in object_poses.items() if name in pushed(self.entry)}
         turns = turns_as_shown(self.entry, {**self.object_poses, **pushes}, symmetries)
-        aside = {one.target for one in self._puts}
         shown = {name: T @ turns[name] if name in turns else T for name, T in object_poses.items()}
-        return {name: back @ T if name in aside else T for name, T in shown.items()}
-
-    def _round_ones(self, context: PlanningContext) -> list[str]:
-        """What looks the same however it is turned."""
-        return [name for name, symmetry in context.symmetries.items() if symmetry.turn == 0]
+        # So much less than the hand that grasped it was turned where it put it.
+        less = (self.turned if self.put == "as_shown" else 0.0) - self.around
+        for name in {one.target for one in self._puts} & shown.keys():
+            turn = turn_about(symmetries[name].middle, less) if name in symmetries else np.eye(4)
+            shown[name] = back @ shown[name] @ turn
+        return shown
 
     @property
     def _puts(self) -> list[Outcome]:
@@ -263,6 +268,12 @@ class Plan:
 
 # Before the first plan: nothing is done, nowhere.
 NO_PLAN = Plan(MemoryEntry(RetrievalKey((), ()), "", (), 0.0, 0, ""), {}, np.eye(4))
+
+
+def _beside(target: Target, by: Array | None) -> Target:
+    """A key pose that the hand passes by ``(3,)`` beside it in the world, metres."""
+    T = target.T_world_ee
+    return target if by is None else replace(target, T_world_ee=se3.transform(T[:3, :3], T[:3, 3] + by))
 
 
 def _is_multiple(radians: float, turn: float) -> bool:

@@ -15,10 +15,10 @@ from lerobot_openspm.control.feasibility import (
     find_stance,
     geometric_score,
 )
-from lerobot_openspm.control.joint_room import led_out, ways_out
+from lerobot_openspm.control.joint_room import ways_out
 from lerobot_openspm.control.plan import Plan
 from lerobot_openspm.control.pushes import pushed_by_landmark
-from lerobot_openspm.control.transfer import as_shown
+from lerobot_openspm.control.transfer import as_shown, half_turned
 from lerobot_openspm.geometry import se3
 from lerobot_openspm.geometry.se3 import Array
 from lerobot_openspm.language.meaning import means_the_same
@@ -193,7 +193,7 @@ class PlanningContext:
             for way in plan.turns(self)
             if abs(float(se3.wrap_angle(way.turned - plan.turned))) > OTHERWISE_RAD
         ]
-        found = self._clearest(ways, self._points(plan))
+        found = self._clearest([replace(way, out=self._ways_out(way)) for way in ways], self._points(plan))
         return plan if found is None else found[0]
 
     def _clearest(
@@ -252,12 +252,16 @@ class PlanningContext:
         return found
 
     def clear(self, plan: Plan) -> Plan:
-        """A plan whose ways leave the arm's joints room, and are lifted over what stands about.
+        """A plan whose ways are lifted over what stands about, and leave the arm's joints room.
 
         Where the arm cannot follow such ways, the plan stays as it is, and that is said.
         """
-        plan = self._with_room(plan)
+        return self._with_room(self._lifted(plan))
+
+    def _lifted(self, plan: Plan) -> Plan:
         points, targets = self._points(plan), plan.targets(self)
+        if plan.is_half_turned:  # key poses are kept as the hand was before
+            targets = half_turned(targets)
         usual = [name for name, T in self.usual.items() if _is_at(plan.object_poses.get(name), T)]
         entry, crossed = lifted(plan.entry, targets, plan.T_world_ee, points, self.hand_radius_m, usual)
         if not crossed:
@@ -273,22 +277,22 @@ class PlanningContext:
 
     def _with_room(self, plan: Plan) -> Plan:
         """A plan that is led out where the arm's joints have no room."""
-        if self.robot.arm is None or plan.stance is None:
-            return plan
-        key_poses = plan.entry.key_poses
-        targets = plan.targets(self)[: len(key_poses)]
-        out = ways_out(targets, self.robot.arm, plan.stance)
-        if not out:
-            return plan
-        further, problems = replace(plan, entry=led_out(plan.entry, targets, out)).followed(self)
+        out = self._ways_out(plan)
+        further, problems = replace(plan, out=out).followed(self) if out else (plan, [])
         if problems:
-            where = " and ".join(f"{key_poses[i].phase} at {key_poses[i].anchor.place}" for i in out)
             logger.warning(
-                "%r: a joint comes near its limit on the way to %s: led further out, %s",
-                plan.entry.language, where, "; ".join(problems),
+                "%r: a joint comes near its limit as the hand rises: led further out, %s",
+                plan.entry.language, "; ".join(problems),
             )  # fmt: skip
             return plan
         return further
+
+    def _ways_out(self, plan: Plan) -> dict[int, Array]:
+        """See :func:`ways_out`; nothing where the arm is not known, nor of a retreat of our own."""
+        if self.robot.arm is None or plan.stance is None:
+            return {}
+        targets = replace(plan, out={}).targets(self)[: len(plan.entry.key_poses)]
+        return ways_out(targets, self.robot.arm, plan.stance)
 
 
 def _is_at(T: Array | None, T_usual: Array) -> bool:

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
+
+import numpy as np
 
 from lerobot_openspm.control.transfer import Target, turn_about
 from lerobot_openspm.geometry import se3
 from lerobot_openspm.geometry.se3 import Array
+from lerobot_openspm.types import Symmetry
 
 
 def put_aside(targets: Sequence[Target], aside: Array) -> tuple[Target, ...]:
@@ -24,31 +27,37 @@ def put_aside(targets: Sequence[Target], aside: Array) -> tuple[Target, ...]:
 def put_turned(
     targets: Sequence[Target],
     radians: float,
-    carried: Mapping[int, str],
+    loads: Mapping[int, str],
     object_poses: Mapping[str, Array],
-    landmarks: Collection[str],
+    symmetries: Mapping[str, Symmetry],
 ) -> tuple[Target, ...]:
-    """The same key poses, those that put something on or in some landmarks turned with it.
+    """The same key poses, those that put something on or in something round turned with it.
 
-    What is carried ends at the same place: hand and load turn about the vertical through its origin.
+    Hand and load turn about the load's axis, where that is put.
 
     Args:
         targets: The key poses.
         radians: How far they are turned.
-        carried: What is carried, by sub-task.
+        loads: What is carried, by sub-task; what does not turn into itself is not turned.
         object_poses: Poses ``T_world_obj`` ``(4, 4)`` of what is carried, where it is grasped.
-        landmarks: What it may be put on turned by any angle.
+        symmetries: How objects turn into themselves, of those that do.
     """
     turned: list[Target] = []
     T_ee_load: dict[int, Array] = {}
+    axes: dict[int, Array | None] = {}  # where the load is turned, by sub-task; None where it is not
     for target, is_put in zip(targets, _are_put(targets), strict=True):
-        pose, T = target.key_pose, target.T_world_ee
-        name = carried.get(pose.sub_task, "")
-        if pose.phase == "grasp" and name in object_poses:
-            T_ee_load.setdefault(pose.sub_task, se3.inverse(T) @ object_poses[name])
-        if is_put and pose.anchor.place in landmarks and pose.sub_task in T_ee_load:
-            load = (T @ T_ee_load[pose.sub_task])[:2, 3]
-            target = replace(target, T_world_ee=turn_about(load, radians) @ T)
+        pose, T, i = target.key_pose, target.T_world_ee, target.key_pose.sub_task
+        name = loads.get(i, "")
+        if pose.phase == "grasp" and name in symmetries and name in object_poses:
+            T_ee_load.setdefault(i, se3.inverse(T) @ object_poses[name])
+        if is_put and i in T_ee_load:
+            landmark = symmetries.get(pose.anchor.place)
+            is_turned = axes[i] is not None if i in axes else landmark is not None and landmark.turn == 0
+            if pose.phase != "retreat" or i not in axes:  # a hand that backs off has let go of it
+                middle = np.array([[*symmetries[name].middle, 0.0]])
+                axes[i] = se3.apply(T @ T_ee_load[i], middle)[0, :2] if is_turned else None
+            if (axis := axes[i]) is not None:
+                target = replace(target, T_world_ee=turn_about(axis, radians) @ T)
         turned.append(target)
     return tuple(turned)
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -56,8 +56,6 @@ class Target:
         axis: The constraint that the way here follows, its direction in the world; None in free space.
         push: The path of what is pushed on the way here; None where nothing is pushed, or the path is not
             known or turns.
-        R_world_anchor: How ``(3, 3)`` the frame that the key pose is kept in is turned here: a shift in it
-            shifts the hand so.
     """
 
     T_world_ee: Array
@@ -65,7 +63,6 @@ class Target:
     precise: bool
     axis: Axis | None = None
     push: PushPath | None = None
-    R_world_anchor: Array = field(default_factory=lambda: np.eye(3))
 
 
 def transfer_pose(T_world_obj: Array, T_obj_ee: Array) -> Array:
@@ -152,7 +149,7 @@ def transfer(
         # Where a push turns, the hand meets its target elsewhere than where the path ends.
         is_straight = sum(p.phase == "push" and p.sub_task == pose.sub_task for p in entry.key_poses) == 1
         push = path if pose.phase == "push" and is_straight else None
-        targets.append(Target(before, pose, _is_precise(entry, i), axis, push, T_world_anchor[:3, :3]))
+        targets.append(Target(before, pose, _is_precise(entry, i), axis, push))
     for sub_task, turn in (turns or {}).items():
         targets = _turned(targets, sub_task, turn, entry.object_poses)
     for sub_task, amount in (gone or {}).items():
@@ -183,16 +180,12 @@ def _turned(targets: Sequence[Target], sub_task: int, turn: Turn, shown: Mapping
             continue
         if pose.phase in ARRIVING and pose.anchor.place != turn.name and not is_put:
             radians, is_put = _put_radians(turn, target, shown), True
-        R_world_anchor = target.R_world_anchor
-        if T_ee_obj is None or pose.phase == "retreat":
-            R_world_anchor = turn_about(turn.middle, radians)[:3, :3] @ R_world_anchor
-        else:
+        if T_ee_obj is not None and pose.phase != "retreat":
             axis = target.T_world_ee @ T_ee_obj
         if pose.phase == "grasp" and T_ee_obj is None:
             T_ee_obj = se3.inverse(target.T_world_ee) @ turn.T_world_obj
         point = se3.apply(axis, np.array([[*turn.middle, 0.0]]))[0]
-        T_world_ee = turn_about(point[:2], radians) @ target.T_world_ee
-        turned[i] = replace(target, T_world_ee=T_world_ee, R_world_anchor=R_world_anchor)
+        turned[i] = replace(target, T_world_ee=turn_about(point[:2], radians) @ target.T_world_ee)
     return turned
 
 

@@ -62,41 +62,58 @@ def pushed_to(
     """
     poses = {name: T for name, T in demonstration.object_poses.items() if len(points.get(name, ()))}
     pushed: dict[str, Array] = {}
+    began, is_behind = np.zeros(2), None
     for before, pose in pairwise(demonstration.key_poses):
         target = sub_task_of(pose, sub_tasks).target
+        if before.phase != "push":
+            began, is_behind = before.T_world_ee[:2, 3], None
         if pose.phase != "push" or target not in poses:
             continue
         start, end = before.T_world_ee[:2, 3], pose.T_world_ee[:2, 3]
         if np.linalg.norm(end - start) < LEAST_PUSH_M:
             continue
-        poses[target], is_behind = _pushed(poses[target], points[target], start, end)
-        if (before.phase == "push" and target in pushed) or is_behind:
-            pushed[target] = poses[target]
+        if is_behind is None:
+            is_behind = _is_behind(poses[target], points[target], began, end)
+        if is_behind:
+            pushed[target] = poses[target] = _pushed(poses[target], points[target], start, end)
         else:
             del poses[target]
+            pushed.pop(target, None)
     return pushed
 
 
-def _pushed(T_world_obj: Array, points: Array, start: Array, end: Array) -> tuple[Array, bool]:
-    """An object with the hand right behind it at the end of a straight push.
+def _is_behind(T_world_obj: Array, points: Array, start: Array, end: Array) -> bool:
+    """Whether the hand begins a push behind an object's middle; see :func:`_pushed`."""
+    low, high = _outline(T_world_obj, points, start, end)[:, 0]
+    return bool(start @ _axes(start, end)[0] < (low + high) / 2)
+
+
+def _pushed(T_world_obj: Array, points: Array, start: Array, end: Array) -> Array:
+    """The pose ``(4, 4)`` of an object with the hand right behind it at the end of a straight push.
 
     Args:
         T_world_obj: Where it was ``(4, 4)``.
         points: Points ``(n, 3)`` of its surface in its frame.
         start: Where the hand begins, x and y ``(2,)`` in the world.
         end: Where the hand ends ``(2,)``.
-
-    Returns:
-        Its pose ``(4, 4)``, and whether the hand began behind its middle.
     """
-    ahead = (end - start) / np.linalg.norm(end - start)
-    axes = np.stack([ahead, [-ahead[1], ahead[0]]])
-    outline = se3.apply(T_world_obj, points)[:, :2] @ axes.T
-    low, high = outline.min(axis=0), outline.max(axis=0)
-    middle = (low + high) / 2
+    low, high = _outline(T_world_obj, points, start, end)
+    back = np.array([low[0], (low[1] + high[1]) / 2])
     moved = T_world_obj.copy()
-    moved[:2, 3] += end - np.array([low[0], middle[1]]) @ axes
-    return moved, float(start @ ahead) < middle[0]
+    moved[:2, 3] += end - back @ _axes(start, end)
+    return moved
+
+
+def _outline(T_world_obj: Array, points: Array, start: Array, end: Array) -> Array:
+    """The least and the most ``(2, 2)`` of an object's points along a push and to its left, metres."""
+    along = se3.apply(T_world_obj, points)[:, :2] @ _axes(start, end).T
+    return np.stack([along.min(axis=0), along.max(axis=0)])
+
+
+def _axes(start: Array, end: Array) -> Array:
+    """Unit vectors, as rows ``(2, 2)``, along a push and to its left."""
+    ahead = (end - start) / np.linalg.norm(end - start)
+    return np.stack([ahead, [-ahead[1], ahead[0]]])
 
 
 def outcomes(
