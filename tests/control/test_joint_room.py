@@ -80,10 +80,13 @@ def test_a_grasp_from_another_side_is_led_out_anew(panda):
     led = context.clear(plan)
     other = context.otherwise(led)
     assert other.turned != led.turned
-    for i, by in other.out.items():
-        straight = replace(other, out={}).targets(context)[i].T_world_ee[:3, 3]
-        assert by @ (straight - panda.base) > 0
     assert other.out
+    straight = replace(other, out={}).targets(context)
+    for i, by in other.out.items():
+        T = straight[i].T_world_ee
+        ahead = (T[:3, 3] - panda.base)[:2]
+        assert by[:2] @ ahead == pytest.approx(np.linalg.norm(by) * np.linalg.norm(ahead))
+        assert room(panda, T, other.stance) < ROOM_RAD
 
 
 def test_where_no_place_further_out_has_room_the_hand_goes_as_it_was_shown(panda):

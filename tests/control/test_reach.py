@@ -64,21 +64,17 @@ def test_grasps_are_turned_by_what_the_shape_allows(panda, turn, expected):
         context = replace(context, symmetries={})
     ways = Plan(context.entries[0], poses, home).turns(context)
     told = [(round(np.rad2deg(way.turned)), way.put) for way in ways]
-    assert told == [
-        (0, "turned"),
-        *((degrees, put) for degrees in expected for put in ("turned", "as_shown")),
-    ]
+    others = [(degrees, put) for degrees in expected for put in ("turned", "as_shown")]
+    assert told == [(0, "turned"), *others]
 
 
 def test_what_is_found_half_turned_is_grasped_as_it_was_shown_and_put_as_it_was_shown():
     # It looks the same so, and the hand that puts it there keeps its direction in the world.
     context, poses, home = scene(None, 0.0, turn=np.pi)
     (shown,) = context.entries
-    in_world = {
-        i: replace(pose, anchor=Anchor("plate", WORLD)) for i, pose in enumerate(shown.key_poses[4:], 4)
-    }
-    shown = replace(shown, key_poses=tuple(in_world.get(i, pose) for i, pose in enumerate(shown.key_poses)))
-    context = replace(context, entries=(shown,))
+    taken, put = shown.key_poses[:4], shown.key_poses[4:]
+    put = tuple(replace(pose, anchor=Anchor("plate", WORLD)) for pose in put)
+    context = replace(context, entries=(replace(shown, key_poses=taken + put),))
     straight, problems = chosen(context, poses, home)
     assert (straight.turned, problems) == (0, [])
     flipped = poses | {"bowl": poses["bowl"] @ se3.from_yaw(np.zeros(3), np.pi)}
