@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from benchmarks.harness import Row
 from benchmarks.stages import LIBERO
 from benchmarks.truth import Error, offsets, pose_error, summary, true_period
@@ -33,7 +34,10 @@ def accuracy(checkpoint: Path, dataset: Path, episodes: Sequence[Row]) -> dict[s
             if name in episode["seen"] and name in T_sim_obj:
                 period = true_period(name, LIBERO)
                 T_true, T = (se3.from_yaw(place[:3], place[3]) for place in (true, episode["seen"][name]))
-                metres, radians = pose_error(T_true @ T_sim_obj[name], T, period)
+                # What is round is where its middle is, however it is found turned.
+                symmetry = models[name].symmetry
+                middle = se3.from_yaw([*(np.zeros(2) if symmetry is None else symmetry.middle), 0.0], 0.0)
+                metres, radians = pose_error(T_true @ T_sim_obj[name] @ middle, T @ middle, period)
                 # Patches do not measure a yaw, and a round object has none.
                 is_turned = period > 0 and not isinstance(models[name], PatchModel)
                 error = (metres, radians if is_turned else None)

@@ -89,6 +89,26 @@ def test_a_grasp_from_another_side_is_led_out_anew(panda):
         assert room(panda, T, other.stance) < ROOM_RAD
 
 
+def test_a_plan_is_led_out_anew_where_its_objects_have_moved(panda):
+    context, plan = planned(panda, NEAR)
+    led = context.clear(plan)
+    away, problems = context.following(led, {"bowl": se3.from_yaw(FAR, -0.3)})
+    assert (bool(led.out), away.out, problems) == (True, {}, [])
+    back, problems = context.following(away, {"bowl": led.object_poses["bowl"]})
+    assert (back.out.keys(), problems) == (led.out.keys(), [])
+    for i, by in back.out.items():
+        assert_allclose(by, led.out[i])
+
+
+def test_a_grasp_that_was_turned_is_tried_as_it_was_shown(panda):
+    context, plan = planned(panda, NEAR)
+    for turned in (0.0, np.pi):
+        ways = [(way.turned, way.put) for way in replace(plan, turned=turned).turns(context)]
+        assert len(ways) == len(set(ways))
+        assert ways[0] == (turned, "turned")
+        assert {(0.0, "turned"), (np.pi, "turned"), (np.pi, "as_shown")} <= set(ways)
+
+
 def test_where_no_place_further_out_has_room_the_hand_goes_as_it_was_shown(panda):
     *joints, last = panda.joints
     stiff = replace(panda, joints=(*joints, replace(last, limits=np.array([0.6, 1.0]))))

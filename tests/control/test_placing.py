@@ -19,12 +19,13 @@ SHOWN = {"bowl": se3.from_yaw([0.2, 0.1, 0.0], 0.0), "plate": se3.from_yaw([0.0,
 BESIDE, BEHIND = np.array([0.0, 0.05, 0.03]), np.array([-0.03, 0.0, 0.0])
 
 
-def placed(with_outcome=True):
+def placed(with_outcome=True, middle=(0.0, 0.0), axes=WORLD):
     key_poses = (
         key_pose("bowl", hand_pose(*BESIDE), "grasp", closed=True),
-        key_pose("plate", hand_pose(*(BESIDE + BEHIND)), "place", closed=True, axes=WORLD),
+        key_pose("plate", hand_pose(*(BESIDE + BEHIND)), "place", closed=True, axes=axes),
     )
-    outcome = Outcome(0, "bowl", Anchor("plate", "plate"), BEHIND, BEHIND, 0.02)
+    ends = BEHIND + np.array([*middle, 0.0])
+    outcome = Outcome(0, "bowl", Anchor("plate", "plate"), ends, ends, 0.02, middle)
     return entry(key_poses=key_poses, object_poses=SHOWN, outcomes=(outcome,) if with_outcome else ())
 
 
@@ -39,20 +40,26 @@ def test_what_is_carried_ends_on_the_same_side_of_a_landmark_however_it_is_turne
     assert_allclose(place.T_world_ee[:3, :3], grasp.T_world_ee[:3, :3], atol=1e-9)
 
 
+@pytest.mark.parametrize("put", ["turned", "as_shown", "kept"])
+@pytest.mark.parametrize("landmark_yaw", [0.0, 1.0])
 @pytest.mark.parametrize("yaw", [0.0, 1.0, 2.5])
-def test_a_round_thing_is_where_it_should_be_however_it_was_turned_before(yaw):
-    middle = np.array([0.0, 0.08])  # its frame lies at its rim
-    round_bowl = {"bowl": Symmetry(middle, 0.0)}
+def test_a_round_thing_is_where_it_should_be_however_it_and_its_place_are_turned(yaw, landmark_yaw, put):
+    middle = (0.0, 0.08)  # its frame lies at its rim
+    round_bowl = {"bowl": Symmetry(np.array(middle), 0.0)}
     context = PlanningContext((), {"bowl": 2 * np.pi, "plate": 2 * np.pi}, robot(), symmetries=round_bowl)
-    now = SHOWN | {"bowl": SHOWN["bowl"] @ turn_about(middle, yaw)}
-    plan = Plan(placed(), now, HOME)
-    grasp, place = plan.targets(context)[:2]
-    ended = now | {"bowl": place.T_world_ee @ se3.inverse(grasp.T_world_ee) @ now["bowl"]}
-    (outcome,) = plan.entry.outcomes
-    assert outcome.is_met(plan.as_if_in_place(ended, round_bowl))
-    assert outcome.is_met(plan.as_if_in_place(ended, {})) == (yaw == 0.0)
-    beside = ended | {"bowl": se3.from_yaw([0.03, 0.0, 0.0], 0.0) @ ended["bowl"]}
-    assert not outcome.is_met(plan.as_if_in_place(beside, round_bowl))
+    now = {
+        "bowl": SHOWN["bowl"] @ turn_about(np.array(middle), yaw),
+        "plate": se3.from_yaw([0.1, -0.1, 0.0], landmark_yaw),
+    }
+    for axes in (WORLD, "plate"):
+        plan = Plan(placed(middle=middle, axes=axes), now, HOME, turned=0.5, put=put)
+        grasp, place = plan.targets(context)[:2]
+        ended = now | {"bowl": place.T_world_ee @ se3.inverse(grasp.T_world_ee) @ now["bowl"]}
+        (outcome,) = plan.entry.outcomes
+        assert_allclose(outcome.target_at(ended), outcome.place(now), atol=1e-9)
+        assert outcome.is_met(plan.as_if_in_place(ended))
+        beside = ended | {"bowl": se3.from_yaw([0.03, 0.0, 0.0], 0.0) @ ended["bowl"]}
+        assert not outcome.is_met(plan.as_if_in_place(beside))
 
 
 def test_where_it_ends_is_not_known_the_key_pose_stands_as_it_is():

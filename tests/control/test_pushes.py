@@ -31,9 +31,10 @@ LEAD_M = 0.07
 BESIDE = np.array([0.04, 0.0])
 
 
-def push(goal=GOAL, shown=GOAL):
+def push(goal=GOAL, shown=GOAL, middle=(0.0, 0.0)):
     """A plate that is dragged from where it stands to a place before the stove."""
-    start, end = LAYOUT["plate"][:3, 3], se3.apply(LAYOUT["stove"], shown[None])[0]
+    start = se3.apply(LAYOUT["plate"], np.array([[*middle, 0.0]]))[0]
+    end = se3.apply(LAYOUT["stove"], shown[None])[0]
     way = (end - start) / np.linalg.norm(end - start)
     inside, done = start + 0.03 * way, end + LEAD_M * way
 
@@ -47,7 +48,7 @@ def push(goal=GOAL, shown=GOAL):
         key_pose("stove", at("stove", done, 0.02), "push", closed=True),
         key_pose("stove", at("stove", done, 0.12), "retreat", closed=True),
     )
-    outcome = Outcome(0, "plate", Anchor("stove", "stove"), goal, shown, 0.02)
+    outcome = Outcome(0, "plate", Anchor("stove", "stove"), goal, shown, 0.02, middle)
     return entry(INSTRUCTION, poses, LAYOUT, outcomes=(outcome,))
 
 
@@ -83,19 +84,20 @@ def test_from_wherever_the_plate_stands_the_hand_leads_it_to_its_place(x, y, yaw
 def test_a_round_thing_is_pushed_to_its_place_however_it_was_found_turned(yaw):
     round_plate = {"plate": Symmetry(BESIDE, 0.0)}
     context = PlanningContext((), {"plate": 2 * np.pi, "stove": 2 * np.pi}, robot(), symmetries=round_plate)
-    memory = push()
+    memory = push(middle=(BESIDE[0], BESIDE[1]))
     now = LAYOUT | {"plate": LAYOUT["plate"] @ turn_about(BESIDE, yaw)}
     plan = Plan(memory, now, HAND.T_world_ee)
     for target, expected in zip(
         plan.targets(context), transfer(memory, LAYOUT, {}, HAND.T_world_ee), strict=True
     ):
         assert_allclose(target.T_world_ee, expected.T_world_ee, atol=1e-9)
-    goal = se3.from_yaw(se3.apply(LAYOUT["stove"], GOAL[None])[0], 0.0)
+    goal = se3.apply(LAYOUT["stove"], GOAL[None])[0]
     (outcome,) = memory.outcomes
     # On its way it turned once more.
-    ended = now | {"plate": goal @ turn_about(BESIDE, 2.0)}
-    assert outcome.is_met(plan.as_if_in_place(ended, round_plate))
-    assert not outcome.is_met(plan.as_if_in_place(ended, {}))
+    ended = now | {"plate": se3.from_yaw(goal, 2.0) @ se3.from_yaw([*-BESIDE, 0.0], 0.0)}
+    assert outcome.is_met(plan.as_if_in_place(ended))
+    beside = now | {"plate": se3.from_yaw([0.03, 0.0, 0.0], 0.0) @ ended["plate"]}
+    assert not outcome.is_met(plan.as_if_in_place(beside))
 
 
 def test_the_height_of_a_push_is_that_of_what_stands_still():
@@ -263,7 +265,8 @@ def pushing(one, perception, ahead_m):
 def test_the_plate_goes_along_from_where_the_hand_meets_its_rim_however_it_is_turned(yaw):
     now = LAYOUT | {"plate": LAYOUT["plate"] @ turn_about(BESIDE, yaw)}
     perception = Perception(now)
-    one = controller(push(), instruction=INSTRUCTION, symmetries={"plate": Symmetry(BESIDE, 0.0)})
+    shown = push(middle=(BESIDE[0], BESIDE[1]))
+    one = controller(shown, instruction=INSTRUCTION, symmetries={"plate": Symmetry(BESIDE, 0.0)})
     hand = pushing(one, perception, 0.5 * (LEAD_M - 0.03))
     watch(one, perception, hand, 1)
     assert one.scene.tracker.held == frozenset()

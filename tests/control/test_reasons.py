@@ -1,9 +1,8 @@
 import numpy as np
 import pytest
-from tests.memory.builders import OPEN_WIDTH, hand_pose, robot
 
 from lerobot_openspm.control.reasons import why_missing
-from lerobot_openspm.types import Hand, PoseEstimate
+from lerobot_openspm.types import PoseEstimate
 
 
 @pytest.mark.parametrize(
@@ -17,13 +16,12 @@ from lerobot_openspm.types import Hand, PoseEstimate
 )
 def test_each_missing_object_is_named_with_what_is_known_of_it(status, seen, words):
     estimate = PoseEstimate(status, np.eye(4), np.eye(4), 0.0, **seen)
-    hand = Hand(hand_pose(0, 0, 0.3), OPEN_WIDTH)
-    told = why_missing(["bowl", "plate"], {"bowl": estimate}, {}, hand, robot())
+    told = why_missing(["bowl", "plate"], {"bowl": estimate}, {}, is_something_held=False)
     assert told.startswith(words)
     assert "cannot find the plate" in told
     assert "fingers" not in told
 
 
 def test_what_is_missing_may_be_in_the_hand():
-    told = why_missing(["bowl"], {}, {}, Hand(hand_pose(0, 0, 0.3), OPEN_WIDTH / 3), robot())
+    told = why_missing(["bowl"], {}, {}, is_something_held=True)
     assert told.endswith("the fingers are around something, which may be it")

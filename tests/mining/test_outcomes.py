@@ -24,7 +24,7 @@ from lerobot_openspm.mining.outcomes import (
     outcomes,
     pushed_to,
 )
-from lerobot_openspm.types import DemonstrationScene, PoseEstimate
+from lerobot_openspm.types import DemonstrationScene, PoseEstimate, Symmetry
 
 PUSH = parse_instruction("push the plate to the front of the stove")
 
@@ -159,6 +159,24 @@ def test_the_outcome_is_where_the_demonstrations_leave_the_target(n):
         layout = {**demonstration.object_poses, **end}
         assert_allclose(outcome.place_shown(layout), end["plate"][:3, 3], atol=1e-12)
         assert outcome.is_met(layout)
+
+
+def test_what_is_round_ends_where_its_middle_is_however_it_is_turned():
+    shown, goals = pushed(5, turned=1.0)
+    middle, rng = np.array([0.04, 0.01]), np.random.default_rng(0)
+    ended = [
+        {"plate": end["plate"] @ se3.from_yaw(np.zeros(3), yaw) @ se3.from_yaw([*-middle, 0.0], 0.0)}
+        for end, yaw in zip(goals, rng.uniform(-3, 3, 5), strict=True)
+    ]
+    found = outcomes(shown, ended, PUSH, {"plate": Symmetry(middle, 0.0)})
+    for one, end, goal, (outcome,) in zip(shown, ended, goals, found, strict=True):
+        layout = {**one.object_poses, **end}
+        assert_allclose(outcome.position, [0.22, 0, 0], atol=1e-9)
+        assert_allclose(outcome.target_at(layout), goal["plate"][:3, 3], atol=1e-9)
+        assert outcome.is_met(layout)
+        assert outcome.tolerance_m == LEAST_TOLERANCE_M
+    # By its frame's origin the demonstrations agree less.
+    assert outcomes(shown, ended, PUSH)[0][0].tolerance_m > 2 * LEAST_TOLERANCE_M
 
 
 def test_axes_are_those_in_which_the_demonstrations_agree():

@@ -143,7 +143,7 @@ def _known_by(model: KnownObject) -> str:
     """By what an object is known, and so where it is found, as a line."""
     match model:
         case SurfaceModel():
-            where = "anywhere"
+            where = "anywhere within 10 cm of where the hand went"
         case PatchModel():
             where = f"only within {100 * REACH_M:.1f} cm of where it stood in the demonstrations"
         case _:

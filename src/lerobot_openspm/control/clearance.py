@@ -38,7 +38,7 @@ SAG_SHARE = 0.1
 BESIDE = 1.5
 # What is put down comes straight down over this height, metres. What is this near to it, seen from above, is
 # in its way.
-FROM_ABOVE_M, OVER_M = 0.35, 0.01
+FROM_ABOVE_M, OVER_M = 0.35, 0.02
 # So many places of a way are compared with what stands about.
 STEPS = 25
 # Where the fingers close and open, the hand is beside objects.

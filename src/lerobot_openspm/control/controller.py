@@ -245,7 +245,7 @@ class EpisodeController:
         plan = self.state.plan
         changed = plan.moved(names, self.scene.tracker.poses(hand.T_world_ee))
         if changed:
-            plan, problems = plan.following(changed).followed(self._context)
+            plan, problems = self._context.following(plan, changed)
             if problems:
                 logger.info("%r: not believed: %s", self.instruction, "; ".join(problems))
                 return set()
@@ -315,7 +315,7 @@ class EpisodeController:
     def _judge(self, hand: Hand) -> LookRequest | None:
         """Compare what is seen with the outcomes: go on if all are met, else go back to what can mend it."""
         state, poses = self.state, self.scene.tracker.poses(hand.T_world_ee)
-        poses = state.plan.as_if_in_place(poses, self._context.symmetries)
+        poses = state.plan.as_if_in_place(poses)
         missed = state.plan.entry.missed(poses, self.scene.recognised(), self._context.yaw_periods)
         if missed is None:
             return None if state.looks_left > 0 else self._end_part(hand)

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from lerobot_openspm.control.feasibility import Miss, check_reach, check_transfer
-from lerobot_openspm.control.pushes import pushed, pushed_by_landmark
+from lerobot_openspm.control.pushes import pushed_by_landmark
 from lerobot_openspm.control.putting import put_aside, put_turned
 from lerobot_openspm.control.transfer import (
     HALF_TURN,
@@ -20,13 +20,11 @@ from lerobot_openspm.control.transfer import (
     as_shown,
     half_turned,
     transfer,
-    turn_about,
-    turns_as_shown,
 )
 from lerobot_openspm.geometry import se3
 from lerobot_openspm.geometry.se3 import Array
 from lerobot_openspm.memory.entry import MemoryEntry, MemoryKeyPose, Outcome, RetrievalKey
-from lerobot_openspm.types import SubTask, Symmetry
+from lerobot_openspm.types import SubTask
 
 if TYPE_CHECKING:
     from lerobot_openspm.control.planning import PlanningContext
@@ -125,8 +123,10 @@ class Plan:
             for radians in TURNS
             if least and all(turn == 0 or _is_multiple(radians, turn) for turn in least)
         ]
-        ways = [replace(self, turned=radians, put=put) for radians in turns for put in puts]
-        return [self, *(way for way in ways if way.turned or way.put == "kept")]
+        # What is not turned is put turned as it is put as shown.
+        ways = [(turned, put) for turned in turns for put in puts if turned or put != "as_shown"]
+        others = [way for way in ways if way != (self.turned, self.put)]
+        return [self, *(replace(self, turned=turned, put=put) for turned, put in others)]
 
     def otherwise_put(self, context: PlanningContext) -> list[Plan]:
         """The plan, putting down what is carried turned, where its landmark is round, or beside its place.
@@ -147,37 +147,22 @@ class Plan:
         ]
 
     def following(self, moved: Mapping[str, Array]) -> Plan:
-        """The plan with some objects elsewhere, at poses ``T_world_obj`` ``(4, 4)``.
+        """The plan with some objects elsewhere, at poses ``T_world_obj`` ``(4, 4)``, and led out nowhere yet.
 
         Beside a place that has moved, things may stand otherwise.
         """
         ends = {name for one in self._puts for name in one.anchor.objects} & moved.keys()
         went = [se3.distances(moved[name], self.object_poses.get(name, NOWHERE))[0] for name in ends]
-        plan = replace(self, object_poses={**self.object_poses, **moved})
-        return (
-            plan
-            if all(metres < ASIDE_KEPT_M for metres in went)
-            else replace(plan, aside=(0.0, 0.0), around=0.0)
-        )
+        plan = replace(self, object_poses={**self.object_poses, **moved}, out={})
+        if any(metres >= ASIDE_KEPT_M for metres in went):
+            plan = replace(plan, aside=(0.0, 0.0), around=0.0)
+        return plan
 
-    def as_if_in_place(
-        self, object_poses: Mapping[str, Array], symmetries: Mapping[str, Symmetry]
-    ) -> dict[str, Array]:
-        """Object poses as outcomes are told: what was put aside or turned moved back, what is round as shown.
-
-        A round thing that was carried is turned by as much as before the hand took it along; what was pushed
-        may have turned on its way.
-        """
+    def as_if_in_place(self, object_poses: Mapping[str, Array]) -> dict[str, Array]:
+        """Object poses as outcomes are told: what was put aside moved back."""
         back = se3.from_yaw(np.array([-self.aside[0], -self.aside[1], 0.0]), 0.0)
-        pushes = {name: T for name, T in object_poses.items() if name in pushed(self.entry)}
-        turns = turns_as_shown(self.entry, {**self.object_poses, **pushes}, symmetries)
-        shown = {name: T @ turns[name] if name in turns else T for name, T in object_poses.items()}
-        # So much less than the hand that grasped it was turned where it put it.
-        less = (self.turned if self.put == "as_shown" else 0.0) - self.around
-        for name in {one.target for one in self._puts} & shown.keys():
-            turn = turn_about(symmetries[name].middle, less) if name in symmetries else np.eye(4)
-            shown[name] = back @ shown[name] @ turn
-        return shown
+        put = {one.target for one in self._puts}
+        return {name: back @ T if name in put else T for name, T in object_poses.items()}
 
     @property
     def _puts(self) -> list[Outcome]:

@@ -33,8 +33,8 @@ logger = logging.getLogger(__name__)
 
 # Of the entries so many are tried.
 MAX_TRIED = 3
-# The hand is in much more of other objects if it is in so many times as many points of them.
-MUCH_MORE = 2
+# The hand is in much more of other objects if it is in so many times as many points of them, and in so many.
+MUCH_MORE, FEW_POINTS = 2, 10
 # A grasp that the hand was kept from is tried again turned by this much at least, radians.
 OTHERWISE_RAD = np.deg2rad(85)
 # A memory that knows more objects than this knows several scenes, and not all objects are looked for.
@@ -176,7 +176,8 @@ class PlanningContext:
                 crowded += [found] if found is not None else []
         if not crowded:
             return first.followed(self)
-        plan, inside = min([*crowded, *self._beside(*min(crowded, key=_amount), points)], key=_amount)
+        best = _clearest_first(crowded)[0]
+        plan, inside = next(iter(self._beside(*best, points)), best)
         if not inside:
             return plan, []
         logger.warning("%r: hand or load may touch the %s where it takes hold or lets go",
@@ -216,8 +217,7 @@ class PlanningContext:
             targets = plan.targets(self)
             if not plan.check(self, targets):
                 ways.append((plan, crowding(plan.entry, targets, points, self.hand_radius_m)))
-        least = min(map(_amount, ways), default=0)
-        for plan, inside in sorted(ways, key=lambda way: _amount(way) > MUCH_MORE * least):
+        for plan, inside in _clearest_first(ways):
             reaching, miss = plan.backing_off(self)
             if miss is None:
                 return reaching, inside
@@ -275,6 +275,15 @@ class PlanningContext:
             return plan
         return higher
 
+    def following(self, plan: Plan, moved: Mapping[str, Array]) -> tuple[Plan, list[str]]:
+        """The plan with some objects elsewhere, and what keeps the hand from following it; in words.
+
+        Args:
+            plan: The plan.
+            moved: Where they are now, ``T_world_obj`` ``(4, 4)`` by name.
+        """
+        return self._with_room(plan.following(moved)).followed(self)
+
     def _with_room(self, plan: Plan) -> Plan:
         """A plan that is led out where the arm's joints have no room."""
         out = self._ways_out(plan)
@@ -301,6 +310,12 @@ def _is_at(T: Array | None, T_usual: Array) -> bool:
         return False
     metres, radians = se3.distances(T, T_usual)
     return bool(metres <= USUAL_M and radians <= USUAL_RAD)
+
+
+def _clearest_first(ways: Sequence[tuple[Plan, dict[str, int]]]) -> list[tuple[Plan, dict[str, int]]]:
+    """Plans in order, those last in which the hand is in much more of other objects than in the best one."""
+    most = max(MUCH_MORE * min(map(_amount, ways), default=0), FEW_POINTS)
+    return sorted(ways, key=lambda way: _amount(way) > most)
 
 
 def _amount(way: tuple[Plan, Mapping[str, int]]) -> int:

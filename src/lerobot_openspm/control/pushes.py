@@ -23,16 +23,21 @@ class PushPath:
     relative to the path: beside the target at its start, and beside the outcome at its end.
 
     Attributes:
-        target: The object that is pushed.
+        outcome: Where the object that is pushed belongs.
         shown: Start and end ``(2, 3)`` of the target in the demonstration, in the world.
         now: Start and end ``(2, 3)`` of the target here.
         is_by_landmark: Whether none of its key poses belongs to the target.
     """
 
-    target: str
+    outcome: Outcome
     shown: Array
     now: Array
     is_by_landmark: bool = False
+
+    @property
+    def target(self) -> str:
+        """The object that is pushed."""
+        return self.outcome.target
 
     def position(self, pose: MemoryKeyPose, poses_shown: Mapping[str, Array]) -> Array:
         """Where the hand goes ``(3,)`` for a key pose of the push."""
@@ -48,7 +53,7 @@ class PushPath:
         position[2] = self.now[1, 2] + T_world_ee[2, 3] - self.shown[1, 2]
         return position
 
-    def beyond(self, T_world_ee: Array, T_world_end: Array, target: Array) -> float:
+    def beyond(self, T_world_ee: Array, T_world_end: Array, object_poses: Mapping[str, Array]) -> float:
         """Metres along the path by which the hand has passed the point where it meets its target.
 
         There the hand is as far ahead of the target as at the end of the push.
@@ -56,10 +61,10 @@ class PushPath:
         Args:
             T_world_ee: The hand ``(4, 4)``.
             T_world_end: Where the push ends ``(4, 4)``.
-            target: Where the target is ``(3,)``.
+            object_poses: Where its target is, ``T_world_obj`` ``(4, 4)`` by name.
         """
         path = (self.now[1] - self.now[0])[:2]
-        meeting = T_world_end[:3, 3] + target - self.now[1]
+        meeting = T_world_end[:3, 3] + self.outcome.target_at(object_poses) - self.now[1]
         gone = float((T_world_ee[:3, 3] - meeting)[:2] @ path)
         return gone / max(_length(self.now), MIN_PUSH_M)
 
@@ -71,10 +76,10 @@ def push_paths(entry: MemoryEntry, object_poses: Mapping[str, Array]) -> dict[in
     for outcome in _push_outcomes(entry):
         if any(name not in poses for name in outcome.objects for poses in (entry.object_poses, object_poses)):
             continue
-        shown = np.stack([entry.object_poses[outcome.target][:3, 3], outcome.place_shown(entry.object_poses)])
-        now = np.stack([object_poses[outcome.target][:3, 3], outcome.place(object_poses)])
+        shown = np.stack([outcome.target_at(entry.object_poses), outcome.place_shown(entry.object_poses)])
+        now = np.stack([outcome.target_at(object_poses), outcome.place(object_poses)])
         is_by_landmark = outcome.sub_task in by_landmark
-        paths[outcome.sub_task] = PushPath(outcome.target, shown, now, is_by_landmark)
+        paths[outcome.sub_task] = PushPath(outcome, shown, now, is_by_landmark)
     return paths
 
 

@@ -16,8 +16,7 @@ def why_missing(
     missing: Sequence[str],
     estimates: Mapping[str, PoseEstimate],
     elsewhere: Mapping[str, Reference],
-    hand: Hand,
-    robot: RobotModel,
+    is_something_held: bool,
 ) -> str:
     """What is known of objects that were not found.
 
@@ -25,8 +24,7 @@ def why_missing(
         missing: Their names, at least one.
         estimates: What the last look brought of the objects that are meant, by name.
         elsewhere: By name, where the only one found should be, but is not.
-        hand: The hand, which may hold one of them.
-        robot: The robot.
+        is_something_held: Whether the fingers are around something of which it is not known what it is.
     """
     reasons = list[str]()
     for name in missing:
@@ -43,7 +41,7 @@ def why_missing(
             reasons.append(f"cannot tell which {name} is meant, or where it stands")
         else:
             reasons.append(f"cannot find the {name}: it is in no view, hidden, or not as it was shown")
-    if are_around_something(hand, robot):
+    if is_something_held:
         reasons.append("the fingers are around something, which may be it")
     return "; ".join(reasons)
 

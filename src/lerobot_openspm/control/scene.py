@@ -145,9 +145,8 @@ class SceneState:
 
     def why_missing(self, names: Sequence[str], hand: Hand) -> str:
         """What is known of objects that the last look did not find, in words."""
-        return why_missing(
-            names, self.detections.estimates, self.grounding.elsewhere, hand, self._context.robot
-        )
+        is_something_held = not self.tracker.held and are_around_something(hand, self._context.robot)
+        return why_missing(names, self.detections.estimates, self.grounding.elsewhere, is_something_held)
 
     # What goes along with the hand.
 
@@ -170,7 +169,7 @@ class SceneState:
 
     def meet(self, plan: Plan, target: Target, hand: Hand) -> None:
         """What is pushed on the way to a key pose goes along once the hand has met it."""
-        if target.push and self._beyond(plan, target, hand) >= 0:
+        if target.push and self._beyond(target, hand) >= 0:
             self.tracker.hold(target.push.target, hand.T_world_ee)
 
     def untouched(self, plan: Plan, targets: Sequence[Target], index: int) -> list[str]:
@@ -200,7 +199,7 @@ class SceneState:
         if target.key_pose.phase != "push":
             return True
         if target.push is not None:
-            return target.push.target != name or self._beyond(plan, target, hand) > LEFT_BEHIND_M
+            return target.push.target != name or self._beyond(target, hand) > LEFT_BEHIND_M
         first = index
         while first > 0 and targets[first - 1].key_pose.phase == "push":
             first -= 1
@@ -210,12 +209,12 @@ class SceneState:
         # On its way to the object the hand has not outrun it, however far that is.
         return min(further, _apart(hand.T_world_ee, place) - _apart(began, was)) > OUTRUN_M
 
-    def _beyond(self, plan: Plan, target: Target, hand: Hand) -> float:
+    def _beyond(self, target: Target, hand: Hand) -> float:
         """Metres by which the hand has gone beyond where it meets what it pushes."""
         if target.push is None:
             return -np.inf
-        poses = plan.as_if_in_place(self.tracker.poses(hand.T_world_ee), self._context.symmetries)
-        return target.push.beyond(hand.T_world_ee, target.T_world_ee, poses[target.push.target][:3, 3])
+        poses = self.tracker.poses(hand.T_world_ee)
+        return target.push.beyond(hand.T_world_ee, target.T_world_ee, poses)
 
 
 def _apart(T: Array, other: Array) -> float:

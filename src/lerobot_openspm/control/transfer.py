@@ -75,29 +75,20 @@ def as_shown(
 ) -> dict[str, Array]:
     """Object poses ``T_world_obj`` ``(4, 4)`` with the round things that an entry moves turned as shown.
 
-    A bottle with a label is found turned by any angle, and is grasped and put down as if it were not. A plate
-    that is pushed is told by its frame's origin, which may lie beside its middle.
+    A bottle with a label is found turned by any angle, and is grasped, pushed and put down as if it were not.
 
     Args:
         entry: The entry.
         object_poses: Poses as they were found.
         symmetries: How objects turn into themselves, of those that do.
     """
-    turns = turns_as_shown(entry, object_poses, symmetries)
-    return {name: T @ turns[name] if name in turns else T for name, T in object_poses.items()}
-
-
-def turns_as_shown(
-    entry: MemoryEntry, object_poses: Mapping[str, Array], symmetries: Mapping[str, Symmetry]
-) -> dict[str, Array]:
-    """By name, turns ``(4, 4)`` about its axis: they bring round things that an entry moves to as shown."""
     moved = {*entry.carried.values(), *pushed(entry)}
     known = moved & symmetries.keys() & object_poses.keys() & entry.object_poses.keys()
-    turns: dict[str, Array] = {}
+    shown = dict(object_poses)
     for name in (name for name in known if symmetries[name].turn == 0):
         yaw = se3.yaw_of(entry.object_poses[name]) - se3.yaw_of(object_poses[name])
-        turns[name] = turn_about(symmetries[name].middle, float(yaw))
-    return turns
+        shown[name] = object_poses[name] @ turn_about(symmetries[name].middle, float(yaw))
+    return shown
 
 
 def turn_about(middle: Array, radians: float) -> Array:

@@ -138,10 +138,13 @@ class Outcome:
         sub_task: Which of the entry's sub-tasks, counted from 0.
         target: The object that was moved.
         anchor: The frame in which the demonstrations agree most on where it ended.
-        position: Origin ``(3,)`` of the target in that frame, metres; what the demonstrations have in common.
+        position: Where the target ends ``(3,)`` in that frame, metres: what the demonstrations have in
+            common.
         shown: The same of this demonstration alone.
         tolerance_m: The sub-task is done while the target is at most this far from there; it may lie lower by
             :data:`MAX_FALL_M`, because what is let go falls.
+        middle: Where the target is, x and y in its own frame, metres: on the axis about which it turns into
+            itself, so that it is there however it is turned.
     """
 
     sub_task: int
@@ -150,11 +153,16 @@ class Outcome:
     position: Array
     shown: Array
     tolerance_m: float
+    middle: tuple[float, float] = (0.0, 0.0)
 
     @property
     def objects(self) -> tuple[str, ...]:
         """The objects whose poses are needed to judge it."""
         return tuple(dict.fromkeys((self.target, *self.anchor.objects)))
+
+    def target_at(self, object_poses: Mapping[str, Array]) -> Array:
+        """Where the target is ``(3,)`` in the world, given the objects' poses ``T_world_obj``."""
+        return se3.apply(object_poses[self.target], np.array([[*self.middle, 0.0]]))[0]
 
     def place_shown(self, object_poses: Mapping[str, Array]) -> Array:
         """Where the demonstration left the target ``(3,)`` in the world, given its objects' poses."""
@@ -166,7 +174,7 @@ class Outcome:
 
     def is_met(self, object_poses: Mapping[str, Array]) -> bool:
         """Whether the target is where it should be, given the objects' poses ``T_world_obj``."""
-        off = object_poses[self.target][:3, 3] - self.place(object_poses)
+        off = self.target_at(object_poses) - self.place(object_poses)
         beside = float(np.linalg.norm(off[:2]))
         return beside <= self.tolerance_m and -MAX_FALL_M <= float(off[2]) <= self.tolerance_m
 

@@ -10,10 +10,7 @@ from lerobot_openspm.memory.entry import MemoryEntry
 
 # The longest name and reason that are kept, in characters, and how many records.
 MAX_CHARS, MAX_RECORDS = 1000, 1000
-NEXT_STEP = (
-    "two cameras have to show it before the hand hides it, the calibration has to fit, and a segmenter can "
-    "find what colours do not show: see docs/mining.md, docs/calibration.md and docs/segmentation.md"
-)
+NEXT_STEP = "docs/mining.md says what helps, by the reason"
 
 
 @dataclass(frozen=True)
@@ -37,10 +34,7 @@ class NotLearned:
         count = f"{self.demonstrations} demonstration{'s' * (self.demonstrations != 1)}"
         if self.what == "instruction":
             return f"{self.name!r} is not learned: none of its {count} is kept, because {self.reason}"
-        return (
-            f"{self.name!r} is handled in {count} and could not be learned: {self.reason}. "
-            f"What helps: {NEXT_STEP}"
-        )
+        return f"{self.name!r} is handled in {count} and could not be learned: {self.reason}; {NEXT_STEP}"
 
 
 def not_learned(

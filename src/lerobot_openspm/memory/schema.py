@@ -108,6 +108,7 @@ class _Outcome(Record):
     position: Vector
     shown: Vector
     tolerance_m: NotNegative
+    middle: tuple[Number, Number] = (0.0, 0.0)
 
 
 class _Entry(Record, kw_only=True):

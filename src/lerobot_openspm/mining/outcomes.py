@@ -11,7 +11,7 @@ from lerobot_openspm.geometry import se3
 from lerobot_openspm.geometry.se3 import Array
 from lerobot_openspm.memory.entry import WORLD, Anchor, Outcome
 from lerobot_openspm.mining.anchors import Demonstration, sub_task_of
-from lerobot_openspm.types import SubTask
+from lerobot_openspm.types import SubTask, Symmetry
 
 # How exactly perception locates an object that was put down.
 FOUND_AGAIN_M = 0.010
@@ -120,6 +120,7 @@ def outcomes(
     demonstrations: Sequence[Demonstration],
     ends: Sequence[Mapping[str, Array]],
     sub_tasks: Sequence[SubTask],
+    symmetries: Mapping[str, Symmetry] | None = None,
 ) -> list[tuple[Outcome, ...]]:
     """Where the demonstrations of one task leave its targets, as far as they agree.
 
@@ -127,6 +128,7 @@ def outcomes(
         demonstrations: The demonstrations, with their objects' poses at the start.
         ends: For each, poses ``T_world_obj`` ``(4, 4)`` at its end of the objects that were moved and found.
         sub_tasks: What the instruction asks for.
+        symmetries: How objects turn into themselves, of those that do.
 
     Returns:
         For each demonstration, one outcome per sub-task that names a landmark and that enough of them show.
@@ -137,7 +139,7 @@ def outcomes(
         moved_on = any(later.target in sub_task.objects for later in sub_tasks[i + 1 :])
         is_told = sub_task.relation and not sub_task.words  # the instruction says where it ends
         if is_told and sub_task.landmark != sub_task.target and not moved_on:
-            for n, outcome in _outcomes(i, sub_task, demonstrations, ends).items():
+            for n, outcome in _outcomes(i, sub_task, demonstrations, ends, symmetries or {}).items():
                 found[n].append(outcome)
     return [tuple(one) for one in found]
 
@@ -147,6 +149,7 @@ def _outcomes(
     sub_task: SubTask,
     demonstrations: Sequence[Demonstration],
     ends: Sequence[Mapping[str, Array]],
+    symmetries: Mapping[str, Symmetry],
 ) -> dict[int, Outcome]:
     """The outcome of one sub-task by demonstration; empty where too few show it, or they disagree."""
     final_poses = [{**one.object_poses, **end} for one, end in zip(demonstrations, ends, strict=True)]
@@ -157,18 +160,20 @@ def _outcomes(
     ]
     if not known or 2 * len(known) < len(demonstrations):
         return {}
-    places = np.stack([ends[i][sub_task.target][:3, 3] for i in known])
+    symmetry = symmetries.get(sub_task.target)
+    x, y = (0.0, 0.0) if symmetry is None else map(float, symmetry.middle)
+    places = np.stack([se3.apply(ends[i][sub_task.target], np.array([[x, y, 0.0]]))[0] for i in known])
     choices = []
     for anchor in (Anchor(sub_task.landmark, sub_task.landmark), Anchor(sub_task.landmark, WORLD)):
         T_anchor_world = se3.inverse(np.stack([anchor.frame(final_poses[i]) for i in known]))
         shown = se3.apply(T_anchor_world, places[:, None])[:, 0]
-        middle = np.median(shown, axis=0)
-        choices.append((float(np.linalg.norm(shown - middle, axis=-1).max()), anchor, middle, shown))
-    spread, anchor, middle, shown = min(choices, key=lambda choice: choice[0])
+        median = np.median(shown, axis=0)
+        choices.append((float(np.linalg.norm(shown - median, axis=-1).max()), anchor, median, shown))
+    spread, anchor, median, shown = min(choices, key=lambda choice: choice[0])
     if spread > MOST_SPREAD_M:
         return {}
     tolerance_m = max(LEAST_TOLERANCE_M, spread + FOUND_AGAIN_M)
     return {
-        i: Outcome(number, sub_task.target, anchor, middle, own, tolerance_m)
+        i: Outcome(number, sub_task.target, anchor, median, own, tolerance_m, (x, y))
         for i, own in zip(known, shown, strict=True)
     }

@@ -48,7 +48,7 @@ from lerobot_openspm.mining.objects import find_objects, learn_scenes, simulator
 from lerobot_openspm.mining.outcomes import outcomes
 from lerobot_openspm.mining.signals import Episode, observe_robot
 from lerobot_openspm.perception.objects.base import KnownObject, ShapeBackend
-from lerobot_openspm.types import Segmenter, Shape
+from lerobot_openspm.types import Segmenter, Shape, Symmetry
 
 logger = logging.getLogger(__name__)
 
@@ -148,7 +148,9 @@ class DatasetProcessor:
             )
         yaw_periods = {name: model.yaw_period for name, model in objects.models.items()}
         surfaces = self._options.lexicon.surfaces
-        tasks = compare(found.episodes, poses, ends, yaw_periods, surfaces)
+        known = {} if self._options.is_oracle else objects.models
+        symmetries = {name: one for name, model in known.items() if (one := model.symmetry) is not None}
+        tasks = compare(found.episodes, poses, ends, yaw_periods, surfaces, symmetries)
         return MinedDataset(
             **vars(found), cameras=cameras, objects=objects.models, object_poses=tuple(poses), tasks=tasks,
             unlearned=objects.unlearned, surfaces=surfaces, simulator_objects=simulator_objects,
@@ -249,6 +251,7 @@ def compare(
     ends: Sequence[Mapping[str, Array]],
     yaw_periods: Mapping[str, float],
     surfaces: Collection[str] = (),
+    symmetries: Mapping[str, Symmetry] | None = None,
 ) -> tuple[MinedTask, ...]:
     """Compare the demonstrations of each task: anchors, axes, outcomes, and how closely they agree.
 
@@ -258,6 +261,7 @@ def compare(
         ends: For each, the final poses of the objects that it moved.
         yaw_periods: Rotational symmetry of each object about its vertical axis, radians.
         surfaces: Names of what things stand on everywhere, such as the table.
+        symmetries: How objects turn into themselves, of those that do.
     """
     by_task: dict[str, list[int]] = defaultdict(list)
     for i, item in enumerate(episodes):
@@ -275,7 +279,7 @@ def compare(
                 anchors=anchors,
                 axes=tuple(constrained_axes(aligned, anchors)),
                 qualities=tuple(qualities(aligned, anchors)),
-                outcomes=tuple(outcomes(aligned, [ends[i] for i in members], sub_tasks)),
+                outcomes=tuple(outcomes(aligned, [ends[i] for i in members], sub_tasks, symmetries)),
             )
         )
     return tuple(tasks)
