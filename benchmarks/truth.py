@@ -19,6 +19,7 @@ from lerobot_openspm.geometry import se3
 from lerobot_openspm.geometry.se3 import Array
 from lerobot_openspm.memory.memory import Memory
 from lerobot_openspm.mining.dataset import Demonstrations, dataset_metadata
+from lerobot_openspm.perception.objects.base import KnownObject
 from lerobot_openspm.perception.oracle import name_simulator_poses
 from lerobot_openspm.training import open_demonstrations
 
@@ -50,7 +51,7 @@ def offsets_in(memory: Memory, demonstrations: Demonstrations) -> dict[str, Arra
 
 
 def _offset(memory: Memory, name: str, demonstrations: Demonstrations) -> Array:
-    """One model's frame as the median over the demonstrations."""
+    """One model's frame as the median over the demonstrations; what is round by its middle."""
     period, found = memory.objects[name].yaw_period, []
     for entry in memory.entries:
         if name in entry.object_poses:
@@ -61,8 +62,16 @@ def _offset(memory: Memory, name: str, demonstrations: Demonstrations) -> Array:
                 se3.inverse(truth) @ T for T in se3.yaw_equivalents(entry.object_poses[name], period)
             ]
             found.append(min(equivalents, key=lambda T: abs(float(se3.yaw_of(T)))))
-    relative = np.stack(found)
-    return se3.from_yaw(np.median(relative[:, :3, 3], axis=0), np.median(se3.yaw_of(relative)))
+    T_obj_middle = middle(memory.objects[name])
+    relative = np.stack(found) @ T_obj_middle
+    T = se3.from_yaw(np.median(relative[:, :3, 3], axis=0), np.median(se3.yaw_of(relative)))
+    return T @ se3.inverse(T_obj_middle)
+
+
+def middle(model: KnownObject) -> Array:
+    """A model's middle in its frame, ``T_obj_middle`` ``(4, 4)``: where it is however it is found turned."""
+    symmetry = model.symmetry
+    return np.eye(4) if symmetry is None else se3.from_yaw([*symmetry.middle, 0.0], 0.0)
 
 
 def upright(T: Array) -> Array:

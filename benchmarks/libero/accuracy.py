@@ -7,10 +7,9 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 from benchmarks.harness import Row
 from benchmarks.stages import LIBERO
-from benchmarks.truth import Error, offsets, pose_error, summary, true_period
+from benchmarks.truth import Error, middle, offsets, pose_error, summary, true_period
 
 from lerobot_openspm.envs.libero.simulator import tasks
 from lerobot_openspm.geometry import se3
@@ -35,9 +34,9 @@ def accuracy(checkpoint: Path, dataset: Path, episodes: Sequence[Row]) -> dict[s
                 period = true_period(name, LIBERO)
                 T_true, T = (se3.from_yaw(place[:3], place[3]) for place in (true, episode["seen"][name]))
                 # What is round is where its middle is, however it is found turned.
-                symmetry = models[name].symmetry
-                middle = se3.from_yaw([*(np.zeros(2) if symmetry is None else symmetry.middle), 0.0], 0.0)
-                metres, radians = pose_error(T_true @ T_sim_obj[name] @ middle, T @ middle, period)
+                T_obj_middle = middle(models[name])
+                T_true_middle = T_true @ T_sim_obj[name] @ T_obj_middle
+                metres, radians = pose_error(T_true_middle, T @ T_obj_middle, period)
                 # Patches do not measure a yaw, and a round object has none.
                 is_turned = period > 0 and not isinstance(models[name], PatchModel)
                 error = (metres, radians if is_turned else None)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from pathlib import Path
 
 from benchmarks.figures import FIGURES
 from benchmarks.libero.failures import FAR_OFF_MM as FAR_OFF
@@ -20,6 +19,7 @@ from benchmarks.markdown import (
     share,
     table,
 )
+from benchmarks.staleness import ROOT
 
 INTRODUCTION = """# On LIBERO-GOAL
 
@@ -61,7 +61,7 @@ SORTED = (
     "not of the task are touched in episodes that succeed too."
 )
 # By a figure's command: of which commit's result films were looked at, and what they show.
-LOOKED_AT = Path(__file__).with_name("looked_at.json")
+LOOKED_AT = ROOT / "docs/looked_at.json"
 PLACES: Columns = {
     "Known by": lambda row: row["learned"] or "not learned",
     "Grasped in": "grasped",

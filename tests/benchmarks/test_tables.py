@@ -140,7 +140,7 @@ def test_contacts_that_no_task_asks_for_are_told_beside_success(results):
     assert "| all ten tasks | 50.0 % | 15.0 to 85.0 % | 4 | 100.0 | 25.0 % | 0.0 % |" in text
     assert "| put the bowl | 50.0 % | 15.0 to 85.0 % | 4 | 100.0 | 25.0 % | - |" in text
     assert "| Failed by | words | perception | reach | grasp | placing |" in text
-    assert "| episodes | 0 | 1 | 0 | 0 | 1 | 0 |" in text
+    assert "| episodes | 0 | 1 | 0 | 1 | 0 |" in text
 
 
 def test_what_films_show_is_told_of_the_commit_whose_episodes_they_are_of(results, tmp_path, monkeypatch):
@@ -157,7 +157,7 @@ def test_what_films_show_is_told_of_the_commit_whose_episodes_they_are_of(result
     for commit, is_told in ((result["commit"], True), ("another", False)):
         looked = {result["command"]: {"commit": commit, "failed": [seen]}}
         libero_tables.LOOKED_AT.write_text(json.dumps(looked))
-        row = "| put the bowl | 3, 7 | collision | the hand is on the rack |"
+        row = "| put the bowl | 3, 7 | collision | the hand stands on the rack |"
         assert (row in tables.results_page()) == is_told
 
 

@@ -175,7 +175,7 @@ def test_add_refuses_what_is_no_memory(openspm: Openspm, memory: Path, tmp_path:
     assert "pass --other=FOLDER" in refused(openspm, memory, "add")
     assert "nothing at nowhere" in refused(openspm, memory, "add", "--other=nowhere")
     (tmp_path / "some.json").write_text('{"format": "zip"}')
-    assert "expected 'openspm-entries' and 8" in refused(
+    assert "expected 'openspm-entries' and 9" in refused(
         openspm, memory, "add", f"--other={tmp_path / 'some.json'}"
     )
     empty = tmp_path / "empty"
@@ -268,7 +268,7 @@ def test_a_file_can_bring_back_what_an_entry_was(openspm: Openspm, memory: Path,
         (lambda e: e["robot"].pop("open_width"), "field `open_width` - at `$.robot`"),
         (
             lambda e: e.update(version=99),
-            "got format and version ['openspm-entries', 99], expected 'openspm-entries' and 8",
+            "got format and version ['openspm-entries', 99], expected 'openspm-entries' and 9",
         ),
     ],
 )

@@ -13,6 +13,7 @@ from tests.memory.builders import entry
 
 from lerobot_openspm.control.clearance import crowding
 from lerobot_openspm.control.plan import Plan
+from lerobot_openspm.control.planning import FEW_POINTS
 from lerobot_openspm.control.transfer import transfer
 from lerobot_openspm.geometry import se3
 from lerobot_openspm.memory.compose import Candidate
@@ -28,7 +29,8 @@ def at_key_pose(context, poses, home, phase, along):
     return targets, se3.from_yaw([*place[:2], T[2, 3] - 0.1], 0.0)
 
 
-POST = pillar(0.0, 0.0, 0.25)
+SPARSE = pillar(0.0, 0.0, 0.25)
+POST = np.tile(SPARSE, (2, 1))
 
 
 @pytest.mark.parametrize("phase", ["grasp", "release"])
@@ -80,6 +82,18 @@ def test_a_grasp_beside_another_object_is_turned_about_a_round_object(caplog):
     assert (plan.turned, problems) == (0, [])
     (record,) = caplog.records
     assert "hand or load may touch the post where it takes hold or lets go" in record.getMessage()
+
+
+@pytest.mark.parametrize(("post", "is_turned"), [(POST, True), (SPARSE, False)])
+def test_a_grasp_is_not_turned_for_few_points_of_another_object(post, is_turned):
+    context, poses, home = scene(None, 0.0)
+    _, place = at_key_pose(context, poses, home, "grasp", (0.0, 0.09))
+    context, poses = replace(context, points={"post": post}, hand_radius_m=RADIUS), poses | {"post": place}
+    shown = Plan(context.entries[0], poses, home)
+    found = crowding(shown.entry, shown.targets(context), {"post": se3.apply(place, post)}, RADIUS)
+    assert found["post"] > 0
+    assert (found["post"] > FEW_POINTS) == is_turned
+    assert (chosen(context, poses, home)[0].turned != 0) == is_turned
 
 
 def test_the_other_one_of_a_kind_is_kept_clear_of_like_any_other_thing(caplog):
@@ -208,7 +222,7 @@ def test_what_is_put_on_something_round_is_turned_clear_of_what_stands_beside_it
     backs = [se3.inverse(one[-2].T_world_ee) @ one[-1].T_world_ee for one in (own, straight)]
     assert_allclose(*backs, atol=1e-9)
     # It is where it should be, its frame turned about its middle or not.
-    ended = plan.as_if_in_place({"bowl": own[5].T_world_ee @ T_ee_load})
+    ended = plan.as_if_in_place({"bowl": own[5].T_world_ee @ T_ee_load}, symmetries)
     unturned = replace(plan, around=0.0, aside=(0.0, 0.0)).targets(context)[5].T_world_ee @ T_ee_load
     assert_allclose(se3.apply(ended["bowl"], axis), se3.apply(unturned, axis), atol=1e-9)
 
@@ -253,12 +267,12 @@ def test_what_was_put_aside_is_where_it_should_be_until_its_place_moves():
     shown = replace(context.entries[0], outcomes=(ON_PLATE,))
     plan = replace(Plan(shown, poses, home), aside=(0.02, 0.0))
     ended = poses | {"bowl": se3.from_yaw([0.02, 0.0, 0.0], 0.0) @ poses["plate"]}
-    assert_allclose(plan.as_if_in_place(ended)["bowl"], poses["plate"], atol=1e-12)
-    assert_allclose(plan.as_if_in_place(ended)["plate"], poses["plate"], atol=1e-12)
+    assert_allclose(plan.as_if_in_place(ended, {})["bowl"], poses["plate"], atol=1e-12)
+    assert_allclose(plan.as_if_in_place(ended, {})["plate"], poses["plate"], atol=1e-12)
     # What is pushed was not put aside.
     pushed = replace(plan, entry=replace(shown, key_poses=shown.key_poses[3:]))
     assert pushed.otherwise_put(context) == []
-    assert_allclose(pushed.as_if_in_place(ended)["bowl"], ended["bowl"])
+    assert_allclose(pushed.as_if_in_place(ended, {})["bowl"], ended["bowl"])
     for name, metres, aside in (("plate", 0.01, 0.02), ("plate", 0.05, 0.0), ("bowl", 0.05, 0.02)):
         there = {name: se3.from_yaw([metres, 0.0, 0.0], 0.0) @ poses[name]}
         followed = plan.following(there)

@@ -57,9 +57,9 @@ def test_a_round_thing_is_where_it_should_be_however_it_and_its_place_are_turned
         ended = now | {"bowl": place.T_world_ee @ se3.inverse(grasp.T_world_ee) @ now["bowl"]}
         (outcome,) = plan.entry.outcomes
         assert_allclose(outcome.target_at(ended), outcome.place(now), atol=1e-9)
-        assert outcome.is_met(plan.as_if_in_place(ended))
+        assert outcome.is_met(plan.as_if_in_place(ended, round_bowl))
         beside = ended | {"bowl": se3.from_yaw([0.03, 0.0, 0.0], 0.0) @ ended["bowl"]}
-        assert not outcome.is_met(plan.as_if_in_place(beside))
+        assert not outcome.is_met(plan.as_if_in_place(beside, round_bowl))
 
 
 def test_where_it_ends_is_not_known_the_key_pose_stands_as_it_is():

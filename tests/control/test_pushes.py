@@ -95,9 +95,12 @@ def test_a_round_thing_is_pushed_to_its_place_however_it_was_found_turned(yaw):
     (outcome,) = memory.outcomes
     # On its way it turned once more.
     ended = now | {"plate": se3.from_yaw(goal, 2.0) @ se3.from_yaw([*-BESIDE, 0.0], 0.0)}
-    assert outcome.is_met(plan.as_if_in_place(ended))
+    assert outcome.is_met(plan.as_if_in_place(ended, round_plate))
+    # What is put on it afterwards is judged as it was shown.
+    shown = plan.as_if_in_place(ended, round_plate)["plate"]
+    assert_allclose(shown[:3, :3], LAYOUT["plate"][:3, :3], atol=1e-9)
     beside = now | {"plate": se3.from_yaw([0.03, 0.0, 0.0], 0.0) @ ended["plate"]}
-    assert not outcome.is_met(plan.as_if_in_place(beside))
+    assert not outcome.is_met(plan.as_if_in_place(beside, round_plate))
 
 
 def test_the_height_of_a_push_is_that_of_what_stands_still():

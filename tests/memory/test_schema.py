@@ -9,7 +9,9 @@ from lerobot_openspm.errors import MemoryFormatError
 from lerobot_openspm.memory.entry import WORLD, Anchor, Outcome
 from lerobot_openspm.memory.schema import entry_from_json, entry_to_json, loads
 
-OUTCOME = Outcome(0, "bowl", Anchor("plate", WORLD), np.array([0.01, 0.0, 0.02]), np.zeros(3), 0.025)
+OUTCOME = Outcome(
+    0, "bowl", Anchor("plate", WORLD), np.array([0.01, 0.0, 0.02]), np.zeros(3), 0.025, (0.03, -0.01)
+)
 
 
 def test_an_entry_is_read_as_it_was_written():

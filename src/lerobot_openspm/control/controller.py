@@ -187,7 +187,7 @@ class EpisodeController:
         for i in range(before, state.index):
             scene.pass_key_pose(state.plan, executor.targets[i], executor.targets[i + 1], hand)
         if (target := executor.target) is not None:
-            scene.meet(state.plan, target, hand)
+            scene.meet(target, hand)
         if state.status is Status.DONE:
             scene.tracker.release(scene.tracker.held, hand.T_world_ee)
             return self._look_at_outcome(hand)
@@ -315,7 +315,7 @@ class EpisodeController:
     def _judge(self, hand: Hand) -> LookRequest | None:
         """Compare what is seen with the outcomes: go on if all are met, else go back to what can mend it."""
         state, poses = self.state, self.scene.tracker.poses(hand.T_world_ee)
-        poses = state.plan.as_if_in_place(poses)
+        poses = state.plan.as_if_in_place(poses, self._context.symmetries)
         missed = state.plan.entry.missed(poses, self.scene.recognised(), self._context.yaw_periods)
         if missed is None:
             return None if state.looks_left > 0 else self._end_part(hand)

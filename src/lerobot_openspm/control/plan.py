@@ -24,7 +24,7 @@ from lerobot_openspm.control.transfer import (
 from lerobot_openspm.geometry import se3
 from lerobot_openspm.geometry.se3 import Array
 from lerobot_openspm.memory.entry import MemoryEntry, MemoryKeyPose, Outcome, RetrievalKey
-from lerobot_openspm.types import SubTask
+from lerobot_openspm.types import SubTask, Symmetry
 
 if TYPE_CHECKING:
     from lerobot_openspm.control.planning import PlanningContext
@@ -158,11 +158,14 @@ class Plan:
             plan = replace(plan, aside=(0.0, 0.0), around=0.0)
         return plan
 
-    def as_if_in_place(self, object_poses: Mapping[str, Array]) -> dict[str, Array]:
-        """Object poses as outcomes are told: what was put aside moved back."""
+    def as_if_in_place(
+        self, object_poses: Mapping[str, Array], symmetries: Mapping[str, Symmetry]
+    ) -> dict[str, Array]:
+        """Object poses as outcomes are told: what was put aside moved back, what is round turned as shown."""
         back = se3.from_yaw(np.array([-self.aside[0], -self.aside[1], 0.0]), 0.0)
         put = {one.target for one in self._puts}
-        return {name: back @ T if name in put else T for name, T in object_poses.items()}
+        shown = as_shown(self.entry, object_poses, symmetries)
+        return {name: back @ T if name in put else T for name, T in shown.items()}
 
     @property
     def _puts(self) -> list[Outcome]:

@@ -33,8 +33,9 @@ logger = logging.getLogger(__name__)
 
 # Of the entries so many are tried.
 MAX_TRIED = 3
-# The hand is in much more of other objects if it is in so many times as many points of them, and in so many.
-MUCH_MORE, FEW_POINTS = 2, 10
+# A hand that is in so few points of other objects is clear of them. Else it is in much more of them in one
+# plan than in another if it is in so many times as many points.
+FEW_POINTS, MUCH_MORE = 10, 2
 # A grasp that the hand was kept from is tried again turned by this much at least, radians.
 OTHERWISE_RAD = np.deg2rad(85)
 # A memory that knows more objects than this knows several scenes, and not all objects are looked for.
@@ -171,14 +172,14 @@ class PlanningContext:
             for is_half_turned in (False, True):
                 plan = replace(first, entry=entry, is_half_turned=is_half_turned)
                 found = self._clearest(plan.turns(self), points)
-                if found is not None and not found[1]:
+                if found is not None and _amount(found) <= FEW_POINTS:
                     return found[0], []
                 crowded += [found] if found is not None else []
         if not crowded:
             return first.followed(self)
         best = _clearest_first(crowded)[0]
         plan, inside = next(iter(self._beside(*best, points)), best)
-        if not inside:
+        if sum(inside.values()) <= FEW_POINTS:
             return plan, []
         logger.warning("%r: hand or load may touch the %s where it takes hold or lets go",
                        plan.entry.language, " and the ".join(inside))  # fmt: skip
@@ -200,10 +201,9 @@ class PlanningContext:
     def _clearest(
         self, turned: Sequence[Plan], points: Mapping[str, Array]
     ) -> tuple[Plan, dict[str, int]] | None:
-        """The first of some plans with which the arm can follow it clear of other objects.
+        """The first of some plans that the arm can follow, unless the hand is in much less of others in one.
 
-        Where that is not to be had, the first one, unless the hand is in much less of them with another. None
-        where the arm can follow none.
+        None where the arm can follow none.
 
         Args:
             turned: A plan with its grasps turned, see :meth:`Plan.turns`.

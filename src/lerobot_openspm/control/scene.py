@@ -167,7 +167,7 @@ class SceneState:
             if pose.phase == "open" and plan.sub_task(pose).operation != "close":
                 self.tracker.cover()
 
-    def meet(self, plan: Plan, target: Target, hand: Hand) -> None:
+    def meet(self, target: Target, hand: Hand) -> None:
         """What is pushed on the way to a key pose goes along once the hand has met it."""
         if target.push and self._beyond(target, hand) >= 0:
             self.tracker.hold(target.push.target, hand.T_world_ee)

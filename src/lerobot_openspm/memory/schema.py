@@ -22,7 +22,7 @@ from lerobot_openspm.memory.memory import Memory
 from lerobot_openspm.memory.robot import RobotModel
 from lerobot_openspm.types import OWN_WORDS, SubTask
 
-VERSION = 8
+VERSION = 9
 AGAIN = "train or pull it again"
 # More than any robot, unit or count needs; sums and products of such numbers stay finite and exact.
 LIMIT = 1e9
