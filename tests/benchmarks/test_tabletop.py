@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from benchmarks.anywhere import _without, summarise
+from benchmarks.anywhere import _without, look, summarise
 from benchmarks.results import PROVENANCE
 from benchmarks.tabletop import TabletopConfig, main
 
@@ -82,6 +82,18 @@ def test_what_was_taken_away_is_put_back_even_where_the_look_fails():
     with pytest.raises(ValueError, match="blind"), _without(world, "bowl"):
         raise ValueError("blind")
     assert put == [("bowl", 5.0), ("bowl", 0.0)]
+
+
+def test_a_first_look_anywhere_tells_of_all_that_stands_there_and_of_what_was_taken_away(
+    checkpoint: Path, tiny_dataset: Path
+):
+    row = look(checkpoint, tiny_dataset, "bowl_on_plate_anywhere", 410020)
+    assert row["drawn"] >= row["tried"] >= 1
+    found = {name: (needed, metres) for name, needed, _, _, metres, _ in row["found"]}
+    assert {name for name, (needed, _) in found.items() if needed} == {"bowl", "plate"}
+    assert found["plate"][1] < 0.02
+    # There are two bowls; of the others each was taken away once.
+    assert [name for name, _, _ in row["gone"]] == ["plate"]
 
 
 def test_first_looks_tell_errors_false_finds_and_whether_confidence_holds():

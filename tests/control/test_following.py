@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 from tests.control.acting import HAND, LOOK_AGAIN_STEPS, Perception, controller, observe, shifted, watch
-from tests.memory.builders import entry
+from tests.memory.builders import OPEN_WIDTH, entry
 
 from lerobot_openspm.control.plan import MOVED_M
 from lerobot_openspm.control.state import Status
@@ -168,6 +168,16 @@ def test_a_place_out_of_reach_is_not_believed():
     watch(one, perception, HAND, 20)
     assert one.state.status is Status.RUNNING
     assert_allclose([target.T_world_ee for target in one.executor.targets], before, atol=1e-9)
+
+
+def test_what_is_missing_may_be_in_the_hand_unless_something_else_is():
+    perception, one = Perception(entry().object_poses), controller()
+    observe(one, HAND, perception)
+    hand = Hand(HAND.T_world_ee, OPEN_WIDTH / 3)
+    told = one.scene.why_missing(["plate"], hand)
+    assert told.endswith("the fingers are around something, which may be it")
+    one.scene.tracker.hold("bowl", HAND.T_world_ee)
+    assert "fingers" not in one.scene.why_missing(["plate"], hand)
 
 
 def test_what_is_gone_is_waited_for_then_lost_and_taken_up_again_when_it_is_back():

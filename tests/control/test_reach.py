@@ -17,6 +17,7 @@ from lerobot_openspm.geometry import se3
 from lerobot_openspm.geometry.arm import load_arm
 from lerobot_openspm.memory.compose import Candidate
 from lerobot_openspm.memory.entry import WORLD, Anchor, Axis
+from lerobot_openspm.memory.retrieval import Scored
 from lerobot_openspm.types import Hand, Symmetry
 
 
@@ -53,6 +54,27 @@ def test_a_hand_that_the_joints_cannot_turn_so_far_is_turned_about_the_object(pa
     plan, problems = chosen(context, poses, home)
     assert (round(np.rad2deg(plan.turned)), plan.put) == (turned, put)
     assert problems == plan.followed(context)[1] == []
+
+
+def test_where_the_joints_do_not_reach_an_entry_the_next_one_is_taken(panda):
+    *joints, last = panda.joints
+    # Neither as it was shown nor the other way round.
+    stiff = replace(panda, joints=(*joints, replace(last, limits=np.array([0.3, 1.3]))))
+    context, poses, home = scene(stiff, np.deg2rad(90))
+    context, (shown,) = replace(context, symmetries={}), context.entries
+    quarter = se3.from_yaw(np.zeros(3), np.pi / 2)
+    others = [
+        replace(
+            shown,
+            key_poses=tuple(replace(pose, T_obj_ee=pose.T_obj_ee @ turn) for pose in shown.key_poses),
+            source=source,
+        )
+        for turn, source in ((quarter, "a quarter"), (se3.inverse(quarter), "a quarter back"))
+    ]
+    ranked = [Scored(one, 1.0, 1.0, 1.0, 1.0) for one in (shown, *others)]
+    assert "beyond what the arm's joints reach" in context.choose(ranked[:1], poses, home)[1][0]
+    plan, problems = context.choose(ranked, poses, home)
+    assert (plan.entry in others, problems) == (True, [])
 
 
 @pytest.mark.parametrize(
