@@ -16,6 +16,7 @@ PHASES = ["approach", "grasp", "lift", "place", "release"]
         ({"status": "infeasible"}, 1.0, "reach"),
         ({"status": "no_progress", "gripped": False, "contacts": {"plate": 0.0}}, 25.0, "perception"),
         ({"status": "no_progress", "gripped": True, "contacts": {"plate": 30.0}}, 15.0, "placing"),
+        ({"status": "no_progress", "gripped": False, "contacts": {"plate": 0.0}}, 15.0, "grasp"),
         ({"status": "no_progress", "gripped": False}, 15.0, "grasp"),
         ({"status": "running", "gripped": True}, None, "placing"),
         ({"status": "done", "gripped": None}, None, "placing"),

@@ -18,8 +18,9 @@ from lerobot_openspm.memory.entry import MemoryEntry, MemoryKeyPose, Outcome
 from lerobot_openspm.memory.exchange import write_entries_file
 from lerobot_openspm.memory.io import read_memory, write_memory
 from lerobot_openspm.perception.objects.base import KnownObject
-from lerobot_openspm.perception.objects.patches.match import REACH_M
+from lerobot_openspm.perception.objects.patches.match import REACH_M as PATCHES_REACH_M
 from lerobot_openspm.perception.objects.patches.model import PatchModel
+from lerobot_openspm.perception.objects.surface.backdrop import REACH_M
 from lerobot_openspm.perception.objects.surface.model import SurfaceModel
 
 
@@ -143,9 +144,9 @@ def _known_by(model: KnownObject) -> str:
     """By what an object is known, and so where it is found, as a line."""
     match model:
         case SurfaceModel():
-            where = "anywhere within 10 cm of where the hand went"
+            where = f"anywhere within {100 * REACH_M:.0f} cm of where the hand went"
         case PatchModel():
-            where = f"only within {100 * REACH_M:.1f} cm of where it stood in the demonstrations"
+            where = f"only within {100 * PATCHES_REACH_M:.1f} cm of where it stood in the demonstrations"
         case _:
             where = "anywhere at the height where it stood in the demonstrations"
     return f"{model.name!r} is known by its {model.kind}: found {where}"
