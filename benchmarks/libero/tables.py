@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections import Counter
 
 from benchmarks.figures import FIGURES
 from benchmarks.libero.failures import FAR_OFF_MM as FAR_OFF
@@ -135,7 +136,9 @@ def _looked_at(result: Quoted) -> str:
         [one["task"].replace("_", " "), ", ".join(map(str, one["states"])), one["kind"], one["seen"]]
         for one in looked["failed"]
     ]
-    return f"\n\nBy a look at a film of each:\n\n{table(heads, rows)}"
+    kinds = Counter(one["kind"] for one in looked["failed"] for _ in one["states"])
+    counted = ", ".join(f"{kind} {n}" for kind, n in kinds.most_common())
+    return f"\n\nBy a look at a film of each: {counted}.\n\n{table(heads, rows)}"
 
 
 def _main(result: Quoted) -> str:
