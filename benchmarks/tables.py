@@ -182,13 +182,15 @@ def _anywhere(result: Quoted) -> str:
         "Mean, mm": "position_mm_mean",
         "95th percentile, mm": "position_mm_p95",
         "Mean yaw, degrees": "yaw_deg_mean",
+        "Yaw off by more than 90": "turned_round",
     }
     rows = {"all that are known": looks["poses"], "those that the task needs": looks["poses_needed"]}
     false, sure, layouts = looks["false_finds"], looks["confident_and_right"], looks["layouts"]
     left_out = layouts["hidden"] + layouts["unsolved"]
     told = (
         f"First looks at {looks['looks']} of these scenes, against the simulator's poses; yaw of those "
-        f"objects that show one. With an object taken away, it was reported in {percent(false)} of "
+        f"objects that show one. Of two alike that the task does not need, the nearer one counts. With an "
+        f"object taken away, it was reported in {percent(false)} of "
         f"{false['n']} looks ({interval(false)}). Of {sure['n']} estimates with a confidence above 0.95, "
         f"{percent(sure)} ({interval(sure)}) are within 10 mm and 10 degrees. For these scenes "
         f"{layouts['drawn']} layouts were drawn, and {left_out} ({share(left_out / layouts['drawn'])}) not "

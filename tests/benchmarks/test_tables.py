@@ -174,7 +174,14 @@ def test_what_films_show_is_kept_of_every_failed_episode_of_a_committed_result_o
 
 
 def test_first_looks_anywhere_are_told_beside_success_and_so_is_which_layouts_are_left_out(results):
-    poses = {"poses": 70, "unknown": 2, "position_mm_mean": 2.5, "position_mm_p95": 6.0, "yaw_deg_mean": 1.5}
+    poses = {
+        "poses": 70,
+        "unknown": 2,
+        "position_mm_mean": 2.5,
+        "position_mm_p95": 6.0,
+        "yaw_deg_mean": 1.5,
+        "turned_round": 3,
+    }
     looks = {
         "looks": 7,
         "layouts": {"drawn": 10, "hidden": 1, "unsolved": 2},
@@ -186,7 +193,7 @@ def test_first_looks_anywhere_are_told_beside_success_and_so_is_which_layouts_ar
     run = {**RATE, "per_task": {"a": 0.5}}
     put(results, "anywhere", n=4, runs={"anywhere": run}, instructions={"a": "do a"}, first_looks=looks)
     text = tables.results_page()
-    assert "| all that are known | 70 | 2 | 2.5 | 6.0 | 1.5 |" in text
+    assert "| all that are known | 70 | 2 | 2.5 | 6.0 | 1.5 | 3 |" in text
     assert "| those that the task needs | 20 |" in text
     assert "it was reported in 50.0 % of 4 looks" in text
     assert "3 (30.0 %) not used: 1 do not show" in text

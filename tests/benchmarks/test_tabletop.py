@@ -7,12 +7,14 @@ from typing import Any
 
 import numpy as np
 import pytest
-from benchmarks.anywhere import _without, look, summarise
+from benchmarks.anywhere import _true, _without, look, summarise
 from benchmarks.results import PROVENANCE
 from benchmarks.tabletop import TabletopConfig, main
+from benchmarks.worlds import tabletop as tabletop_world
 
 from benchmarks import results, stages, tabletop
 from lerobot_openspm.cli.pipeline import THREADS, Episode
+from lerobot_openspm.envs.tabletop import scene
 
 EPISODES = [Episode("a", 1000, 100, True, "done"), Episode("b", 1000, 300, False, "no_progress")]
 
@@ -96,6 +98,15 @@ def test_a_first_look_anywhere_tells_of_all_that_stands_there_and_of_what_was_ta
     assert [name for name, _, _ in row["gone"]] == ["plate"]
 
 
+def test_of_two_alike_both_true_places_are_known():
+    with tabletop_world("turn_on_stove_anywhere", 410020) as world:
+        true, second = _true(world, {"bowl": np.eye(4), "plate": np.eye(4)})
+        there = world.env.simulator.data.body(scene.second("bowl")).xpos
+    np.testing.assert_allclose(second["bowl"][:3, 3], there, atol=1e-9)
+    assert np.linalg.norm(true["bowl"][:3, 3] - there) > 0.05
+    np.testing.assert_allclose(second["plate"], true["plate"])
+
+
 def test_first_looks_tell_errors_false_finds_and_whether_confidence_holds():
     row = {
         # Object, needed, its yaw shows, confidence, metres, radians.
@@ -103,6 +114,7 @@ def test_first_looks_tell_errors_false_finds_and_whether_confidence_holds():
             ["bowl", True, False, 0.99, 0.002, 1.0],
             ["stove", True, True, 0.99, 0.004, 0.5],
             ["rack", False, True, 0.90, None, None],
+            ["cabinet", False, True, 0.90, 0.003, 3.0],
         ],
         "gone": [["plate", False, 0.0], ["box", True, 0.97], ["cup", True, 0.80]],
         "drawn": 5,
@@ -112,7 +124,8 @@ def test_first_looks_tell_errors_false_finds_and_whether_confidence_holds():
     # Three do not show which one is meant; of the other two the expert solves the last one.
     assert told["layouts"] == {"drawn": 5, "hidden": 3, "unsolved": 1}
     assert told["poses"]["position_mm_mean"] == 3.0
-    assert told["poses"]["unknown"] == 1
+    assert (told["poses"]["unknown"], told["poses"]["turned_round"]) == (1, 1)
+    assert told["poses_needed"]["turned_round"] == 0
     assert told["poses_needed"]["yaw_deg_mean"] == round(float(np.rad2deg(0.5)), 2)
     assert (told["false_finds"]["success"], told["false_finds"]["n"]) == (2 / 3, 3)
     # The bowl is right; the stove is turned, and the box is not there.
