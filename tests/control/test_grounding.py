@@ -146,6 +146,27 @@ def test_words_that_can_be_decided_are_never_overruled():
     np.testing.assert_array_equal(look(grounding, seen(FAR, NEAR)).T_world_obj, NEAR)
 
 
+def test_the_center_of_the_table_is_where_demonstrations_of_those_words_show_it():
+    where = Reference("center", ("table",))
+    low, high = CONTEXT.robot.workspace
+    meant, in_the_middle = at(0.11, -0.11), at(*(low + high)[:2] / 2)
+    estimates = {"bowl": seen(in_the_middle, meant), "plate": seen(at(0.1, 0.1))}
+    for shown_before, expected in (({"bowl": BESIDE_PLATE}, meant), ({}, in_the_middle)):
+        grounding = Grounding({"bowl": where}, shown_before, frozenset(CONTEXT.surfaces))
+        found = grounding.sort_out(estimates, CONTEXT.surfaces)["bowl"]
+        np.testing.assert_array_equal(found.T_world_obj, expected)
+
+
+def test_where_demonstrations_do_not_tell_the_middle_of_the_table_is_a_guess():
+    low, high = CONTEXT.robot.workspace
+    middle, side = at(*(low + high)[:2] / 2 + 0.03), at(*high[:2])
+    where = {"bowl": Reference("center", ("table",))}
+    grounding = Grounding(where, {"bowl": BESIDE_PLATE}, frozenset(CONTEXT.surfaces))
+    # The plate is not found that they show it beside.
+    found = grounding.sort_out({"bowl": seen(side, middle)}, CONTEXT.surfaces)["bowl"]
+    np.testing.assert_array_equal(found.T_world_obj, middle)
+
+
 def test_without_what_they_show_it_beside_the_demonstrations_do_not_choose():
     grounding = Grounding({"bowl": NEXT_TO_RACK}, {"bowl": BESIDE_PLATE})
     assert grounding.sort_out({"bowl": seen(NEAR, FAR)}, {})["bowl"].status == "ambiguous"
@@ -203,6 +224,20 @@ def test_an_instruction_with_an_unknown_landmark_is_acted_by_on_the_one_that_was
     observe(one, HAND, perception)
     assert one.state.status is Status.RUNNING
     np.testing.assert_allclose(one.state.plan.object_poses["bowl"], meant)
+
+
+def test_an_episode_takes_what_was_shown_for_the_center_of_the_table():
+    where = Reference("center", ("table",))
+    known = {"bowl": at(0.0, -0.15), "plate": at(0.1, 0.1)}
+    made = dataclasses.replace(
+        spoken(where, known, instruction="put the bowl on the plate"),
+        language="put the bowl from the center of the table on the plate",
+    )
+    one = controller(made, instruction=made.language)
+    low, high = CONTEXT.robot.workspace
+    middle = at(*(low + high)[:2] / 2)
+    observe(one, HAND, TwoBowls({**known, "bowl": middle, "second bowl": known["bowl"]}))
+    np.testing.assert_array_equal(one.scene.detections.estimates["bowl"].T_world_obj, known["bowl"])
 
 
 # The only one of its kind.

@@ -13,10 +13,11 @@ from tests.perception.builders import model, patch_model
 
 from lerobot_openspm.geometry import se3
 from lerobot_openspm.language.instruction import parse_instruction
+from lerobot_openspm.mining import objects as mining_objects
 from lerobot_openspm.mining.key_poses import find_key_poses
 from lerobot_openspm.mining.mined import MinedEpisode
-from lerobot_openspm.mining.objects import contact_cues, place_touched
-from lerobot_openspm.types import ContactCue, PoseEstimate
+from lerobot_openspm.mining.objects import contact_cues, detect_touched, place_touched
+from lerobot_openspm.types import ContactCue, DemonstrationScene, PoseEstimate
 
 ANGLES = np.linspace(0, 2 * np.pi, 40, endpoint=False)
 RIM = np.column_stack([0.05 * np.cos(ANGLES), 0.05 * np.sin(ANGLES), np.full(40, 0.04)])
@@ -55,6 +56,27 @@ def test_only_the_first_touch_tells_where_it_stood_at_first():
 def test_other_objects_touches_tell_nothing():
     assert place_touched(BOWL, seen(NEAR, FAR), (touch(NEAR, name="plate"),)) is None
     assert_array_equal(place_touched(BOWL, seen(NEAR), ()), NEAR)
+
+
+@pytest.mark.parametrize(
+    ("first", "all_of_them", "kind", "expected"),
+    [
+        (seen(FAR), seen(FAR, NEAR), "grasp", (FAR, NEAR)),  # the hand went to another one
+        (seen(NEAR), seen(FAR, NEAR), "grasp", (NEAR,)),
+        (seen(FAR), seen(FAR), "grasp", (FAR,)),  # there is none where the hand went
+        (seen(FAR), seen(FAR, NEAR), "release", (FAR,)),  # something was put there
+    ],
+)
+def test_others_of_the_kind_are_sought_where_the_hand_went_elsewhere(
+    first, all_of_them, kind, expected, monkeypatch
+):
+    def detect(views, objects, segmenter=None, told_apart=()):
+        return {name: all_of_them if name in told_apart else first for name in objects}
+
+    monkeypatch.setattr(mining_objects, "detect", detect)
+    scene = DemonstrationScene({}, (touch(NEAR, kind=kind, by=(0.05, 0.0)),))
+    found = detect_touched(scene, {"bowl": BOWL})["bowl"]
+    assert_array_equal((found.T_world_obj, *found.others), expected)
 
 
 def test_one_that_is_seen_where_the_hand_never_went_is_another_one():

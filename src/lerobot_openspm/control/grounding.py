@@ -39,10 +39,12 @@ def demonstrations(
 ) -> dict[str, tuple[Mapping[str, Array], ...]]:
     """By the name of an object that is told by a landmark nobody knows: what shows which one is meant.
 
+    Nobody knows where the table ends and has its middle, either.
+
     Args:
         candidates: What the instruction, or a part of it, can be carried out by.
         object_meant: Tells the name under which a thing is known.
-        known: Names of all known objects and surfaces.
+        known: Names of all known objects.
 
     Returns:
         Per demonstration that said the same of the object, poses ``T_world_obj`` ``(4, 4)`` by name at its
@@ -65,7 +67,8 @@ class Grounding:
     Attributes:
         said: By name, where the instruction says that the object is.
         shown: By name, where demonstrations show what stood; for objects that their landmark cannot tell.
-        surfaces: Landmarks that are as wide as the scene: nothing is far from them.
+        surfaces: Landmarks that are as wide as the scene: nothing is far from them, and where they have
+            their middle is a guess.
         feet: By name, the middle ``(3,)`` of what an object stands on in its frame, metres; its frame's
             origin where it is not named.
         elsewhere: By name, where the only one that the last look brought should be, but plainly is not.
@@ -126,12 +129,7 @@ class Grounding:
             return self._unless_elsewhere(name, estimate, object_poses)
         candidates = (estimate.T_world_obj, *estimate.others)
         landmarks = {mark: T for mark, T in object_poses.items() if mark != name}
-        index = None
-        if name in self.said:
-            standing = [self._foot(name, T) for T in candidates]
-            index = choose(self.said[name], standing, self._feet_of(landmarks))
-        if index is None and name in self.shown:
-            index = choose_as_shown(name, candidates, landmarks, self.shown[name])
+        index = self._told_from(name, candidates, landmarks)
         if index is None:
             where = self.said.get(name, "nothing")
             logger.info("cannot tell which of %d objects like the %r is meant: %s is said of it",
@@ -139,6 +137,25 @@ class Grounding:
             return replace(estimate, status="ambiguous")
         self.not_meant[name] = candidates[:index] + candidates[index + 1 :]
         return replace(estimate, status="found", T_world_obj=candidates[index], others=())
+
+    def _told_from(
+        self, name: str, candidates: Sequence[Array], landmarks: Mapping[str, Array]
+    ) -> int | None:
+        """Which of several is meant: by the words, and where these do not tell by what was shown.
+
+        Of the table nobody knows the middle, so that what was shown comes first.
+        """
+        said, shown = self.said.get(name), self.shown.get(name)
+        if shown is not None and said is not None and set(said.landmarks) & self.surfaces:
+            index = choose_as_shown(name, candidates, landmarks, shown)
+            if index is not None:
+                return index
+        if said is not None:
+            standing = [self._foot(name, T) for T in candidates]
+            index = choose(said, standing, self._feet_of(landmarks))
+            if index is not None:
+                return index
+        return None if shown is None else choose_as_shown(name, candidates, landmarks, shown)
 
     def _unless_elsewhere(
         self, name: str, estimate: PoseEstimate, object_poses: Mapping[str, Array]

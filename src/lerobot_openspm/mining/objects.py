@@ -45,6 +45,8 @@ FILMED_PER_TASK, FILMED, FILM_STEP = 10, 30, 4
 FRAMES_BEFORE_CONTACT = 4
 # What the hand takes hold of or pushes has its surface within this distance of the hand, seen from above.
 TOUCH_M = 0.08
+# Where it is seen farther than this from the hand, the hand may have gone to another one of the kind, metres.
+ASTRAY_M = 0.03
 # Where one of these is said, the hand lets go above the landmark.
 UPON = ("on", "in", "at")
 # A pushed object's final pose counts from this confidence on.
@@ -154,11 +156,33 @@ def find_objects(
     for scene, item in tqdm(zip(scenes, mined, strict=True), "Finding objects", len(scenes), unit="episode"):
         wanted = dict.fromkeys(name for sub_task in item.sub_tasks for name in sub_task.objects)
         sought = {name: models[name] for name in wanted if name in models}
-        estimates = detect(scene.views, sought, segmenter)
+        estimates = detect_touched(scene, sought, segmenter)
         places = {name: place_touched(models[name], one, scene.cues) for name, one in estimates.items()}
         found.append({name: T for name, T in places.items() if T is not None})
     ends = _ends(scenes, mined, found, models, segmenter)
     return FoundObjects(models, found, ends, unlearned)
+
+
+def detect_touched(
+    scene: DemonstrationScene, objects: Mapping[str, KnownObject], segmenter: Segmenter | None = None
+) -> dict[str, PoseEstimate]:
+    """Find objects in a first frame; where the hand went elsewhere, the one of the kind that stands there.
+
+    Args:
+        scene: A demonstration, and where it touched what.
+        objects: The objects by name.
+        segmenter: As for :func:`find_objects`.
+    """
+    taken = {cue.name: cue for cue in reversed(scene.cues) if cue.kind != "release"}
+
+    def is_astray(name: str, one: PoseEstimate) -> bool:
+        return min(_gaps_m(objects[name], _places(one), taken[name])) > ASTRAY_M
+
+    estimates = detect(scene.views, objects, segmenter)
+    sought = {name: one for name, one in estimates.items() if name in taken and len(objects[name].points)}
+    astray = [name for name, one in sought.items() if is_astray(name, one)]
+    again = detect(scene.views, objects, segmenter, astray) if astray else {}
+    return {**estimates, **{name: again[name] for name in astray if not is_astray(name, again[name])}}
 
 
 def _ends(
@@ -225,12 +249,22 @@ def place_touched(model: KnownObject, estimate: PoseEstimate, touched: Sequence[
         return None
     if cue is None:
         return estimate.T_world_obj
-    places = (estimate.T_world_obj, *estimate.others)
-    points = np.asarray(model.points, float) if len(model.points) else np.zeros((1, 3))
-    gaps = [np.linalg.norm(se3.apply(T, points)[:, :2] - cue.point_world[:2], axis=1).min() for T in places]
+    places = _places(estimate)
+    gaps = _gaps_m(model, places, cue)
     nearest = int(np.argmin(gaps))
     is_elsewhere = cue.kind != "release" and len(model.points) > 0 and gaps[nearest] > TOUCH_M
     return None if is_elsewhere else places[nearest]
+
+
+def _places(estimate: PoseEstimate) -> tuple[Array, ...]:
+    return estimate.T_world_obj, *estimate.others
+
+
+def _gaps_m(model: KnownObject, places: Sequence[Array], cue: ContactCue) -> list[float]:
+    """How far an object's surface is at each place from where the hand was, seen from above."""
+    points = np.asarray(model.points, float) if len(model.points) else np.zeros((1, 3))
+    away = [se3.apply(T, points)[:, :2] - cue.point_world[:2] for T in places]
+    return [float(np.linalg.norm(one, axis=1).min()) for one in away]
 
 
 def simulator_poses(

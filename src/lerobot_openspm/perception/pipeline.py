@@ -277,7 +277,10 @@ def _of_the_hand(look: Look) -> dict[str, View]:
 
 
 def detect(
-    views: Mapping[str, View], objects: Mapping[str, KnownObject], segmenter: Segmenter | None = None
+    views: Mapping[str, View],
+    objects: Mapping[str, KnownObject],
+    segmenter: Segmenter | None = None,
+    told_apart: Collection[str] = (),
 ) -> dict[str, PoseEstimate]:
     """Find objects in the views of one moment, nothing being known of where they may be.
 
@@ -285,12 +288,13 @@ def detect(
         views: Views by camera name.
         objects: The objects by phrase.
         segmenter: Finds the masks of objects that were learned from a segmenter's; None if none were.
+        told_apart: Those of the objects of which several may be there, and all are sought.
 
     Raises:
         ObservationError: There is no view, or one is malformed.
         PerceptionError: An object needs a segmenter and there is none, or the segmenter cannot be used.
     """
-    look = look_at(views, list(objects), segmenter, {}, {})
+    look = look_at(views, list(objects), segmenter, {}, {}, told_apart)
     return localise_all(objects, look)
 
 

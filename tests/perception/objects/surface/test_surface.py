@@ -26,7 +26,7 @@ from lerobot_openspm.perception.objects.surface import model as model_module
 from lerobot_openspm.perception.objects.surface.compare import correlation
 from lerobot_openspm.perception.objects.surface.learn import _first_poses
 from lerobot_openspm.perception.objects.surface.model import SurfaceModel
-from lerobot_openspm.perception.objects.surface.search import Place, _areas, _ranked
+from lerobot_openspm.perception.objects.surface.search import Place, _areas, _ranked, distinct
 from lerobot_openspm.perception.objects.surface.sight import Surface
 from lerobot_openspm.types import DemonstrationScene, Moment, PoseEstimate
 
@@ -130,6 +130,21 @@ def test_of_what_words_tell_apart_every_one_is_found(models):
     assert len(places) == 2
     for place, T in zip(places, (other, usual), strict=True):
         assert place == pytest.approx(T[:2, 3] + away, abs=0.008)
+
+
+def test_a_place_is_told_once_however_often_it_was_found(models):
+    surface = models["cup"].surface
+    poses = [np.array([x, 0.1, 0.0, 0.0]) for x in (0.0, 0.01, 0.12, 0.13)]
+    places = [Place(pose, score) for pose, score in zip(poses, (0.9, 0.8, 0.7, 0.6), strict=True)]
+    assert [place.score for place in distinct(surface, places, 0.035)] == [0.9, 0.7]
+
+
+def test_of_those_that_words_tell_apart_one_counts_that_would_be_found_alone(models):
+    cup, pose = models["cup"], np.array([0.0, 0.1, models["cup"].height, 0.0])
+    best, alone = Place(pose, 1.3 * cup.typical_agreement), max(0.85, cup.found_share) * cup.typical_agreement
+    for told_apart in (False, True):
+        assert cup._is_another(Place(pose, alone + 0.01), best, told_apart) == told_apart
+        assert not cup._is_another(Place(pose, alone - 0.01), best, told_apart)
 
 
 def test_two_of_a_kind_where_neither_was_shown_are_both_found_without_words(models):

@@ -24,8 +24,8 @@ from lerobot_openspm.perception.objects.surface.search import (
     Freedom,
     Place,
     covariance_at,
+    distinct,
     likelihood,
-    middles_apart,
     over_supports,
     over_table,
     refine,
@@ -139,7 +139,7 @@ class SurfaceModel:
             return near
         sights = self._sights(look)
         if self.name in look.told_apart and expected is None:
-            found = self._estimate(look, sights, self._all_places(look, sights))
+            found = self._estimate(look, sights, self._all_places(look, sights), told_apart=True)
             return self._unless_tipped(look, sights, found)
         is_seen = near.status == "found"
         near_score = score_at(self.surface, sights, _pose(near.T_world_obj)) if is_seen else 0.0
@@ -292,11 +292,13 @@ class SurfaceModel:
         quick = refine(self.surface, sights, pose, free, QUICK_POINTS, QUICK_STEPS)
         return refine(self.surface, sights, quick.pose, free, FINE_POINTS, FINE_STEPS)
 
-    def _estimate(self, look: Look, sights: Mapping[str, Sight], places: list[Place]) -> PoseEstimate:
+    def _estimate(
+        self, look: Look, sights: Mapping[str, Sight], places: list[Place], told_apart: bool = False
+    ) -> PoseEstimate:
         best = places[0]
         share = best.score / self.typical_agreement
         apart = max(SAME_PLACE_M, OVERLAP_SHARE * self.surface.radius)
-        rivals = [one for one in places[1:] if middles_apart(self.surface, one, best) > apart]
+        _, *rivals = distinct(self.surface, places, apart)
         most = RIVAL_SHARE * likelihood(self.surface, best)
         is_rivalled = any(likelihood(self.surface, one) > most for one in rivals)
         status = "not_found" if share < self._needed(best) else "ambiguous" if is_rivalled else "found"
@@ -306,10 +308,19 @@ class SurfaceModel:
         others = tuple(
             se3.from_yaw(one.pose[:3], float(one.pose[3]))
             for one in rivals
-            if one.score >= ANOTHER_SHARE * max(self.typical_agreement, best.score)
+            if self._is_another(one, best, told_apart)
         )
         sure = WITHOUT_PATTERN + (1 - WITHOUT_PATTERN) * self.surface.pattern
         return PoseEstimate(status, T, covariance, sure * float(np.clip(share, 0, 1)), visible, None, others)
+
+    def _is_another(self, place: Place, best: Place, told_apart: bool) -> bool:
+        """Whether another one of the kind stands at a place: it is nearly as well seen as the best one.
+
+        Where words tell them apart it is enough that it would be found if it were alone.
+        """
+        alone = max(ANOTHER_SHARE, self._needed(place)) * self.typical_agreement
+        enough = ANOTHER_SHARE * max(self.typical_agreement, best.score)
+        return place.score >= (min(alone, enough) if told_apart else enough)
 
     def to_record(self) -> Record:
         """See :class:`lerobot_openspm.perception.objects.base.KnownObject`."""

@@ -130,6 +130,15 @@ def middles_apart(surface: Surface, place: Place, other: Place) -> float:
     return float(np.linalg.norm(surface.middle_at(place.pose) - surface.middle_at(other.pose)))
 
 
+def distinct(surface: Surface, places: Sequence[Place], metres: float) -> list[Place]:
+    """Those places whose middle is apart from that of all better ones by so much; the best come first."""
+    chosen = list[Place]()
+    for place in places:
+        if all(middles_apart(surface, place, one) > metres for one in chosen):
+            chosen.append(place)
+    return chosen
+
+
 def _ranked(surface: Surface, places: Sequence[Place]) -> list[Place]:
     """Places, the most likely first."""
     return sorted(places, key=lambda place: -likelihood(surface, place))
