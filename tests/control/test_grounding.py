@@ -146,25 +146,25 @@ def test_words_that_can_be_decided_are_never_overruled():
     np.testing.assert_array_equal(look(grounding, seen(FAR, NEAR)).T_world_obj, NEAR)
 
 
-def test_the_center_of_the_table_is_where_demonstrations_of_those_words_show_it():
+@pytest.mark.parametrize("plate", [(0.1, 0.1), (0.1, 0.25), None])
+def test_the_center_of_the_table_is_where_demonstrations_of_those_words_show_it(plate):
     where = Reference("center", ("table",))
     low, high = CONTEXT.robot.workspace
-    meant, in_the_middle = at(0.11, -0.11), at(*(low + high)[:2] / 2)
-    estimates = {"bowl": seen(in_the_middle, meant), "plate": seen(at(0.1, 0.1))}
+    meant, in_the_middle = at(0.13, -0.13), at(*(low + high)[:2] / 2)
+    estimates = {"bowl": seen(in_the_middle, meant)} | ({"plate": seen(at(*plate))} if plate else {})
+    # Wherever the plate is now that they show beside it.
     for shown_before, expected in (({"bowl": BESIDE_PLATE}, meant), ({}, in_the_middle)):
         grounding = Grounding({"bowl": where}, shown_before, frozenset(CONTEXT.surfaces))
         found = grounding.sort_out(estimates, CONTEXT.surfaces)["bowl"]
         np.testing.assert_array_equal(found.T_world_obj, expected)
 
 
-def test_where_demonstrations_do_not_tell_the_middle_of_the_table_is_a_guess():
-    low, high = CONTEXT.robot.workspace
-    middle, side = at(*(low + high)[:2] / 2 + 0.03), at(*high[:2])
-    where = {"bowl": Reference("center", ("table",))}
-    grounding = Grounding(where, {"bowl": BESIDE_PLATE}, frozenset(CONTEXT.surfaces))
-    # The plate is not found that they show it beside.
-    found = grounding.sort_out({"bowl": seen(side, middle)}, CONTEXT.surfaces)["bowl"]
-    np.testing.assert_array_equal(found.T_world_obj, middle)
+def test_only_the_center_of_a_surface_is_told_by_where_it_was_shown():
+    meant, other = at(0.0, 0.02), at(0.11, -0.11)  # nearest to the plate, and where it was shown
+    for said in (Reference("on", ("plate",)), Reference("center", ("plate",))):
+        grounding = Grounding({"bowl": said}, {"bowl": BESIDE_PLATE}, frozenset(CONTEXT.surfaces))
+        found = look_beside_plate(grounding, seen(other, meant), (0.0, 0.0))
+        np.testing.assert_array_equal(found.T_world_obj, meant)
 
 
 def test_without_what_they_show_it_beside_the_demonstrations_do_not_choose():

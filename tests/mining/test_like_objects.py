@@ -23,6 +23,7 @@ ANGLES = np.linspace(0, 2 * np.pi, 40, endpoint=False)
 RIM = np.column_stack([0.05 * np.cos(ANGLES), 0.05 * np.sin(ANGLES), np.full(40, 0.04)])
 BOWL = replace(model("bowl"), points=RIM.astype(np.float32))
 NEAR, FAR = se3.from_yaw([0.1, -0.2, 0.0], 0.3), se3.from_yaw([0.1, 0.1, 0.0], 0.0)
+ELSEWHERE = se3.from_yaw([0.4, 0.4, 0.0], 0.0)
 
 
 def seen(*places, status=None):
@@ -63,7 +64,10 @@ def test_other_objects_touches_tell_nothing():
     [
         (seen(FAR), seen(FAR, NEAR), "grasp", (FAR, NEAR)),  # the hand went to another one
         (seen(NEAR), seen(FAR, NEAR), "grasp", (NEAR,)),
-        (seen(FAR), seen(FAR), "grasp", (FAR,)),  # there is none where the hand went
+        (seen(FAR), seen(ELSEWHERE, FAR), "grasp", (FAR,)),  # there is none where the hand went
+        (seen(FAR), seen(NEAR, status="not_found"), "grasp", (FAR,)),
+        (seen(FAR, status="not_found"), seen(NEAR), "grasp", (NEAR,)),
+        (seen(FAR), seen(FAR, NEAR), "contact", (FAR,)),  # it was pushed from beside it
         (seen(FAR), seen(FAR, NEAR), "release", (FAR,)),  # something was put there
     ],
 )

@@ -39,12 +39,12 @@ def demonstrations(
 ) -> dict[str, tuple[Mapping[str, Array], ...]]:
     """By the name of an object that is told by a landmark nobody knows: what shows which one is meant.
 
-    Nobody knows where the table ends and has its middle, either.
+    Nobody knows where the table has its center, either.
 
     Args:
         candidates: What the instruction, or a part of it, can be carried out by.
         object_meant: Tells the name under which a thing is known.
-        known: Names of all known objects.
+        known: Names of all known objects but surfaces.
 
     Returns:
         Per demonstration that said the same of the object, poses ``T_world_obj`` ``(4, 4)`` by name at its
@@ -67,8 +67,8 @@ class Grounding:
     Attributes:
         said: By name, where the instruction says that the object is.
         shown: By name, where demonstrations show what stood; for objects that their landmark cannot tell.
-        surfaces: Landmarks that are as wide as the scene: nothing is far from them, and where they have
-            their middle is a guess.
+        surfaces: Landmarks that are as wide as the scene: nothing is far from them, and their center is
+            where it was shown, else a guess.
         feet: By name, the middle ``(3,)`` of what an object stands on in its frame, metres; its frame's
             origin where it is not named.
         elsewhere: By name, where the only one that the last look brought should be, but plainly is not.
@@ -141,21 +141,23 @@ class Grounding:
     def _told_from(
         self, name: str, candidates: Sequence[Array], landmarks: Mapping[str, Array]
     ) -> int | None:
-        """Which of several is meant: by the words, and where these do not tell by what was shown.
-
-        Of the table nobody knows the middle, so that what was shown comes first.
-        """
-        said, shown = self.said.get(name), self.shown.get(name)
-        if shown is not None and said is not None and set(said.landmarks) & self.surfaces:
-            index = choose_as_shown(name, candidates, landmarks, shown)
-            if index is not None:
-                return index
-        if said is not None:
+        """Which of several is meant: by the words, and where these do not tell by what was shown."""
+        index = None
+        if (said := self.said.get(name)) is not None:
             standing = [self._foot(name, T) for T in candidates]
-            index = choose(said, standing, self._feet_of(landmarks))
-            if index is not None:
-                return index
-        return None if shown is None else choose_as_shown(name, candidates, landmarks, shown)
+            marks = {**self._feet_of(landmarks), **self._shown_center(name, said)}
+            index = choose(said, standing, marks)
+        if index is None and name in self.shown:
+            index = choose_as_shown(name, candidates, landmarks, self.shown[name])
+        return index
+
+    def _shown_center(self, name: str, said: Reference) -> dict[str, Array]:
+        """Where the center of the table is by demonstrations that say of an object that it stood there."""
+        own = [self._foot(name, one[name]) for one in self.shown.get(name, ()) if name in one]
+        if not own or said.relation != "center" or not set(said.landmarks) <= self.surfaces:
+            return {}
+        middle = np.median(np.stack(own)[:, :3, 3], axis=0)
+        return dict.fromkeys(said.landmarks, se3.transform(np.eye(3), middle))
 
     def _unless_elsewhere(
         self, name: str, estimate: PoseEstimate, object_poses: Mapping[str, Array]

@@ -83,7 +83,8 @@ class SceneState:
         """Take in which of several like objects a part of the instruction is about."""
         meant = self._context.object_meant
         said = {k: where for one in candidates for k, where in references(one, meant).items()}
-        others = self.grounding.hear(said, demonstrations(candidates, meant, self._context.yaw_periods))
+        known = set(self._context.yaw_periods) - set(self._context.surfaces)
+        others = self.grounding.hear(said, demonstrations(candidates, meant, known))
         self.tracker.forget(others)
         self.altered -= others
 

@@ -45,7 +45,7 @@ FILMED_PER_TASK, FILMED, FILM_STEP = 10, 30, 4
 FRAMES_BEFORE_CONTACT = 4
 # What the hand takes hold of or pushes has its surface within this distance of the hand, seen from above.
 TOUCH_M = 0.08
-# Where it is seen farther than this from the hand, the hand may have gone to another one of the kind, metres.
+# Where it is seen farther than this from the hand, that may have grasped another one of the kind, metres.
 ASTRAY_M = 0.03
 # Where one of these is said, the hand lets go above the landmark.
 UPON = ("on", "in", "at")
@@ -166,23 +166,25 @@ def find_objects(
 def detect_touched(
     scene: DemonstrationScene, objects: Mapping[str, KnownObject], segmenter: Segmenter | None = None
 ) -> dict[str, PoseEstimate]:
-    """Find objects in a first frame; where the hand went elsewhere, the one of the kind that stands there.
+    """Find objects in a first frame; where the hand grasped elsewhere, the one of the kind that stands there.
 
     Args:
         scene: A demonstration, and where it touched what.
-        objects: The objects by name.
+        objects: The objects by name. Of those known by their surface all of a kind can be sought.
         segmenter: As for :func:`find_objects`.
     """
-    taken = {cue.name: cue for cue in reversed(scene.cues) if cue.kind != "release"}
+    first = {cue.name: cue for cue in reversed(scene.cues)}
+    grasped = {name: cue for name, cue in first.items() if cue.kind == "grasp"}
 
-    def is_astray(name: str, one: PoseEstimate) -> bool:
-        return min(_gaps_m(objects[name], _places(one), taken[name])) > ASTRAY_M
+    def is_there(name: str, one: PoseEstimate) -> bool:
+        return min(_gaps_m(objects[name], _places(one), grasped[name])) <= ASTRAY_M
 
     estimates = detect(scene.views, objects, segmenter)
-    sought = {name: one for name, one in estimates.items() if name in taken and len(objects[name].points)}
-    astray = [name for name, one in sought.items() if is_astray(name, one)]
+    told = {name: one for name, one in estimates.items() if name in grasped and len(objects[name].points)}
+    astray = [name for name, one in told.items() if not is_there(name, one)]
     again = detect(scene.views, objects, segmenter, astray) if astray else {}
-    return {**estimates, **{name: again[name] for name in astray if not is_astray(name, again[name])}}
+    better = {name: again[name] for name in astray if again[name].status != "not_found"}
+    return {**estimates, **{name: one for name, one in better.items() if is_there(name, one)}}
 
 
 def _ends(

@@ -26,6 +26,7 @@ from lerobot_openspm.perception.objects.surface.search import (
     covariance_at,
     distinct,
     likelihood,
+    middles_apart,
     over_supports,
     over_table,
     refine,
@@ -298,17 +299,16 @@ class SurfaceModel:
         best = places[0]
         share = best.score / self.typical_agreement
         apart = max(SAME_PLACE_M, OVERLAP_SHARE * self.surface.radius)
-        _, *rivals = distinct(self.surface, places, apart)
+        rivals = [one for one in places[1:] if middles_apart(self.surface, one, best) > apart]
         most = RIVAL_SHARE * likelihood(self.surface, best)
         is_rivalled = any(likelihood(self.surface, one) > most for one in rivals)
         status = "not_found" if share < self._needed(best) else "ambiguous" if is_rivalled else "found"
         T = se3.from_yaw(best.pose[:3], float(best.pose[3]))
         covariance = covariance_at(self.surface, sights, best.pose, not self.surface.is_round)
         visible = look.seen_share(se3.apply(T, self.surface.coloured))
+        more = [one for one in rivals if self._is_another(one, best, told_apart)]
         others = tuple(
-            se3.from_yaw(one.pose[:3], float(one.pose[3]))
-            for one in rivals
-            if self._is_another(one, best, told_apart)
+            se3.from_yaw(one.pose[:3], float(one.pose[3])) for one in distinct(self.surface, more, apart)
         )
         sure = WITHOUT_PATTERN + (1 - WITHOUT_PATTERN) * self.surface.pattern
         return PoseEstimate(status, T, covariance, sure * float(np.clip(share, 0, 1)), visible, None, others)
@@ -316,11 +316,11 @@ class SurfaceModel:
     def _is_another(self, place: Place, best: Place, told_apart: bool) -> bool:
         """Whether another one of the kind stands at a place: it is nearly as well seen as the best one.
 
-        Where words tell them apart it is enough that it would be found if it were alone.
+        Where words tell them apart, one that is seen better than usual does not ask more of the others.
         """
-        alone = max(ANOTHER_SHARE, self._needed(place)) * self.typical_agreement
+        usual = max(ANOTHER_SHARE, self._needed(place)) * self.typical_agreement
         enough = ANOTHER_SHARE * max(self.typical_agreement, best.score)
-        return place.score >= (min(alone, enough) if told_apart else enough)
+        return place.score >= (min(usual, enough) if told_apart else enough)
 
     def to_record(self) -> Record:
         """See :class:`lerobot_openspm.perception.objects.base.KnownObject`."""
