@@ -61,7 +61,7 @@ def look(checkpoint: Path, root: Path, task: str, seed: int) -> Row:
         tabletop(task, seed) as world,
     ):
         observation = observe(policy, world)
-        true, second = _true(world, T_sim_obj)
+        right = right_places(world, T_sim_obj)
         with torch.inference_mode():
             policy.act([observation])
         controller = policy.episodes[0].controller
@@ -69,12 +69,10 @@ def look(checkpoint: Path, root: Path, task: str, seed: int) -> Row:
         needed = controller.state.ranked[0].entry.objects if controller.state.ranked else ()
         found = []
         for name, estimate in controller.scene.detections.estimates.items():
-            if name in true:
+            if name in right:
                 errors, period = (None, None), true_period(name, ENV)
-                # Where the words do not say which of two is meant, either is right.
-                either = [true[name]] if name in needed else [true[name], second[name]]
                 if name in poses:
-                    errors = min(pose_error(T, poses[name], period) for T in either)
+                    errors = min(pose_error(T, poses[name], period) for T in right[name])
                 turns = period > 0
                 found.append((name, name in needed, turns, estimate.confidence, *errors))
         gone = []
@@ -94,15 +92,22 @@ def observe(policy: OpenSPMPolicy, world: TabletopWorld) -> Observation:
     return Observation(world.instruction, vector, hand, images, None)
 
 
-def _true(world: TabletopWorld, T_sim_obj: Mapping[str, Array]) -> tuple[dict[str, Array], dict[str, Array]]:
-    """True poses of all that the policy knows, and the same of the second ones where there are two."""
+def right_places(world: TabletopWorld, T_sim_obj: Mapping[str, Array]) -> dict[str, list[Array]]:
+    """True poses ``T_world_obj`` ``(4, 4)`` by the policy's names; two of what the task does not name of two.
+
+    Where the instruction names an object, its words say which of two is meant.
+    """
     simulator, poses = world.env.simulator, world.object_poses()
-    truth, both = Truth(poses, T_sim_obj), dict(poses)
+    truth, second = Truth(poses, T_sim_obj), dict(poses)
     for name in scene.MOVABLE_NAMES:
         if scene.second(name) in simulator.movable:
             body = simulator.data.body(scene.second(name))
-            both[name] = se3.transform(body.xmat.reshape(3, 3), body.xpos)
-    return truth.now(poses), truth.now(both)
+            second[name] = se3.transform(body.xmat.reshape(3, 3), body.xpos)
+    first, other = truth.now(poses), truth.now(second)
+    return {
+        name: [T] if name in world.instruction or np.array_equal(T, other[name]) else [T, other[name]]
+        for name, T in first.items()
+    }
 
 
 def _taken_away(world: TabletopWorld, names: Sequence[str]) -> list[tuple[str, str]]:

@@ -189,7 +189,7 @@ def _anywhere(result: Quoted) -> str:
     left_out = layouts["hidden"] + layouts["unsolved"]
     told = (
         f"First looks at {looks['looks']} of these scenes, against the simulator's poses; yaw of those "
-        f"objects that show one. Of two alike that the task does not need, the nearer one counts. With an "
+        f"objects that show one. Of two alike that the task does not name, the nearer one counts. With an "
         f"object taken away, it was reported in {percent(false)} of "
         f"{false['n']} looks ({interval(false)}). Of {sure['n']} estimates with a confidence above 0.95, "
         f"{percent(sure)} ({interval(sure)}) are within 10 mm and 10 degrees. For these scenes "

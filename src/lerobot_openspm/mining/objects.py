@@ -45,7 +45,7 @@ FILMED_PER_TASK, FILMED, FILM_STEP = 10, 30, 4
 FRAMES_BEFORE_CONTACT = 4
 # What the hand takes hold of or pushes has its surface within this distance of the hand, seen from above.
 TOUCH_M = 0.08
-# Where it is seen farther than this from the hand, that may have grasped another one of the kind, metres.
+# What is seen farther than this from where the hand grasped may be another one of the kind, metres.
 ASTRAY_M = 0.03
 # Where one of these is said, the hand lets go above the landmark.
 UPON = ("on", "in", "at")
