@@ -263,7 +263,32 @@ def test_an_episode_takes_what_was_shown_for_the_center_of_the_table():
 def test_the_only_one_is_meant_unless_it_plainly_is_elsewhere(where, place, status):
     grounding = Grounding({"bowl": where})
     assert look(grounding, seen(at(*place))).status == status
-    assert grounding.elsewhere == ({"bowl": where} if status == "not_found" else {})
+    told = {} if status == "found" else {"bowl": f"is not {where.relation} the {where.landmarks[0]}"}
+    assert grounding.elsewhere == told
+
+
+@pytest.mark.parametrize(("away_m", "status"), [(0.0, "found"), (0.12, "found"), (0.2, "not_found")])
+def test_the_only_one_is_meant_unless_it_is_far_from_where_demonstrations_show_the_one_that_is_meant(
+    away_m, status
+):
+    where, plate = Reference("next to", ("ramekin",)), at(0.2, 0.1)  # nobody knows the ramekin
+    grounding = Grounding({"bowl": where}, {"bowl": BESIDE_PLATE})
+    there = at(0.2 - away_m, -0.1)
+    assert grounding.sort_out({"bowl": seen(there)}, {"plate": plate})["bowl"].status == status
+    words = "is far from where the bowl next to the ramekin was shown"
+    assert grounding.elsewhere == ({} if status == "found" else {"bowl": words})
+    assert grounding.sort_out({"bowl": seen(there)}, {})["bowl"].status == "found"  # nothing to tell it by
+
+
+@pytest.mark.parametrize("is_meant_lying", [True, False])
+def test_words_tell_whether_the_one_that_stands_or_the_one_that_lies_is_meant(is_meant_lying):
+    standing, lying = (FAR, NEAR) if is_meant_lying else (NEAR, FAR)
+    bowl = dataclasses.replace(seen(standing), lying=(lying,))
+    grounding = Grounding({"bowl": NEXT_TO_RACK})
+    meant = look(grounding, bowl)
+    assert (meant.status, meant.tipped) == (("not_found", True) if is_meant_lying else ("found", False))
+    again = look(grounding, seen(standing))
+    assert again.status == ("not_found" if is_meant_lying else "found")
 
 
 def test_the_only_one_between_two_is_not_far_behind_both():

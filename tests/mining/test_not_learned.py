@@ -42,6 +42,22 @@ def test_a_grasp_of_what_was_rarely_found_is_kept_where_it_was_found():
     assert anchors[GRASP] == Anchor("bowl", "bowl")
 
 
+@pytest.mark.parametrize("n_found", [5, 6, 7, 8, 9])
+@pytest.mark.parametrize("moves_m", [0.005, 0.01, 0.02, 0.2])
+def test_a_grasp_belongs_to_what_was_found_in_most_demonstrations_however_little_things_move(
+    n_found: int, moves_m: float
+):
+    for seed in range(5):
+        rng = np.random.default_rng(seed)
+        made: list[Demonstration] = []
+        for _ in range(10):
+            bowl, plate = (se3.from_yaw([x, *(moves_m * rng.uniform(-1, 1, 1)), 0.0], 0.0) for x in (0.0, 0.2))
+            grasp = key_pose("grasp", bowl @ hand_pose(*rng.normal(0, 0.001, 2), 0.02))
+            made.append(Demonstration((grasp,), {"bowl": bowl, "plate": plate}))
+        anchors = consensus(without("bowl", made, n_found), SUB_TASKS)
+        assert anchors[GRASP].place == "bowl"
+
+
 def beside_the_plate(n: int, moves_m: float) -> list[Demonstration]:
     """The hand grasps at a fixed pose from a plate that stands somewhere else in every demonstration."""
     rng = np.random.default_rng(0)
@@ -70,6 +86,16 @@ def test_it_is_said_what_a_contact_is_kept_relative_to_instead(n: int, words: st
     (bowl, *_) = list_not_learned(mined)
     assert (bowl.name, bowl.demonstrations) == ("bowl", n)
     assert bowl.reason == "it is grey" + (f"; what the hand does there is {words}" if words else "")
+
+
+def test_it_is_said_of_what_the_hand_never_touched_too():
+    made = beside_the_plate(6, 0.2)
+    episode = SimpleNamespace(sub_tasks=SUB_TASKS, episode=SimpleNamespace(task="put the bowl on the plate"))
+    task = MinedTask((episode,), tuple(made), consensus(made, SUB_TASKS), (), (), ())
+    mined = SimpleNamespace(tasks=[task], object_poses=[one.object_poses for one in made], surfaces=(),
+                            unlearned={}, objects={}, simulator_objects=())  # fmt: skip
+    (bowl,) = list_not_learned(mined)
+    assert bowl.reason.startswith("the hand touches it in no demonstration; what the hand does there is kept")
 
 
 def test_what_is_put_on_the_table_is_put_relative_to_what_is_known():

@@ -8,9 +8,15 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from lerobot_openspm.control.spatial_relations import choose, choose_as_shown, contradicts
+from lerobot_openspm.control.spatial_relations import (
+    choose,
+    choose_as_shown,
+    contradicts,
+    is_far_from_shown,
+)
 from lerobot_openspm.geometry import se3
 from lerobot_openspm.geometry.se3 import Array
+from lerobot_openspm.language.descriptions import noun_phrase
 from lerobot_openspm.memory.compose import Candidate
 from lerobot_openspm.types import PoseEstimate, Reference
 
@@ -71,7 +77,7 @@ class Grounding:
             where it was shown, else a guess.
         feet: By name, the middle ``(3,)`` of what an object stands on in its frame, metres; its frame's
             origin where it is not named.
-        elsewhere: By name, where the only one that the last look brought should be, but plainly is not.
+        elsewhere: By name, in words, how the only one that the last look brought is not where it should be.
         not_meant: By name, poses ``T_world_obj`` ``(4, 4)`` of the others of its kind.
     """
 
@@ -81,7 +87,7 @@ class Grounding:
     )
     surfaces: frozenset[str] = frozenset()
     feet: Mapping[str, Array] = field(default_factory=dict[str, Array])
-    elsewhere: dict[str, Reference] = field(default_factory=dict[str, Reference])
+    elsewhere: dict[str, str] = field(default_factory=dict[str, str])
     not_meant: dict[str, tuple[Array, ...]] = field(default_factory=dict[str, tuple[Array, ...]])
     _told: set[str] = field(default_factory=set[str])
 
@@ -115,7 +121,7 @@ class Grounding:
 
         An object is told from its like once, when several are first seen; from then on those that are not
         meant are known by their places. One that cannot be told is ambiguous. The only one of its kind is
-        the one that is meant, unless it plainly is not where that is said to be.
+        the one that is meant, unless it plainly is not where that is said or was shown to be.
         """
         self.elsewhere = {}
         places = {name: one.T_world_obj for name, one in estimates.items() if one.status == "found"}
@@ -125,9 +131,10 @@ class Grounding:
     def _meant(self, name: str, estimate: PoseEstimate, object_poses: Mapping[str, Array]) -> PoseEstimate:
         if name in self.not_meant:
             return self._unless_another(name, estimate)
-        if estimate.status == "not_found" or not estimate.others:
+        standing = (estimate.T_world_obj, *estimate.others)
+        candidates = (*standing, *estimate.lying)
+        if estimate.status == "not_found" or len(candidates) == 1:
             return self._unless_elsewhere(name, estimate, object_poses)
-        candidates = (estimate.T_world_obj, *estimate.others)
         landmarks = {mark: T for mark, T in object_poses.items() if mark != name}
         index = self._told_from(name, candidates, landmarks)
         if index is None:
@@ -136,7 +143,9 @@ class Grounding:
                         len(candidates), name, where)  # fmt: skip
             return replace(estimate, status="ambiguous")
         self.not_meant[name] = candidates[:index] + candidates[index + 1 :]
-        return replace(estimate, status="found", T_world_obj=candidates[index], others=())
+        status = "found" if index < len(standing) else "not_found"
+        lying = () if status == "found" else (candidates[index],)
+        return replace(estimate, status=status, T_world_obj=candidates[index], others=(), lying=lying)
 
     def _told_from(
         self, name: str, candidates: Sequence[Array], landmarks: Mapping[str, Array]
@@ -165,12 +174,16 @@ class Grounding:
         """The estimate of the only one, unless it is of another than is said, when it is first seen."""
         if estimate.status != "found" or name not in self.said or name in self._told:
             return estimate
+        said, T = self.said[name], estimate.T_world_obj
         landmarks = {k: T for k, T in object_poses.items() if k != name and k not in self.surfaces}
-        if contradicts(self.said[name], self._foot(name, estimate.T_world_obj), self._feet_of(landmarks)):
-            self.elsewhere[name] = self.said[name]
-            return replace(estimate, status="not_found")
-        self._told.add(name)
-        return estimate
+        if contradicts(said, self._foot(name, T), self._feet_of(landmarks)):
+            self.elsewhere[name] = f"is not {said.relation} the {' and the '.join(said.landmarks)}"
+        elif name in self.shown and is_far_from_shown(name, T, landmarks, self.shown[name]):
+            self.elsewhere[name] = f"is far from where {noun_phrase(name, where=said)} was shown"
+        else:
+            self._told.add(name)
+            return estimate
+        return replace(estimate, status="not_found")
 
     def _unless_another(self, name: str, estimate: PoseEstimate) -> PoseEstimate:
         """The estimate, unless it is of one that is not meant; then that of the place that is left."""

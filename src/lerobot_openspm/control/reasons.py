@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 
 from lerobot_openspm.memory.robot import RobotModel
 from lerobot_openspm.perception.tracking.tracker import TrackerSettings
-from lerobot_openspm.types import Hand, PoseEstimate, Reference
+from lerobot_openspm.types import Hand, PoseEstimate
 
 # Fingers that are open by such a share are around something, as far as can be felt.
 FINGERS_AROUND = (0.03, 0.9)
@@ -15,7 +15,7 @@ FINGERS_AROUND = (0.03, 0.9)
 def why_missing(
     missing: Sequence[str],
     estimates: Mapping[str, PoseEstimate],
-    elsewhere: Mapping[str, Reference],
+    elsewhere: Mapping[str, str],
     is_something_held: bool,
 ) -> str:
     """What is known of objects that were not found.
@@ -23,7 +23,7 @@ def why_missing(
     Args:
         missing: Their names, at least one.
         estimates: What the last look brought of the objects that are meant, by name.
-        elsewhere: By name, where the only one found should be, but is not.
+        elsewhere: By name, how the only one found is not where it should be.
         is_something_held: Whether the fingers are around something of which it is not known what it is.
     """
     reasons = list[str]()
@@ -32,9 +32,7 @@ def why_missing(
         if one is not None and one.tipped:
             reasons.append(f"the {name} has tipped over")
         elif name in elsewhere:
-            where = elsewhere[name]
-            marks = " and the ".join(where.landmarks)
-            reasons.append(f"the only {name} that was found is not {where.relation} the {marks}")
+            reasons.append(f"the only {name} that was found {elsewhere[name]}")
         elif one is not None and one.status == "found" and one.visible < TrackerSettings.visible:
             reasons.append(f"no view shows more than {100 * one.visible:.0f} % of the {name}")
         elif one is not None and one.status == "ambiguous":

@@ -29,6 +29,8 @@ SIDEWAYS_SHARE = 3.0
 FAR_M = 0.5
 # ... and what is said to be on one side of something is not this far on the other.
 OPPOSITE_M = 0.1
+# The only one that is seen is another than the one that demonstrations show if it is this far from there.
+FAR_FROM_SHOWN_M = 0.15
 
 _SIDES = {"right": (0.0, 1.0), "left": (0.0, -1.0), "back": (-1.0, 0.0), "front": (1.0, 0.0)}
 _ALIASES = {
@@ -116,22 +118,42 @@ def choose_as_shown(
     """
     if len(candidates) == 1:
         return 0
-    expected = _where_shown(name, objects, [one for one in shown if name in one])
+    expected = _where_shown(name, objects, shown)
     if not expected or not candidates:
         return None
-    places = np.stack(candidates)[:, :2, 3]
-    middles: list[Array] = [np.median(one, axis=0) for one in expected]
-    spread = sum(_median_distance(*pair) for pair in zip(expected, middles, strict=True)) / len(expected)
-    costs = np.linalg.norm(places[:, None] - np.stack(middles), axis=-1).mean(axis=1)
+    costs, spread = _away_from_shown(candidates, expected)
     best = int(np.argmin(costs))
     margin = max(MARGIN_M, spread, float(costs[best]) / 2)
     return best if np.delete(costs, best).min() - costs[best] >= margin else None
+
+
+def is_far_from_shown(
+    name: str, T_world_obj: Array, objects: Mapping[str, Array], shown: Sequence[Mapping[str, Array]]
+) -> bool:
+    """Whether an object plainly is not where demonstrations show the one that is meant.
+
+    The arguments are those of :func:`choose_as_shown`, for one object.
+    """
+    expected = _where_shown(name, objects, shown)
+    if not expected:
+        return False
+    costs, spread = _away_from_shown([T_world_obj], expected)
+    return float(costs[0]) > FAR_FROM_SHOWN_M + spread
+
+
+def _away_from_shown(candidates: Sequence[Array], expected: Sequence[Array]) -> tuple[Array, float]:
+    """How far ``(n,)`` candidates are from where one was shown, and what demonstrations differ, metres."""
+    places = np.stack(candidates)[:, :2, 3]
+    middles: list[Array] = [np.median(one, axis=0) for one in expected]
+    spread = sum(_median_distance(*pair) for pair in zip(expected, middles, strict=True)) / len(expected)
+    return np.linalg.norm(places[:, None] - np.stack(middles), axis=-1).mean(axis=1), spread
 
 
 def _where_shown(
     name: str, objects: Mapping[str, Array], shown: Sequence[Mapping[str, Array]]
 ) -> list[Array]:
     """Where demonstrations show an object: places ``(k, 2)`` here by each other object that it is beside."""
+    shown = [one for one in shown if name in one]
     beside = sorted({mark for one in shown for mark in one} - {name})
     if not beside:
         return [np.stack([one[name][:2, 3] for one in shown])] if shown else []

@@ -52,14 +52,15 @@ def phrase(sub_task: SubTask) -> str:
         return sub_task.words
     verb = _VERBS.get(sub_task.operation, sub_task.operation)
     if not sub_task.landmark:
-        return f"{verb} {_noun(sub_task.target, sub_task.part, sub_task.target_where)}"
+        return f"{verb} {noun_phrase(sub_task.target, sub_task.part, sub_task.target_where)}"
     preposition = _PREPOSITIONS.get(sub_task.relation, sub_task.relation)
-    target = _noun(sub_task.target, "", sub_task.target_where)
-    landmark = _noun(sub_task.landmark, sub_task.part, sub_task.landmark_where)
+    target = noun_phrase(sub_task.target, "", sub_task.target_where)
+    landmark = noun_phrase(sub_task.landmark, sub_task.part, sub_task.landmark_where)
     return f"{verb} {target} {preposition} {landmark}"
 
 
-def _noun(name: str, part: str, where: Reference | None) -> str:
+def noun_phrase(name: str, part: str = "", where: Reference | None = None) -> str:
+    """An object, or a part of it, in words: "the bowl next to the ramekin", "the left plate"."""
     told = f"the {name}"
     if where is not None and not where.landmarks:
         told = f"the {where.relation} {name}"

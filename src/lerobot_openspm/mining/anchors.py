@@ -117,7 +117,8 @@ def consensus(
 
     Only objects that the instruction names are candidates, because nothing looks for others when acting. A
     contact belongs to the object that the instruction suggests. If that was found in few demonstrations, the
-    contact is anchored to another one only where the demonstrations show that it goes along with that.
+    contact is anchored to another one only where the demonstrations show that it goes along with that. If it
+    was found in most, the others say nothing against it.
 
     Args:
         demonstrations: The demonstrations of the task.
@@ -136,9 +137,11 @@ def consensus(
     for role, members in gathered.items():
         suggested = suggested_anchor(members[0][0], sub_tasks)
         n_found = sum(suggested in demonstration.object_poses for _, demonstration in members)
-        is_free = role not in touching or suggested in surfaces or 2 * n_found >= len(members)
+        in_most = 2 * n_found >= len(members)
+        is_free = role not in touching or suggested in surfaces or in_most
+        expected = n_found if in_most and suggested not in surfaces else len(members)
         costs = {
-            anchor: _cost(anchor, members, suggested)
+            anchor: _cost(anchor, members, suggested, expected)
             for anchor in dict.fromkeys(candidates)
             if is_free or anchor.place == suggested or _goes_along(anchor, members)
         }
@@ -148,15 +151,21 @@ def consensus(
     return anchors
 
 
-def _cost(anchor: Anchor, members: Sequence[tuple[KeyPose, Demonstration]], suggested: str) -> float:
-    """How much key poses of one role vary in an anchor's frame, in metres, plus the priors against it."""
+def _cost(
+    anchor: Anchor, members: Sequence[tuple[KeyPose, Demonstration]], suggested: str, expected: int
+) -> float:
+    """How much key poses of one role vary in an anchor's frame, in metres, plus the priors against it.
+
+    That of the suggested object is expected to be known in so many of them, any other one in all.
+    """
     placed = [demonstration.in_frame(anchor, pose) for pose, demonstration in members]
     found = [T for T in placed if T is not None]
     if not found:
         return np.inf
     prior = PRIOR_M * (anchor.place != suggested) + AXES_PRIOR_M * (anchor.axes != anchor.place)
     spread = float(np.median(deviations(np.stack(found))))
-    return spread + prior / len(found) + PRIOR_M * (1 - len(found) / len(members))
+    lacking = (expected if anchor.place == suggested else len(members)) - len(found)
+    return spread + prior / len(found) + PRIOR_M * lacking / len(members)
 
 
 def _goes_along(anchor: Anchor, members: Sequence[tuple[KeyPose, Demonstration]]) -> bool:

@@ -8,6 +8,8 @@ from lerobot_openspm.memory.not_learned import MAX_RECORDS, NotLearned, not_lear
 from lerobot_openspm.mining.anchors import Demonstration, contact_roles, roles, suggested_anchor
 from lerobot_openspm.mining.mined import MinedDataset, MinedTask
 
+UNTOUCHED = "the hand touches it in no demonstration"
+
 
 def missing_objects(demonstration: Demonstration, task: MinedTask) -> frozenset[str]:
     """The objects of a demonstration's contacts that it does not show; with any, it cannot be acted by."""
@@ -46,13 +48,13 @@ def list_not_learned(mined: MinedDataset) -> tuple[NotLearned, ...]:
     for name, count in sorted(handled.items()):
         if name in mined.surfaces:
             continue
-        if name not in found and name in mined.unlearned:
-            why = mined.unlearned[name]
+        if name not in found and (name in mined.unlearned or stand_ins[name]):
+            why = mined.unlearned.get(name, UNTOUCHED)
             if marks := " and the ".join(sorted(stand_ins[name])):
                 why += f"; what the hand does there is kept relative to the {marks}, with which it goes along"
             objects.append(not_learned("object", name, count, why))
         elif lost[name] and name not in mined.objects and not mined.simulator_objects:
-            objects.append(not_learned("object", name, count, "the hand touches it in no demonstration"))
+            objects.append(not_learned("object", name, count, UNTOUCHED))
         elif lost[name]:
             why = f"its first picture does not show it clearly in {lost[name]} of them"
             objects.append(not_learned("object", name, count, why))

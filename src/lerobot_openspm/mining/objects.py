@@ -150,7 +150,10 @@ def find_objects(
     models, unlearned = dict(known), dict[str, str]()
     if named:
         logger.info("learning what these look like: %s", ", ".join(named))
-        learned, unlearned = learn_objects(scenes, rng, known.values(), segmenter, shape, shapes)
+        sub_tasks = [sub_task for item in mined for sub_task in item.sub_tasks]
+        told_apart = {one.target for one in sub_tasks if one.target_where is not None}
+        told_apart |= {one.landmark for one in sub_tasks if one.landmark_where is not None}
+        learned, unlearned = learn_objects(scenes, rng, known.values(), segmenter, shape, shapes, told_apart)
         models |= learned
     found: list[dict[str, Array]] = []
     for scene, item in tqdm(zip(scenes, mined, strict=True), "Finding objects", len(scenes), unit="episode"):

@@ -293,6 +293,7 @@ class Examples:
         segmenter: Finds the objects' masks; None where the demonstrations teach their looks.
         source: What a segmenter's masks are to teach.
         shapes: Tells the sizes of objects, for source "sam3d".
+        told_apart: Names that instructions tell from others of their kind: pictures may show several.
         left_out: By name, why objects could not be learned; the kinds write it with :meth:`leave_out`.
     """
 
@@ -303,6 +304,7 @@ class Examples:
     segmenter: Segmenter | None = None
     source: Shape = "demonstrations"
     shapes: ShapeBackend | None = None
+    told_apart: Collection[str] = ()
     left_out: dict[str, list[str]] = field(default_factory=dict[str, list[str]])
 
     def leave_out(self, name: str, why: str) -> None:

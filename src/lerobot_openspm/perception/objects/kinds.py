@@ -40,6 +40,7 @@ def learn_objects(
     segmenter: Segmenter | None = None,
     source: Shape = "demonstrations",
     shapes: ShapeBackend | None = None,
+    told_apart: Collection[str] = (),
 ) -> LearnedObjects:
     """Learn every object that some scene's contact cues name and that is not known.
 
@@ -51,6 +52,7 @@ def learn_objects(
         source: With a segmenter, "box" learns the boxes around the objects and "demonstrations" their shapes;
             without one, there is only the latter. "sam3d" learns boxes of the sizes that `shapes` tells.
         shapes: Tells the sizes of objects, for "sam3d".
+        told_apart: Names that instructions tell from others of their kind: pictures may show several.
 
     Raises:
         DatasetError: No scene has a contact cue.
@@ -61,7 +63,7 @@ def learn_objects(
             "no demonstration shows a grasp, contact or release; perception has nothing to learn from"
         )
     names = sorted(named - {one.name for one in known})
-    examples = Examples(names, scenes, known, rng, segmenter, source, shapes)
+    examples = Examples(names, scenes, known, rng, segmenter, source, shapes, told_apart)
     learned: dict[str, KnownObject] = {}
     for kind in KINDS.values():
         left = [name for name in names if name not in learned]

@@ -50,6 +50,20 @@ def test_of_those_that_words_tell_apart_one_seen_well_asks_no_more_of_the_others
         assert not cup._is_another(Place(pose, usual - 0.01), best, told_apart)
 
 
+@pytest.mark.parametrize("is_lying", [True, False])
+def test_beside_the_only_one_that_stands_one_that_lies_is_told(models, is_lying):
+    standing = se3.from_yaw([-0.1, -0.12, 0.0], 0.0)
+    lying = se3.transform(se3.exp_so3([0.0, np.pi / 2, 0.0]), [0.0, 0.12, 0.04])
+    cups = [(SHAPES["cup"], T) for T in ((standing, lying) if is_lying else (standing,))]
+    views = render(cups, None, hand_camera(looking_down(*HOME)))
+    found = models["cup"].localise(Look(views, told_apart=("cup",)))
+    assert (found.status, found.others, found.tipped) == ("found", (), False)
+    middles = [models["cup"].surface.middle_at(np.append(T[:3, 3], 0.0)) for T in found.lying]
+    assert len(middles) == is_lying
+    assert all(middle == pytest.approx([0.05, 0.12], abs=0.02) for middle in middles)
+    assert models["cup"].localise(Look(views)).lying == ()  # nothing tells that there are others
+
+
 def test_two_of_a_kind_where_neither_was_shown_are_both_found_without_words(models):
     cups = [(SHAPES["cup"], se3.from_yaw(place, 0.0)) for place in ([0.12, 0.12, 0.0], [-0.1, -0.12, 0.0])]
     views = render(cups, None, hand_camera(looking_down(*HOME)))

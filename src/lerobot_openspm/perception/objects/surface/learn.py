@@ -18,11 +18,11 @@ from lerobot_openspm.perception.objects.patches.model import PatchModel
 from lerobot_openspm.perception.objects.surface.backdrop import Backdrop, Float32, learn_backdrop
 from lerobot_openspm.perception.objects.surface.carving import Carved, Frame, Frames, carve, silhouette
 from lerobot_openspm.perception.objects.surface.compare import correlation_at, score_at
-from lerobot_openspm.perception.objects.surface.model import YAWS, SurfaceModel
+from lerobot_openspm.perception.objects.surface.model import ANOTHER_SHARE, YAWS, SurfaceModel
 from lerobot_openspm.perception.objects.surface.record import from_record
 from lerobot_openspm.perception.objects.surface.relief import WEIGHTS, find_relief
-from lerobot_openspm.perception.objects.surface.search import Freedom, over_table, search
-from lerobot_openspm.perception.objects.surface.sight import Sight, Surface, sight_of
+from lerobot_openspm.perception.objects.surface.search import Freedom, Place, over_table, search
+from lerobot_openspm.perception.objects.surface.sight import Surface, sight_of
 from lerobot_openspm.perception.objects.surface.solid import (
     Depths,
     Solid,
@@ -51,6 +51,8 @@ SHOWN_SHARE = 0.85
 # In so many of the demonstrations it is measured what looks most like the object without it; what is this
 # near to it is hidden for that, pixels of a picture 256 wide.
 RIVAL_SCENES, MARGIN_PX = 6, 6
+# So many of a kind that instructions tell apart are looked for in a demonstration's first picture.
+MOST_OF_A_KIND = 6
 # An object with fewer coloured points gets no surface.
 MIN_COLOURED = 40
 
@@ -94,7 +96,7 @@ def _learn_surfaces(
     for name, surface in surfaces.items():
         standing = [(scene.views, T[name]) for scene, T in zip(scenes, first, strict=True) if name in T]
         surface = replace(surface, pattern=_pattern(surface, standing, backdrop))
-        typical, rival = _agreements(surface, standing, backdrop)
+        typical, rival = _agreements(surface, standing, backdrop, name in examples.told_apart)
         models[name] = SurfaceModel(name, surface, backdrop, heights[name], typical, rival, near[name])
         logger.info("surface of %s: %d coloured points, agreement %.2f, without it %.2f",
                     name, len(surface.coloured), typical, rival)  # fmt: skip
@@ -237,10 +239,13 @@ def _pattern(surface: Surface, standing: FirstSights, backdrop: Backdrop) -> flo
     return float(np.clip((np.median(seen) - low) / (high - low), 0, 1)) if seen else 0.0
 
 
-def _agreements(surface: Surface, standing: FirstSights, backdrop: Backdrop) -> tuple[float, float]:
+def _agreements(
+    surface: Surface, standing: FirstSights, backdrop: Backdrop, are_several: bool
+) -> tuple[float, float]:
     """How well first pictures agree with the object where it stands, and with the best place without it.
 
-    The first is the median of demonstrations, the second the most of some of them.
+    The first is the median of demonstrations, the second the most of some of them. Where there may be several
+    of its kind, the second is without those others too.
     """
     own, rivals = [], []
     searched = np.linspace(0, len(standing) - 1, RIVAL_SCENES).astype(int)
@@ -248,20 +253,30 @@ def _agreements(surface: Surface, standing: FirstSights, backdrop: Backdrop) -> 
         sights = {c: sight_of(view, c, backdrop, None) for c, view in views.items()}
         own.append(score_at(surface, sights, np.array([*T[:3, 3], 0.0])))
         if i in searched:
-            world = se3.apply(T, surface.points)
-            without = {
-                c: sight_of(view, c, backdrop, _covered(view, world, surface.spacing))
-                for c, view in views.items()
-            }
-            rivals.append(_best_on_table(surface, without, backdrop, float(T[2, 3])))
+            another = ANOTHER_SHARE * own[-1] if are_several else np.inf
+            rivals.append(_best_without(surface, views, T, backdrop, another))
     typical = float(np.clip(np.median(own), 0.05, 1.0)) if own else 0.05
     return typical, float(np.clip(max(rivals, default=0.0), 0.0, typical))
 
 
-def _best_on_table(surface: Surface, sights: Mapping[str, Sight], backdrop: Backdrop, height: float) -> float:
-    """How well the best place on the table agrees, for a frame at a world z, turned anyhow."""
-    ground = over_table(surface, backdrop.reach, height)
-    return search(surface, sights, ground, YAWS, Freedom(turns=True))[0].score
+def _best_without(
+    surface: Surface, views: Mapping[str, View], T_world_obj: Array, backdrop: Backdrop, another: float
+) -> float:
+    """How well the best place on the table agrees where none is: without the one that stands at a pose.
+
+    What agrees so well as `another` is another of its kind, and left out as well.
+    """
+    ground = over_table(surface, backdrop.reach, float(T_world_obj[2, 3]))
+    points, best = np.empty((0, 3)), Place(np.append(T_world_obj[:3, 3], se3.yaw_of(T_world_obj)), np.inf)
+    for _ in range(MOST_OF_A_KIND):
+        T = se3.from_yaw(best.pose[:3], float(best.pose[3]))
+        points = np.concatenate([points, se3.apply(T, surface.points)])
+        covered = {c: _covered(view, points, surface.spacing) for c, view in views.items()}
+        sights = {c: sight_of(view, c, backdrop, covered[c]) for c, view in views.items()}
+        best = search(surface, sights, ground, YAWS, Freedom(turns=True))[0]
+        if best.score < another:
+            break
+    return best.score
 
 
 def _covered(view: View, points: Array, spacing: float) -> Mask:

@@ -16,6 +16,7 @@ from lerobot_openspm.perception.objects.base import Look, Record
 from lerobot_openspm.perception.objects.patches.model import PatchModel
 from lerobot_openspm.perception.objects.surface.backdrop import Backdrop
 from lerobot_openspm.perception.objects.surface.compare import FINE_POINTS, score_at
+from lerobot_openspm.perception.objects.surface.earlier import shown_before, sights_before
 from lerobot_openspm.perception.objects.surface.search import (
     FINE_STEPS,
     QUICK_POINTS,
@@ -33,7 +34,7 @@ from lerobot_openspm.perception.objects.surface.search import (
     search,
 )
 from lerobot_openspm.perception.objects.surface.sight import Sight, Surface, sight_of
-from lerobot_openspm.perception.objects.surface.tipped import has_tipped, lying
+from lerobot_openspm.perception.objects.surface.tipped import lying, where_tipped
 from lerobot_openspm.types import PoseEstimate, Symmetry
 
 # In a record, the colour of points that have none.
@@ -58,15 +59,12 @@ LIFTED_M = 0.02
 # Of the typical agreement around where an object is expected: from here on it is seen there; below that it
 # is gone; in between something may hide it.
 KEPT_SHARE, GONE_SHARE = 0.7, 0.4
-# Where other things stood before it when it was found, fixed cameras showed less of it, but at least this
-# share of the typical agreement. A camera that has this share of its points in the picture should show it.
-LEAST_SHOWN_SHARE, IN_VIEW_SHARE = 0.25, 0.5
 # That it is where it was expected needs less evidence, if the pictures tell its place as sharply as this:
 # from this share on nothing is in doubt. What tells it more vaguely than that is no evidence. Metres.
 SURE_SHARE, SHARP_M, VAGUE_M = 0.8, 0.004, 0.008
-# Earlier looks that found an object less than so far from where it is expected, metres, count as long as the
-# place by all of them agrees with the present look by this share of what the best place by that alone does.
-STILL_M, STILL_SHARE = 0.03, 0.85
+# Earlier looks count as long as the place by all of them agrees with the present look by this share of what
+# the best place by that alone does.
+STILL_SHARE = 0.85
 # Directions that the search begins from, for an object that does not look alike from all of them.
 YAWS = tuple(np.linspace(0, 2 * np.pi, 8, endpoint=False))
 # An object that agrees less than this share with its best place on the table may stand on something. That is
@@ -141,7 +139,7 @@ class SurfaceModel:
         sights = self._sights(look)
         if self.name in look.told_apart and expected is None:
             found = self._estimate(look, sights, self._all_places(look, sights), told_apart=True)
-            return self._unless_tipped(look, sights, found)
+            return found if found.others else self._with_lying(look, sights, found)
         is_seen = near.status == "found"
         near_score = score_at(self.surface, sights, _pose(near.T_world_obj)) if is_seen else 0.0
         is_near = near_score >= BELIEVED_SHARE * self.typical_agreement
@@ -150,7 +148,9 @@ class SurfaceModel:
             return near
         if expected is not None:
             there = there or self._at(look, expected)
-            if there.confidence >= GONE_SHARE * self._shown_before(look, expected):
+            typical = self.typical_agreement
+            shown = shown_before(look, self.name, self.surface, typical, expected, self._sights)
+            if there.confidence >= GONE_SHARE * shown:
                 return _followed(there)
         if is_near:
             return near
@@ -161,8 +161,9 @@ class SurfaceModel:
         found = self._estimate(look, sights, places)
         if found.status == "found":
             return found
+        found = self._with_lying(look, sights, found)
         if expected is None:
-            return self._unless_tipped(look, sights, found)
+            return found
         # Where its patches cannot tell that it is gone, it may be hidden.
         return replace(found, visible=min(found.visible, near.visible))
 
@@ -181,46 +182,13 @@ class SurfaceModel:
         """
         sights = self._sights(look)
         seen = self._refined(sights, T_expected)
-        if before := self._sights_before(look, T_expected):
+        if before := sights_before(look, self.name, T_expected, self._sights):
             together = sights | before
             still = refine(self.surface, together, _pose(T_expected), self._freedom, FINE_POINTS, FINE_STEPS)
             score = score_at(self.surface, sights, still.pose)
             if score >= STILL_SHARE * seen.score:
                 seen = replace(still, score=score)
         return self._estimate(look, sights, [seen])
-
-    def _sights_before(self, look: Look, T_expected: Array) -> dict[str, Sight]:
-        """The views of earlier looks in which it was found where it is expected."""
-        found: dict[str, Sight] = {}
-        for i, earlier in enumerate(look.before):
-            T = earlier.poses.get(self.name)
-            if T is not None and np.linalg.norm(T[:3, 3] - T_expected[:3, 3]) < STILL_M:
-                own = self._sights(earlier.look)
-                found |= {f"{camera}, earlier look {i}": sight for camera, sight in own.items()}
-        return found
-
-    def _shown_before(self, look: Look, T_expected: Array) -> float:
-        """The share of the typical agreement by fixed cameras when it was found where it is expected.
-
-        What stands before it hides as much of it from them now. 1 where there was no such look, where they
-        showed too little of it to tell, and where a camera of the hand should show it now.
-        """
-        hand = {name: view for name, view in look.views.items() if view.camera.mount == "ee"}
-        points = se3.apply(T_expected, self.surface.coloured)
-        if hand and Look(hand).seen_share(points) > IN_VIEW_SHARE:
-            return 1.0
-        for earlier in look.before:
-            T = earlier.poses.get(self.name)
-            if T is None or np.linalg.norm(T[:3, 3] - T_expected[:3, 3]) >= STILL_M:
-                continue
-            fixed = {
-                k for k, view in earlier.look.views.items() if view.camera.mount != "ee"
-            } & look.views.keys()
-            sights = {k: sight for k, sight in self._sights(earlier.look).items() if k in fixed}
-            if sights:
-                share = score_at(self.surface, sights, _pose(T)) / self.typical_agreement
-                return share if LEAST_SHOWN_SHARE < share < 1 else 1.0
-        return 1.0
 
     def _sights(self, look: Look) -> dict[str, Sight]:
         """The views as surfaces are compared with them, prepared once for all objects."""
@@ -271,14 +239,22 @@ class SurfaceModel:
         is_raised = place.pose[2] > self.height + LIFTED_M / 2
         return max(self.found_share, RAISED_SHARE) if is_raised else self.found_share
 
-    def _unless_tipped(self, look: Look, sights: Mapping[str, Sight], found: PoseEstimate) -> PoseEstimate:
-        """A first look's estimate, which says where there is none whether the object lies on the table."""
-        if found.status != "not_found" or found.visible < TIPPED_SEEN_SHARE:
+    def _with_lying(self, look: Look, sights: Mapping[str, Sight], found: PoseEstimate) -> PoseEstimate:
+        """The estimate of none, or of a single one, with where on the table one lies on its side instead."""
+        is_none = found.status == "not_found"
+        if is_none and found.visible < TIPPED_SEEN_SHARE:
             return found
         sides, table = lying(self.surface), self.backdrop.table_height
         needed = (self.found_share + TIPPED_MORE) * self.typical_agreement
-        told = partial(has_tipped, sides, sights, self.backdrop.reach, table, YAWS, needed)
-        return replace(found, tipped=look.prepared((self.name, id(self), "tipped"), told))
+        standing = () if is_none else (self.surface.middle_at(_pose(found.T_world_obj)),)
+        told = partial(
+            where_tipped, sides, sights, self.backdrop.reach, table, YAWS, needed, standing, self._distinct_m
+        )
+        middle = look.prepared((self.name, id(self), "lying"), told)
+        if middle is None:
+            return found
+        T = se3.transform(np.eye(3), np.append(middle - self.surface.middle, self.height))
+        return replace(found, lying=(T,))
 
     @property
     def _yaws(self) -> tuple[float, ...]:
@@ -287,6 +263,11 @@ class SurfaceModel:
     @property
     def _freedom(self) -> Freedom:
         return Freedom(not self.surface.is_round)
+
+    @property
+    def _distinct_m(self) -> float:
+        """How far apart the middles of two of its kind are at least, metres."""
+        return max(SAME_PLACE_M, OVERLAP_SHARE * self.surface.radius)
 
     def _refined(self, sights: Mapping[str, Sight], T_world_obj: Array) -> Place:
         pose, free = _pose(T_world_obj), self._freedom
@@ -298,8 +279,7 @@ class SurfaceModel:
     ) -> PoseEstimate:
         best = places[0]
         share = best.score / self.typical_agreement
-        apart = max(SAME_PLACE_M, OVERLAP_SHARE * self.surface.radius)
-        rivals = [one for one in places[1:] if middles_apart(self.surface, one, best) > apart]
+        rivals = [one for one in places[1:] if middles_apart(self.surface, one, best) > self._distinct_m]
         most = RIVAL_SHARE * likelihood(self.surface, best)
         is_rivalled = any(likelihood(self.surface, one) > most for one in rivals)
         status = "not_found" if share < self._needed(best) else "ambiguous" if is_rivalled else "found"
@@ -307,9 +287,8 @@ class SurfaceModel:
         covariance = covariance_at(self.surface, sights, best.pose, not self.surface.is_round)
         visible = look.seen_share(se3.apply(T, self.surface.coloured))
         more = [one for one in rivals if self._is_another(one, best, told_apart)]
-        others = tuple(
-            se3.from_yaw(one.pose[:3], float(one.pose[3])) for one in distinct(self.surface, more, apart)
-        )
+        more = distinct(self.surface, more, self._distinct_m)
+        others = tuple(se3.from_yaw(one.pose[:3], float(one.pose[3])) for one in more)
         sure = WITHOUT_PATTERN + (1 - WITHOUT_PATTERN) * self.surface.pattern
         return PoseEstimate(status, T, covariance, sure * float(np.clip(share, 0, 1)), visible, None, others)
 
