@@ -172,8 +172,7 @@ class PoseEstimate:
         support: What the estimate rests on; None where the covariance needs no correction.
         others: Poses ``(4, 4)`` of further places that show such an object too, the most confident first;
             empty for kinds that cannot see several.
-        lying: Poses ``(4, 4)``, as if it stood there, at which one of its kind is seen to lie on its side or
-            upside down; sought where none stands, or a single one of several.
+        tipped: Whether it is seen to lie on its side or upside down, and so was not found as it should stand.
     """
 
     status: Literal["found", "not_found", "ambiguous"]
@@ -183,12 +182,7 @@ class PoseEstimate:
     visible: float = 1.0
     support: Support | None = None
     others: tuple[Array, ...] = ()
-    lying: tuple[Array, ...] = ()
-
-    @property
-    def tipped(self) -> bool:
-        """Whether it was not found as it should stand, because it has tipped over."""
-        return self.status == "not_found" and len(self.lying) > 0
+    tipped: bool = False
 
 
 @dataclass(frozen=True)

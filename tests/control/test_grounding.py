@@ -277,18 +277,37 @@ def test_the_only_one_is_meant_unless_it_is_far_from_where_demonstrations_show_t
     assert grounding.sort_out({"bowl": seen(there)}, {"plate": plate})["bowl"].status == status
     words = "is far from where the bowl next to the ramekin was shown"
     assert grounding.elsewhere == ({} if status == "found" else {"bowl": words})
-    assert grounding.sort_out({"bowl": seen(there)}, {})["bowl"].status == "found"  # nothing to tell it by
 
 
-@pytest.mark.parametrize("is_meant_lying", [True, False])
-def test_words_tell_whether_the_one_that_stands_or_the_one_that_lies_is_meant(is_meant_lying):
-    standing, lying = (FAR, NEAR) if is_meant_lying else (NEAR, FAR)
-    bowl = dataclasses.replace(seen(standing), lying=(lying,))
-    grounding = Grounding({"bowl": NEXT_TO_RACK})
-    meant = look(grounding, bowl)
-    assert (meant.status, meant.tipped) == (("not_found", True) if is_meant_lying else ("found", False))
-    again = look(grounding, seen(standing))
-    assert again.status == ("not_found" if is_meant_lying else "found")
+def test_the_only_one_is_meant_where_nothing_is_found_that_demonstrations_show():
+    grounding = Grounding({"bowl": Reference("next to", ("ramekin",))}, {"bowl": BESIDE_PLATE})
+    assert grounding.sort_out({"bowl": seen(at(2.0, 2.0))}, {})["bowl"].status == "found"
+
+
+@pytest.mark.parametrize(
+    ("moved", "displaced", "status"),
+    [
+        (("box",), (), "found"),
+        (("box", "plate"), (), "not_found"),
+        (("box", "plate"), ("box", "plate"), "found"),
+    ],
+)
+def test_what_was_moved_itself_tells_little_of_where_it_was_shown(moved, displaced, status):
+    marks = {"plate": (0.1, 0.1), "box": (0.3, -0.1)}
+    shown_there = tuple(
+        {"bowl": at(0.1, -0.1), **{k: at(*place) for k, place in marks.items()}} for _ in "123"
+    )
+    now = {name: seen(at(x + 0.4 * (name in moved), y)) for name, (x, y) in marks.items()}
+    grounding = Grounding({"bowl": Reference("next to", ("ramekin",))}, {"bowl": shown_there})
+    meant = grounding.sort_out({"bowl": seen(at(0.1, -0.1)), **now}, {}, displaced)["bowl"]
+    assert meant.status == status
+
+
+def test_the_center_of_the_table_stays_where_it_is_for_the_only_one_too():
+    where = Reference("center", ("table",))
+    grounding = Grounding({"bowl": where}, {"bowl": BESIDE_PLATE}, frozenset({"table"}))
+    moved = {"table": at(0.0, 0.0), "plate": at(0.4, 0.1)}
+    assert grounding.sort_out({"bowl": seen(at(0.1, -0.1))}, moved)["bowl"].status == "found"
 
 
 def test_the_only_one_between_two_is_not_far_behind_both():

@@ -8,7 +8,7 @@ from lerobot_openspm.types import PoseEstimate
 @pytest.mark.parametrize(
     ("status", "seen", "words"),
     [
-        ("not_found", {"lying": (np.eye(4),)}, "the bowl has tipped over"),
+        ("not_found", {"tipped": True}, "the bowl has tipped over"),
         ("ambiguous", {}, "cannot tell which bowl is meant"),
         ("not_found", {}, "cannot find the bowl: it is in no view"),
         ("found", {"visible": 0.4}, "no view shows more than 40 % of the bowl"),

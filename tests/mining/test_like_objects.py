@@ -104,3 +104,22 @@ def test_what_is_put_beside_a_thing_does_not_touch_it(relation, touched):
     episode = pick_and_place()[0].episode(0, task)
     item = MinedEpisode(episode, tuple(find_key_poses(episode, robot())), parse_instruction(task))
     assert [cue.name for cue in contact_cues(item)] == touched
+
+
+@pytest.mark.parametrize(
+    ("task", "told_apart"),
+    [
+        ("put the bowl on the plate", set()),
+        ("put the left bowl on the plate", {"bowl"}),
+        ("put the bowl on the plate next to the box", {"plate"}),
+    ],
+)
+def test_learning_is_told_of_what_pictures_may_show_several(task, told_apart, monkeypatch):
+    told = []
+    monkeypatch.setattr(mining_objects, "learn_objects", lambda *given: told.append(given[-1]) or ({}, {}))
+    monkeypatch.setattr(mining_objects, "detect", lambda *_: {})
+    episode = pick_and_place()[0].episode(0, task)
+    item = MinedEpisode(episode, tuple(find_key_poses(episode, robot())), parse_instruction(task))
+    scene = DemonstrationScene({}, contact_cues(item))
+    mining_objects.find_objects([scene], [item], {}, np.random.default_rng(0))
+    assert told == [told_apart]

@@ -51,7 +51,9 @@ def test_a_grasp_belongs_to_what_was_found_in_most_demonstrations_however_little
         rng = np.random.default_rng(seed)
         made: list[Demonstration] = []
         for _ in range(10):
-            bowl, plate = (se3.from_yaw([x, *(moves_m * rng.uniform(-1, 1, 1)), 0.0], 0.0) for x in (0.0, 0.2))
+            bowl, plate = (
+                se3.from_yaw([x, *(moves_m * rng.uniform(-1, 1, 1)), 0.0], 0.0) for x in (0.0, 0.2)
+            )
             grasp = key_pose("grasp", bowl @ hand_pose(*rng.normal(0, 0.001, 2), 0.02))
             made.append(Demonstration((grasp,), {"bowl": bowl, "plate": plate}))
         anchors = consensus(without("bowl", made, n_found), SUB_TASKS)
@@ -96,6 +98,8 @@ def test_it_is_said_of_what_the_hand_never_touched_too():
                             unlearned={}, objects={}, simulator_objects=())  # fmt: skip
     (bowl,) = list_not_learned(mined)
     assert bowl.reason.startswith("the hand touches it in no demonstration; what the hand does there is kept")
+    mined.objects = {"bowl": object()}
+    assert list_not_learned(mined) == ()  # it is known, and so what is kept can be acted on
 
 
 def test_what_is_put_on_the_table_is_put_relative_to_what_is_known():

@@ -115,49 +115,52 @@ class Grounding:
         return changed
 
     def sort_out(
-        self, estimates: Mapping[str, PoseEstimate], object_poses: Mapping[str, Array]
+        self,
+        estimates: Mapping[str, PoseEstimate],
+        object_poses: Mapping[str, Array],
+        displaced: Collection[str] = (),
     ) -> dict[str, PoseEstimate]:
         """What was seen of the objects that are meant, given the poses of objects seen before.
 
         An object is told from its like once, when several are first seen; from then on those that are not
         meant are known by their places. One that cannot be told is ambiguous. The only one of its kind is
-        the one that is meant, unless it plainly is not where that is said or was shown to be.
+        the one that is meant, unless it plainly is not where that is said or was shown to be. What was
+        displaced since the start tells nothing of where things were shown.
         """
         self.elsewhere = {}
         places = {name: one.T_world_obj for name, one in estimates.items() if one.status == "found"}
         known = {**places, **object_poses}
-        return {name: self._meant(name, one, known) for name, one in estimates.items()}
+        still = {name: T for name, T in known.items() if name not in displaced}
+        return {name: self._meant(name, one, known, still) for name, one in estimates.items()}
 
-    def _meant(self, name: str, estimate: PoseEstimate, object_poses: Mapping[str, Array]) -> PoseEstimate:
+    def _meant(
+        self, name: str, estimate: PoseEstimate, known: Mapping[str, Array], still: Mapping[str, Array]
+    ) -> PoseEstimate:
         if name in self.not_meant:
             return self._unless_another(name, estimate)
-        standing = (estimate.T_world_obj, *estimate.others)
-        candidates = (*standing, *estimate.lying)
-        if estimate.status == "not_found" or len(candidates) == 1:
-            return self._unless_elsewhere(name, estimate, object_poses)
-        landmarks = {mark: T for mark, T in object_poses.items() if mark != name}
-        index = self._told_from(name, candidates, landmarks)
+        if estimate.status == "not_found" or not estimate.others:
+            return self._unless_elsewhere(name, estimate, known, still)
+        candidates = (estimate.T_world_obj, *estimate.others)
+        index = self._told_from(name, candidates, known, still)
         if index is None:
             where = self.said.get(name, "nothing")
             logger.info("cannot tell which of %d objects like the %r is meant: %s is said of it",
                         len(candidates), name, where)  # fmt: skip
             return replace(estimate, status="ambiguous")
         self.not_meant[name] = candidates[:index] + candidates[index + 1 :]
-        status = "found" if index < len(standing) else "not_found"
-        lying = () if status == "found" else (candidates[index],)
-        return replace(estimate, status=status, T_world_obj=candidates[index], others=(), lying=lying)
+        return replace(estimate, status="found", T_world_obj=candidates[index], others=())
 
     def _told_from(
-        self, name: str, candidates: Sequence[Array], landmarks: Mapping[str, Array]
+        self, name: str, candidates: Sequence[Array], known: Mapping[str, Array], still: Mapping[str, Array]
     ) -> int | None:
         """Which of several is meant: by the words, and where these do not tell by what was shown."""
-        index = None
+        index, landmarks = None, {mark: T for mark, T in known.items() if mark != name}
         if (said := self.said.get(name)) is not None:
             standing = [self._foot(name, T) for T in candidates]
             marks = {**self._feet_of(landmarks), **self._shown_center(name, said)}
             index = choose(said, standing, marks)
         if index is None and name in self.shown:
-            index = choose_as_shown(name, candidates, landmarks, self.shown[name])
+            index = choose_as_shown(name, candidates, still, self.shown[name])
         return index
 
     def _shown_center(self, name: str, said: Reference) -> dict[str, Array]:
@@ -169,16 +172,18 @@ class Grounding:
         return dict.fromkeys(said.landmarks, se3.transform(np.eye(3), middle))
 
     def _unless_elsewhere(
-        self, name: str, estimate: PoseEstimate, object_poses: Mapping[str, Array]
+        self, name: str, estimate: PoseEstimate, known: Mapping[str, Array], still: Mapping[str, Array]
     ) -> PoseEstimate:
         """The estimate of the only one, unless it is of another than is said, when it is first seen."""
         if estimate.status != "found" or name not in self.said or name in self._told:
             return estimate
-        said, T = self.said[name], estimate.T_world_obj
-        landmarks = {k: T for k, T in object_poses.items() if k != name and k not in self.surfaces}
-        if contradicts(said, self._foot(name, T), self._feet_of(landmarks)):
+        said, T_world_obj = self.said[name], estimate.T_world_obj
+        landmarks = {k: T for k, T in known.items() if k != name and k not in self.surfaces}
+        # The center of the table stays where it is, whatever else was shown beside the object.
+        shown = () if self._shown_center(name, said) else self.shown.get(name, ())
+        if contradicts(said, self._foot(name, T_world_obj), self._feet_of(landmarks)):
             self.elsewhere[name] = f"is not {said.relation} the {' and the '.join(said.landmarks)}"
-        elif name in self.shown and is_far_from_shown(name, T, landmarks, self.shown[name]):
+        elif is_far_from_shown(name, T_world_obj, still, shown):
             self.elsewhere[name] = f"is far from where {noun_phrase(name, where=said)} was shown"
         else:
             self._told.add(name)

@@ -112,7 +112,7 @@ class SceneState:
         self.detections = detections
         self._looked_at_step = self._step
         known = {**self._context.surfaces, **self.tracker.poses(hand.T_world_ee)}
-        meant = self.grounding.sort_out(detections.estimates, known)
+        meant = self.grounding.sort_out(detections.estimates, known, self.tracker.displaced)
         self.detections = replace(detections, estimates=meant)
         return self.tracker.look(meant, hand.T_world_ee, waited_s, is_felt)
 

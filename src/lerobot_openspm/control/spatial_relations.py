@@ -121,7 +121,8 @@ def choose_as_shown(
     expected = _where_shown(name, objects, shown)
     if not expected or not candidates:
         return None
-    costs, spread = _away_from_shown(candidates, expected)
+    away, spread = _away_from_shown(candidates, expected)
+    costs = away.mean(axis=1)
     best = int(np.argmin(costs))
     margin = max(MARGIN_M, spread, float(costs[best]) / 2)
     return best if np.delete(costs, best).min() - costs[best] >= margin else None
@@ -132,21 +133,26 @@ def is_far_from_shown(
 ) -> bool:
     """Whether an object plainly is not where demonstrations show the one that is meant.
 
-    The arguments are those of :func:`choose_as_shown`, for one object.
+    It is far from there by all the other objects that were shown: one of these may have been moved. The
+    arguments are those of :func:`choose_as_shown`, for one object.
     """
     expected = _where_shown(name, objects, shown)
     if not expected:
         return False
-    costs, spread = _away_from_shown([T_world_obj], expected)
-    return float(costs[0]) > FAR_FROM_SHOWN_M + spread
+    away, spread = _away_from_shown([T_world_obj], expected)
+    return bool((away[0] > FAR_FROM_SHOWN_M + spread).all())
 
 
 def _away_from_shown(candidates: Sequence[Array], expected: Sequence[Array]) -> tuple[Array, float]:
-    """How far ``(n,)`` candidates are from where one was shown, and what demonstrations differ, metres."""
+    """How far candidates are from where one was shown, by each of k other objects.
+
+    Returns:
+        Metres ``(n, k)``, and how far demonstrations are from one another in the mean, metres.
+    """
     places = np.stack(candidates)[:, :2, 3]
     middles: list[Array] = [np.median(one, axis=0) for one in expected]
     spread = sum(_median_distance(*pair) for pair in zip(expected, middles, strict=True)) / len(expected)
-    return np.linalg.norm(places[:, None] - np.stack(middles), axis=-1).mean(axis=1), spread
+    return np.linalg.norm(places[:, None] - np.stack(middles), axis=-1), spread
 
 
 def _where_shown(

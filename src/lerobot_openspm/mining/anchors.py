@@ -118,7 +118,7 @@ def consensus(
     Only objects that the instruction names are candidates, because nothing looks for others when acting. A
     contact belongs to the object that the instruction suggests. If that was found in few demonstrations, the
     contact is anchored to another one only where the demonstrations show that it goes along with that. If it
-    was found in most, the others say nothing against it.
+    was found in half of them or more, the others say nothing against it.
 
     Args:
         demonstrations: The demonstrations of the task.
@@ -137,9 +137,9 @@ def consensus(
     for role, members in gathered.items():
         suggested = suggested_anchor(members[0][0], sub_tasks)
         n_found = sum(suggested in demonstration.object_poses for _, demonstration in members)
-        in_most = 2 * n_found >= len(members)
-        is_free = role not in touching or suggested in surfaces or in_most
-        expected = n_found if in_most and suggested not in surfaces else len(members)
+        in_half = 2 * n_found >= len(members)
+        is_free = role not in touching or suggested in surfaces or in_half
+        expected = n_found if in_half and suggested not in surfaces else len(members)
         costs = {
             anchor: _cost(anchor, members, suggested, expected)
             for anchor in dict.fromkeys(candidates)

@@ -48,12 +48,13 @@ def list_not_learned(mined: MinedDataset) -> tuple[NotLearned, ...]:
     for name, count in sorted(handled.items()):
         if name in mined.surfaces:
             continue
-        if name not in found and (name in mined.unlearned or stand_ins[name]):
+        is_known = name in mined.objects or bool(mined.simulator_objects)
+        if name not in found and (name in mined.unlearned or (stand_ins[name] and not is_known)):
             why = mined.unlearned.get(name, UNTOUCHED)
             if marks := " and the ".join(sorted(stand_ins[name])):
                 why += f"; what the hand does there is kept relative to the {marks}, with which it goes along"
             objects.append(not_learned("object", name, count, why))
-        elif lost[name] and name not in mined.objects and not mined.simulator_objects:
+        elif lost[name] and not is_known:
             objects.append(not_learned("object", name, count, UNTOUCHED))
         elif lost[name]:
             why = f"its first picture does not show it clearly in {lost[name]} of them"

@@ -98,7 +98,7 @@ def test_what_lies_on_its_side_is_not_found_and_said_to_have_tipped(models):
 
 def test_pictures_are_searched_once_for_what_has_tipped(models, monkeypatch):
     searched = []
-    monkeypatch.setattr(model_module, "where_tipped", lambda *_: searched.append(1))
+    monkeypatch.setattr(model_module, "has_tipped", lambda *_: bool(searched.append(1)))
     # On the block the cup, which lies beside it, is sought as well.
     on_its_side = se3.exp_so3([0.0, np.pi / 2, 0.0])
     scene = {

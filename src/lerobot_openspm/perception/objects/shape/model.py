@@ -152,8 +152,7 @@ class ShapeModel:
             fits.sort(key=lambda one: -one.score)
             fits = [fits[i] for i in distinct([one.T_world_obj for one in fits], self.radius)]
             if fits and self._has_tipped(evidence, fits[0]):
-                upright = self._estimate(look, evidence, fits)
-                return replace(upright, status="not_found", lying=(upright.T_world_obj,))
+                return replace(self._estimate(look, evidence, fits), status="not_found", tipped=True)
         return self._estimate(look, evidence, fits)
 
     def _where_expected(self, look: Look, evidence: Sequence[Evidence]) -> list[Fit]:

@@ -247,16 +247,18 @@ def _agreements(
     The first is the median of demonstrations, the second the most of some of them. Where there may be several
     of its kind, the second is without those others too.
     """
-    own, rivals = [], []
-    searched = np.linspace(0, len(standing) - 1, RIVAL_SCENES).astype(int)
-    for i, (views, T) in enumerate(standing):
+    if not standing:
+        return 0.05, 0.0
+    own = []
+    for views, T in standing:
         sights = {c: sight_of(view, c, backdrop, None) for c, view in views.items()}
         own.append(score_at(surface, sights, np.array([*T[:3, 3], 0.0])))
-        if i in searched:
-            another = ANOTHER_SHARE * own[-1] if are_several else np.inf
-            rivals.append(_best_without(surface, views, T, backdrop, another))
-    typical = float(np.clip(np.median(own), 0.05, 1.0)) if own else 0.05
-    return typical, float(np.clip(max(rivals, default=0.0), 0.0, typical))
+    typical = float(np.clip(np.median(own), 0.05, 1.0))
+    another = ANOTHER_SHARE * typical if are_several else np.inf
+    searched = np.unique(np.linspace(0, len(standing) - 1, RIVAL_SCENES).astype(int))
+    some = [standing[i] for i in searched]
+    rivals = [_best_without(surface, views, T, backdrop, another) for views, T in some]
+    return typical, float(np.clip(max(rivals), 0.0, typical))
 
 
 def _best_without(

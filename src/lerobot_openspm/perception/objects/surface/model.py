@@ -34,7 +34,7 @@ from lerobot_openspm.perception.objects.surface.search import (
     search,
 )
 from lerobot_openspm.perception.objects.surface.sight import Sight, Surface, sight_of
-from lerobot_openspm.perception.objects.surface.tipped import lying, where_tipped
+from lerobot_openspm.perception.objects.surface.tipped import has_tipped, lying
 from lerobot_openspm.types import PoseEstimate, Symmetry
 
 # In a record, the colour of points that have none.
@@ -139,7 +139,7 @@ class SurfaceModel:
         sights = self._sights(look)
         if self.name in look.told_apart and expected is None:
             found = self._estimate(look, sights, self._all_places(look, sights), told_apart=True)
-            return found if found.others else self._with_lying(look, sights, found)
+            return self._unless_tipped(look, sights, found)
         is_seen = near.status == "found"
         near_score = score_at(self.surface, sights, _pose(near.T_world_obj)) if is_seen else 0.0
         is_near = near_score >= BELIEVED_SHARE * self.typical_agreement
@@ -161,7 +161,7 @@ class SurfaceModel:
         found = self._estimate(look, sights, places)
         if found.status == "found":
             return found
-        found = self._with_lying(look, sights, found)
+        found = self._unless_tipped(look, sights, found)
         if expected is None:
             return found
         # Where its patches cannot tell that it is gone, it may be hidden.
@@ -239,22 +239,14 @@ class SurfaceModel:
         is_raised = place.pose[2] > self.height + LIFTED_M / 2
         return max(self.found_share, RAISED_SHARE) if is_raised else self.found_share
 
-    def _with_lying(self, look: Look, sights: Mapping[str, Sight], found: PoseEstimate) -> PoseEstimate:
-        """The estimate of none, or of a single one, with where on the table one lies on its side instead."""
-        is_none = found.status == "not_found"
-        if is_none and found.visible < TIPPED_SEEN_SHARE:
+    def _unless_tipped(self, look: Look, sights: Mapping[str, Sight], found: PoseEstimate) -> PoseEstimate:
+        """The estimate, which says where there is none whether the object lies on the table."""
+        if found.status != "not_found" or found.visible < TIPPED_SEEN_SHARE:
             return found
         sides, table = lying(self.surface), self.backdrop.table_height
         needed = (self.found_share + TIPPED_MORE) * self.typical_agreement
-        standing = () if is_none else (self.surface.middle_at(_pose(found.T_world_obj)),)
-        told = partial(
-            where_tipped, sides, sights, self.backdrop.reach, table, YAWS, needed, standing, self._distinct_m
-        )
-        middle = look.prepared((self.name, id(self), "lying"), told)
-        if middle is None:
-            return found
-        T = se3.transform(np.eye(3), np.append(middle - self.surface.middle, self.height))
-        return replace(found, lying=(T,))
+        told = partial(has_tipped, sides, sights, self.backdrop.reach, table, YAWS, needed)
+        return replace(found, tipped=look.prepared((self.name, id(self), "tipped"), told))
 
     @property
     def _yaws(self) -> tuple[float, ...]:
@@ -263,11 +255,6 @@ class SurfaceModel:
     @property
     def _freedom(self) -> Freedom:
         return Freedom(not self.surface.is_round)
-
-    @property
-    def _distinct_m(self) -> float:
-        """How far apart the middles of two of its kind are at least, metres."""
-        return max(SAME_PLACE_M, OVERLAP_SHARE * self.surface.radius)
 
     def _refined(self, sights: Mapping[str, Sight], T_world_obj: Array) -> Place:
         pose, free = _pose(T_world_obj), self._freedom
@@ -279,7 +266,8 @@ class SurfaceModel:
     ) -> PoseEstimate:
         best = places[0]
         share = best.score / self.typical_agreement
-        rivals = [one for one in places[1:] if middles_apart(self.surface, one, best) > self._distinct_m]
+        apart = max(SAME_PLACE_M, OVERLAP_SHARE * self.surface.radius)
+        rivals = [one for one in places[1:] if middles_apart(self.surface, one, best) > apart]
         most = RIVAL_SHARE * likelihood(self.surface, best)
         is_rivalled = any(likelihood(self.surface, one) > most for one in rivals)
         status = "not_found" if share < self._needed(best) else "ambiguous" if is_rivalled else "found"
@@ -287,8 +275,9 @@ class SurfaceModel:
         covariance = covariance_at(self.surface, sights, best.pose, not self.surface.is_round)
         visible = look.seen_share(se3.apply(T, self.surface.coloured))
         more = [one for one in rivals if self._is_another(one, best, told_apart)]
-        more = distinct(self.surface, more, self._distinct_m)
-        others = tuple(se3.from_yaw(one.pose[:3], float(one.pose[3])) for one in more)
+        others = tuple(
+            se3.from_yaw(one.pose[:3], float(one.pose[3])) for one in distinct(self.surface, more, apart)
+        )
         sure = WITHOUT_PATTERN + (1 - WITHOUT_PATTERN) * self.surface.pattern
         return PoseEstimate(status, T, covariance, sure * float(np.clip(share, 0, 1)), visible, None, others)
 

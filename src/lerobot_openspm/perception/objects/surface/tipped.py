@@ -29,17 +29,15 @@ def lying(surface: Surface) -> list[Surface]:
     return sides
 
 
-def where_tipped(
+def has_tipped(
     sides: Sequence[Surface],
     sights: Mapping[str, Sight],
     area: Array,
     table_height: float,
     yaws: Sequence[float],
     needed: float,
-    standing: Sequence[Array] = (),
-    apart: float = 0.0,
-) -> Array | None:
-    """The middle ``(2,)`` of where views agree with an object on one of its other sides; None if nowhere.
+) -> bool:
+    """Whether the views agree with an object on one of its other sides.
 
     Args:
         sides: The object on them, see :func:`lying`.
@@ -48,16 +46,9 @@ def where_tipped(
         table_height: World z of what it lies on, metres.
         yaws: Directions to begin from, radians.
         needed: The agreement from which on it is taken to lie there.
-        standing: Middles ``(2,)`` of others of its kind that stand upright.
-        apart: How far from those it is sought at least, metres.
     """
     for side in sides:
         ground = over_table(side, area, table_height)
-        places = search(side, sights, ground, yaws, Freedom(turns=True), several=len(standing) > 0)
-        middles = [side.middle_at(place.pose) for place in places]
-        for place, middle in zip(places, middles, strict=True):
-            if all(np.linalg.norm(middle - one) > apart for one in standing):
-                if place.score >= needed:
-                    return middle
-                break
-    return None
+        if search(side, sights, ground, yaws, Freedom(turns=True))[0].score >= needed:
+            return True
+    return False
