@@ -164,12 +164,14 @@ def test_what_films_show_is_told_of_the_commit_whose_episodes_they_are_of(result
 
 
 def test_what_films_show_is_kept_of_every_failed_episode_of_a_committed_result_once():
+    looked_at = json.loads(libero_tables.LOOKED_AT.read_text())
     committed = [json.loads(path.read_text()) for path in RESULTS.glob("*.json")]
-    for command, looked in json.loads(libero_tables.LOOKED_AT.read_text()).items():
-        taken = [r for r in committed if (r["command"], r["commit"]) == (command, looked["commit"])]
-        (result,) = [r for r in taken if "failed" in r]
+    failing = {result["command"]: result for result in committed if result.get("failed")}
+    assert looked_at.keys() == failing.keys()
+    for command, looked in looked_at.items():
+        assert looked["commit"] == failing[command]["commit"]
         seen = [(one["task"], state) for one in looked["failed"] for state in one["states"]]
-        assert sorted(seen) == sorted((one["task"], one["state"]) for one in result["failed"])
+        assert sorted(seen) == sorted((one["task"], one["state"]) for one in failing[command]["failed"])
 
 
 def test_first_looks_anywhere_are_told_beside_success_and_so_is_which_layouts_are_left_out(results):
