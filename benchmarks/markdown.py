@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+import json
+from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
 
 from benchmarks.results import PROVENANCE
-from benchmarks.staleness import read_result
+from benchmarks.staleness import ROOT, read_result
 
 NO_FIGURES = {*PROVENANCE, "interval"}
+# By a figure's command: of which commit's result films were looked at, and what they show. An episode is
+# known by its initial state, or by its seed where scenes are drawn.
+LOOKED_AT = ROOT / "docs/looked_at.json"
 
 
 class Quoted(dict[str, Any]):
@@ -65,6 +70,27 @@ def _origin(result: dict[str, Any]) -> str:
         f"`{command}` on {result['date'][:10]}, commit `{result['commit']}`{changed}; "
         f"{machine['cores']} cores of {machine['cpu']}."
     )
+
+
+def looked_at(result: Quoted) -> str:
+    """What films of the failed episodes show; nothing where those of the result were not looked at."""
+    looked = json.loads(LOOKED_AT.read_text()).get(result["command"], {})
+    if looked.get("commit") != result["commit"]:
+        return ""
+    episodes = "Seeds" if "seeds" in looked["failed"][0] else "States"
+    rows = [
+        [
+            one["task"].replace("_", " "),
+            ", ".join(map(str, one[episodes.lower()])),
+            one["kind"],
+            one["seen"],
+        ]
+        for one in looked["failed"]
+    ]
+    kinds = Counter(one["kind"] for one in looked["failed"] for _ in one[episodes.lower()])
+    counted = ", ".join(f"{kind} {n}" for kind, n in kinds.most_common())
+    heads = ["Task", episodes, "Failed by", "What is seen"]
+    return f"\n\nBy a look at a film of each: {counted}.\n\n{table(heads, rows)}"
 
 
 def percent(run: dict[str, Any]) -> str:

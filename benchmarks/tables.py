@@ -19,6 +19,7 @@ from benchmarks.markdown import (
     chapter,
     grid,
     interval,
+    looked_at,
     percent,
     quoted,
     section,
@@ -155,7 +156,7 @@ def _demo(result: Quoted) -> str:
     }
     told = ", ".join(f"{what} {s:.0f} s" for what, s in seconds.items() if s is not None)
     overall = grid({"all ten tasks": result}, STEPS)
-    return f"{overall}\n\n{told.capitalize()}.\n\n{_per_task({'success': result})}"
+    return f"{overall}\n\n{told.capitalize()}.\n\n{_per_task({'success': result})}{looked_at(result)}"
 
 
 def _execution(result: Quoted) -> str:
@@ -197,7 +198,8 @@ def _anywhere(result: Quoted) -> str:
         f"used: {layouts['hidden']} do not show one of the two objects well enough, and the expert does not "
         f"solve {layouts['unsolved']}."
     )
-    return f"{_selection(result)}\n\n{grid(rows, columns, 'Objects')}\n\n{told}"
+    success = f"{_selection(result)}{looked_at(result)}"
+    return f"{success}\n\n{grid(rows, columns, 'Objects')}\n\n{told}"
 
 
 def _per_task(runs: dict[str, Any]) -> str:

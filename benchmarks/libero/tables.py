@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import json
-from collections import Counter
-
 from benchmarks.figures import FIGURES
 from benchmarks.libero.failures import FAR_OFF_MM as FAR_OFF
 from benchmarks.markdown import (
@@ -15,12 +12,12 @@ from benchmarks.markdown import (
     chapter,
     grid,
     interval,
+    looked_at,
     percent,
     section,
     share,
     table,
 )
-from benchmarks.staleness import ROOT
 
 INTRODUCTION = """# On LIBERO-GOAL
 
@@ -61,8 +58,6 @@ SORTED = (
     "gripped or pushed but without reaching the goal. Collisions are told by a look alone: objects that are "
     "not of the task are touched in episodes that succeed too."
 )
-# By a figure's command: of which commit's result films were looked at, and what they show.
-LOOKED_AT = ROOT / "docs/looked_at.json"
 PLACES: Columns = {
     "Known by": lambda row: row["learned"] or "not learned",
     "Grasped in": "grasped",
@@ -117,28 +112,13 @@ def libero_sections() -> list[str]:
 
 def _variant(result: Quoted) -> str:
     per_task = grid({"all ten tasks": result, **result["per_task"]}, {**STEPS, **CONTACTS})
-    return f"{per_task}\n\n{TOUCHED}\n\n{_sorted(result)}{_looked_at(result)}"
+    return f"{per_task}\n\n{TOUCHED}\n\n{_sorted(result)}{looked_at(result)}"
 
 
 def _sorted(result: Quoted) -> str:
     """How many episodes failed by what, as `failures` sorts them."""
     counts = result["failures"]
     return f"{table(['Failed by', *counts], [['episodes', *counts.values()]])}\n\n{SORTED}"
-
-
-def _looked_at(result: Quoted) -> str:
-    """What films of the failed episodes show; nothing where those of the result were not looked at."""
-    looked = json.loads(LOOKED_AT.read_text()).get(result["command"], {})
-    if looked.get("commit") != result["commit"]:
-        return ""
-    heads = ["Task", "States", "Failed by", "What is seen"]
-    rows = [
-        [one["task"].replace("_", " "), ", ".join(map(str, one["states"])), one["kind"], one["seen"]]
-        for one in looked["failed"]
-    ]
-    kinds = Counter(one["kind"] for one in looked["failed"] for _ in one["states"])
-    counted = ", ".join(f"{kind} {n}" for kind, n in kinds.most_common())
-    return f"\n\nBy a look at a film of each: {counted}.\n\n{table(heads, rows)}"
 
 
 def _main(result: Quoted) -> str:
@@ -199,7 +179,7 @@ def _failures(result: Quoted) -> str:
         "Geometric constraints: of the others, those of tasks that push, open or turn. Else small tolerances."
     )
     paper = f"{table(['Category', 'Episodes'], rows)}\n\n{rule} {share}"
-    return f"{paper}\n\n{_sorted(result)}{_looked_at(result)}" + (f"\n\n{listed}." if n else "")
+    return f"{paper}\n\n{_sorted(result)}{looked_at(result)}" + (f"\n\n{listed}." if n else "")
 
 
 def _execution(result: Quoted) -> str:
