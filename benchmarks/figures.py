@@ -104,6 +104,7 @@ LIBERO_GOAL = "--demos=10 --states=50 --tasks=0-9"
 PLACES = {
     "libero_spatial": "--suite=libero_spatial",
     "libero_object": "--suite=libero_object",
+    "libero_object_exchanged": "--suite=libero_object --exchanged=true",
     "libero_goal": "--suite=libero_goal --scenes=10",
     "libero_goal_patches": "--suite=libero_goal --scenes=10 --kinds=patches",
     "libero_goal_shape": "--suite=libero_goal --scenes=10 --kinds=shape",

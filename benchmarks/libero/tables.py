@@ -58,6 +58,13 @@ SORTED = (
     "gripped or pushed but without reaching the goal. Collisions are told by a look alone: objects that are "
     "not of the task are touched in episodes that succeed too."
 )
+# Of what scenes a figure is, where its suite does not say it.
+SCENES = {
+    "places_libero_object": "LIBERO's own draw hardly moves these things between the scenes of a task, some "
+    "not at all, so this figure proves little; the next one is of the same things, exchanged.",
+    "places_libero_object_exchanged": "All but the basket changed places, and LIBERO's range of each place "
+    "was widened by 2 cm on every side.",
+}
 PLACES: Columns = {
     "Known by": lambda row: row["learned"] or "not learned",
     "Grasped in": "grasped",
@@ -93,6 +100,11 @@ def libero_sections() -> list[str]:
             section("Error of the object poses", "libero_accuracy", _accuracy),
             section("The things of libero_spatial, found by a first look", "places_libero_spatial", _places),
             section("The things of libero_object, found by a first look", "places_libero_object", _places),
+            section(
+                "Things of libero_object that changed places, found by a first look",
+                "places_libero_object_exchanged",
+                _places,
+            ),
             section("Things of LIBERO-GOAL that changed places", "places_libero_goal_exchanged", _places),
             section(
                 "Kinds of objects, and how many demonstrations",
@@ -235,9 +247,9 @@ def _places(result: Quoted) -> str:
         f"{percent(sure)} of {sure['n']} estimates with a confidence above 0.95 are within 10 mm and 10 "
         f"degrees. Learning the objects took {learned['learn_objects_s']:.0f} s of the "
         f"{learned['seconds']:.0f} s of mining. A first look at all of them takes {spent['median']:.0f} ms "
-        f"of a processor (95th percentile {spent['p95']:.0f})."
+        f"of a processor (95th percentile {spent['p95']:.0f}). {SCENES.get(result.name, '')}"
     )
-    return f"{grid(rows, PLACES, 'Thing')}\n\n{note}"
+    return f"{grid(rows, PLACES, 'Thing')}\n\n{note.strip()}"
 
 
 def _kinds(results: list[Quoted]) -> str:

@@ -236,6 +236,7 @@ def test_every_thing_that_was_touched_has_a_row_whether_it_was_learned_or_not(re
     )
     assert "| basket | not learned | 0 |" in text
     assert "took 80 s of the 200 s of mining" in text
+    assert "this figure proves little" in text
 
 
 def test_the_curve_of_few_demonstrations_ends_with_the_main_result(results):
