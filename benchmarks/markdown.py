@@ -12,7 +12,8 @@ from benchmarks.staleness import ROOT, read_result
 
 NO_FIGURES = {*PROVENANCE, "interval"}
 # By a figure's command: of which commit's result films were looked at, and what they show. An episode is
-# known by its initial state, or by its seed where scenes are drawn.
+# known by its initial state, or by its seed where scenes are drawn. Where films are of an earlier run, in
+# which the same episodes failed for the same reasons, `filmed` is the commit of that.
 LOOKED_AT = ROOT / "docs/looked_at.json"
 
 
@@ -90,7 +91,9 @@ def looked_at(result: Quoted) -> str:
     kinds = Counter(one["kind"] for one in looked["failed"] for _ in one[episodes.lower()])
     counted = ", ".join(f"{kind} {n}" for kind, n in kinds.most_common())
     heads = ["Task", episodes, "Failed by", "What is seen"]
-    return f"\n\nBy a look at a film of each: {counted}.\n\n{table(heads, rows)}"
+    earlier = looked.get("filmed")
+    of = f" in the run of commit `{earlier}`, where the same failed for the same reasons" if earlier else ""
+    return f"\n\nBy a look at a film of each{of}: {counted}.\n\n{table(heads, rows)}"
 
 
 def percent(run: dict[str, Any]) -> str:

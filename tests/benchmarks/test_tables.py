@@ -162,6 +162,13 @@ def test_what_films_show_is_told_of_the_commit_whose_episodes_they_are_of(result
         row = "| put the bowl | 3, 7 | collision | the hand stands on the rack |"
         assert (row in tables.results_page()) == is_told
         assert ("film of each: collision 2." in tables.results_page()) == is_told
+    by_seed = {"task": "put_the_bowl", "seeds": [1003], "kind": "grasp", "seen": "it slips"}
+    of_earlier = {"commit": result["commit"], "filmed": "ba9876543210", "failed": [by_seed]}
+    markdown.LOOKED_AT.write_text(json.dumps({result["command"]: of_earlier}))
+    text = tables.results_page()
+    assert "| Task | Seeds | Failed by | What is seen |" in text
+    assert "| put the bowl | 1003 | grasp |" in text
+    assert "film of each in the run of commit `ba9876543210`" in text
 
 
 def test_what_films_show_is_kept_of_every_failed_episode_of_a_committed_result_once():
