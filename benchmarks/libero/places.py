@@ -9,9 +9,10 @@ at each of many seeded scenes with the simulator's poses. Everything is kept, an
 from __future__ import annotations
 
 import functools
+import itertools
 import json
 import time
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -57,7 +58,7 @@ from lerobot_openspm.types import Detections, Hand, PoseEstimate
 
 FIRST_SEED, FIRST_TUNING_SEED = 20_000, TUNING_SEED_START + 600_000
 # LIBERO at times draws two things into each other, and one is thrown off: it still moves after half a second.
-STILL_M, STILL_STEPS, REDRAWN = 0.002, 10, 1000
+STILL_M, STILL_STEPS, REDRAWN = 0.002, 10, 10_000
 LEARNED = "learned.json"
 
 
@@ -70,7 +71,7 @@ class PlacesConfig:
         exchanged: Whether things change places in the scenes, see `variants`.
         demos: Demonstrations a task to learn from.
         kinds: Of objects that are asked to learn, several with commas, or "all".
-        scenes: Of each task, all from the same seeds.
+        scenes: Of each task. Every scene has a seed of its own: tasks of a suite may draw alike.
         dataset: The demonstrations; recorded if not given.
         output: Folder for what is measured; outputs/bench/NAME if not given.
         workers: Scenes at a time, each in a process of its own; a single one stays in this process.
@@ -108,6 +109,11 @@ class PlacesConfig:
     def first_seed(self) -> int:
         """The first scene's seed."""
         return FIRST_TUNING_SEED if self.tuning else FIRST_SEED
+
+    def drawn(self, tasks: Sequence[str]) -> list[tuple[str, int]]:
+        """Task and seed of every scene."""
+        scenes = itertools.product(tasks, range(self.scenes))
+        return [(task, seed) for seed, (task, _) in enumerate(scenes, self.first_seed)]
 
     @property
     def simulator(self) -> str:
@@ -173,10 +179,10 @@ def learning(names: Collection[str]) -> dict[str, Kind]:
     return kinds
 
 
-def look_at_scene(config: PlacesConfig, folder: Path, task: str, number: int) -> Row:
+def look_at_scene(config: PlacesConfig, folder: Path, task: str, seed: int) -> Row:
     """Draw a scene, look once for everything that the hand touched, and compare with the simulator."""
     memory, frames = _memory(folder)
-    simulator, seed = draw(task, config.first_seed + number, config.exchanged)
+    simulator, seed = draw(task, seed, config.exchanged)
     poses = simulator.object_poses()
     seen = observe(memory, simulator)
     estimates, spent_s = look(memory, seen, several_of_a_kind(poses, memory.objects))
@@ -260,7 +266,7 @@ def main(config: PlacesConfig) -> dict[str, Any]:
     folder = measured_folder(output, files, options, __file__)
     learned = learn(root, folder, config.asked())
     tasks = find_suite(config.simulator).tasks("all")
-    jobs = {f"{task} {i}": (config, folder, task, i) for task in tasks for i in range(config.scenes)}
+    jobs = {f"{task} {seed}": (config, folder, task, seed) for task, seed in config.drawn(tasks)}
     rows = resume(folder / "scenes.jsonl", jobs, look_at_scene, config.workers)
     for told in learned["objects"].values():
         del told["T_sim_obj"]

@@ -139,6 +139,13 @@ def test_every_thing_that_the_hand_touched_is_in_a_scenes_row(tmp_path: Path, mo
     assert row["objects"]["black bowl"] == {"found": False, "confidence": 0.0, "of": 1}
 
 
+def test_no_two_scenes_have_the_same_seed():
+    # The tasks of libero_goal draw the same scene from a seed.
+    drawn = PlacesConfig(scenes=10).drawn(["one", "another"])
+    assert [task for task, _ in drawn] == ["one"] * 10 + ["another"] * 10
+    assert len({seed for _, seed in drawn}) == 20
+
+
 def test_another_suite_is_refused_by_name():
     with pytest.raises(ValueError, match="expected one of libero_goal, libero_spatial, libero_object"):
         PlacesConfig("libero_90")
