@@ -49,9 +49,9 @@ def judged(
         return row
     period, model = true_period(name, LIBERO), models[name]
     shows_yaw = period > 0 and model.yaw_period > 0 and not isinstance(model, PatchModel)
-    # However a round thing is found turned, its middle stays; its frame may lie beside that, and does not.
-    point = np.asarray(model.points, float).mean(0) if period == 0 and len(model.points) else np.zeros(3)
-    middle = se3.transform(np.eye(3), np.array([*point[:2], 0.0]))
+    # However a round thing is found turned, its axis stays. The simulator's frame lies on that, the learned
+    # one may lie beside it.
+    middle = se3.inverse(T_sim_obj) if period == 0 else np.eye(4)
     there, found = [T @ middle for T in there], [T @ middle for T in (estimate.T_world_obj, *estimate.others)]
     T_found = meant.T_world_obj @ middle
     metres, radians = pose_error(there[0], T_found, period)
