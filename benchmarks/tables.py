@@ -14,6 +14,7 @@ from benchmarks.figures import FIGURES
 from benchmarks.libero.tables import libero_sections
 from benchmarks.markdown import (
     STEPS,
+    SUCCESS,
     Columns,
     Quoted,
     chapter,
@@ -29,6 +30,7 @@ from benchmarks.markdown import (
 from benchmarks.memory_tables import memory_sections
 from benchmarks.perception_tables import perception_sections
 from benchmarks.staleness import ROOT, origin, read_result
+from lerobot_openspm.cli.pipeline import rate
 
 INTRODUCTION = """# Results
 
@@ -156,7 +158,8 @@ def _demo(result: Quoted) -> str:
     }
     told = ", ".join(f"{what} {s:.0f} s" for what, s in seconds.items() if s is not None)
     overall = grid({"all ten tasks": result}, STEPS)
-    return f"{overall}\n\n{told.capitalize()}.\n\n{_per_task({'success': result})}{looked_at(result)}"
+    per_task = grid(_of_each(result), SUCCESS, "Task")
+    return f"{overall}\n\n{told.capitalize()}.\n\n{per_task}{looked_at(result)}"
 
 
 def _execution(result: Quoted) -> str:
@@ -170,8 +173,9 @@ def _with_tasks(result: Quoted) -> str:
 
 def _selection(result: Quoted) -> str:
     ((name, run),) = result["runs"].items()
-    rows = [[text, f"{100 * run['per_task'][task]:.0f} %"] for task, text in result["instructions"].items()]
-    return f"{grid(result['runs'], STEPS)}\n\n{NOTES[name]}\n\n{table(['Instruction', 'Success'], rows)}"
+    per_task = _of_each(run)
+    rows = {text: per_task[task] for task, text in result["instructions"].items()}
+    return f"{grid(result['runs'], STEPS)}\n\n{NOTES[name]}\n\n{grid(rows, SUCCESS, 'Instruction')}"
 
 
 def _anywhere(result: Quoted) -> str:
@@ -206,6 +210,12 @@ def _per_task(runs: dict[str, Any]) -> str:
     tasks = next(iter(runs.values()))["per_task"]
     rows = [[task, *(f"{100 * run['per_task'][task]:.0f} %" for run in runs.values())] for task in tasks]
     return table(["Task", *(name.replace("_", " ") for name in runs)], rows)
+
+
+def _of_each(run: dict[str, Any]) -> dict[str, dict[str, Any]]:
+    """Success of each task, of which there were equally many episodes."""
+    n = run["n"] // len(run["per_task"])
+    return {task: rate(round(success * n), n) for task, success in run["per_task"].items()}
 
 
 def drop_what_is_not_current() -> list[Path]:

@@ -243,9 +243,10 @@ def _places(result: Quoted) -> str:
         "it. Seeded scenes that none of them shows; the hand is somewhere else in each. Shares are of the "
         "scenes that hold the thing, whether it was learned or not; of several of a kind the one that the "
         "instruction is about counts, as the policy tells it, and their column says in how many scenes each "
-        "of them is within 10 mm. Of a round thing it is the middle of the learned surface that is compared. "
-        f"{percent(sure)} of {sure['n']} estimates with a confidence above 0.95 are within 10 mm and 10 "
-        f"degrees. Learning the objects took {learned['learn_objects_s']:.0f} s of the "
+        "of them is within 10 mm. A round thing is where its axis is. "
+        f"{percent(sure)} ({interval(sure)}) of {sure['n']} estimates with a confidence above 0.95 are "
+        "within 10 mm and 10 degrees. "
+        f"Learning the objects took {learned['learn_objects_s']:.0f} s of the "
         f"{learned['seconds']:.0f} s of mining. A first look at all of them takes {spent['median']:.0f} ms "
         f"of a processor (95th percentile {spent['p95']:.0f}). {SCENES.get(result.name, '')}"
     )
@@ -265,12 +266,15 @@ def _kinds(results: list[Quoted]) -> str:
         "Learned": "learned",
         **{head: PLACES[head] for head in ("Found", "Within 10 mm", "95 % interval", "Median, mm")},
         "Right of those above 0.95": lambda row: f"{percent(row['sure'])} of {row['sure']['n']}",
+        "Its 95 % interval": lambda row: interval(row["sure"]),
         "First look, ms": "spent",
     }
     note = (
         "The kinds that are asked to learn, where things stand in the scenes, as LIBERO draws them or in one "
         "another's places, and from how many demonstrations a task. All things that the hand touched, the "
-        "same scenes for all. Boxes are learned from a segmenter's masks and are not compared."
+        "same scenes for all. Boxes are learned from a segmenter's masks and are not compared. Where all are "
+        "asked, objects that begin at a few places are learned by their surface, and those that are moved "
+        "about by their shape: see [method.md](method.md)."
     )
     return f"{grid(rows, columns, 'Kinds')}\n\n{note}"
 
@@ -293,8 +297,10 @@ def _wrong_calibration(result: Quoted) -> str:
     note = (
         "Seeded scenes of libero_goal in which one camera at a time is not where its calibration says. Axes "
         "are the camera's own; it looks along its z. Told: at the first look, before anything moves, some "
-        "camera is not believed. Named: that which is off alone. `image` stands in the room, `image2` goes "
-        "with the hand. With both where they should be, one is not believed in "
+        "camera is not believed. Named: that which is off alone; of two cameras it cannot be told which is, "
+        "and both are named. An error along the line of sight, or about it, hardly moves what a camera looks "
+        "at. `image` stands in the room, `image2` goes with the hand. With both where they should be, one is "
+        "not believed in "
         f"{percent(right)} of {right['n']} scenes."
     )
     return f"{grid(rows, columns, 'Camera and error')}\n\n{note}"

@@ -8,6 +8,7 @@ one of its axes. To which side is drawn with the scene.
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -35,7 +36,7 @@ from lerobot_openspm.perception.pipeline import Perception
 OFF_M, OFF_RAD = 0.02, np.deg2rad(3.0)
 # Of a camera; it looks along its z.
 AXES = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
-SCENES, FIRST_SEED, FIRST_TUNING_SEED = 2, 30_000, TUNING_SEED_START + 800_000
+SCENES, FIRST_SEED, FIRST_TUNING_SEED = 20, 30_000, TUNING_SEED_START + 800_000
 
 
 @dataclass
@@ -43,7 +44,7 @@ class WrongCalibrationConfig:
     """What to measure.
 
     Args:
-        scenes: Of each task, all from the same seeds.
+        scenes: Each of a seed of its own, the tasks in turn.
         output: Folder for what is measured.
         workers: Scenes at a time, each in a process of its own; a single one stays in this process.
         tuning: Take scenes of tuning seeds; nothing is published then.
@@ -62,6 +63,11 @@ class WrongCalibrationConfig:
     def first_seed(self) -> int:
         """The first scene's seed."""
         return FIRST_TUNING_SEED if self.tuning else FIRST_SEED
+
+    def drawn(self, tasks: Sequence[str]) -> list[tuple[str, int]]:
+        """Task and seed of every scene. Tasks of libero_goal draw the same scene from a seed."""
+        seeds = range(self.first_seed, self.first_seed + self.scenes)
+        return list(zip(itertools.cycle(tasks), seeds, strict=False))
 
 
 def errors(rng: np.random.Generator) -> dict[str, Array]:
@@ -89,10 +95,10 @@ def told(memory: Memory, seen: Observation) -> list[str]:
     return sorted(perception.detect(seen, list(memory.objects), {}, 0.0).faults)
 
 
-def look_at_scene(config: WrongCalibrationConfig, checkpoint: Path, task: str, number: int) -> Row:
+def look_at_scene(config: WrongCalibrationConfig, checkpoint: Path, task: str, seed: int) -> Row:
     """The cameras that are not believed in a scene: as calibrated, and by camera and error."""
     memory = load(str(checkpoint)).require_memory()
-    simulator, seed = draw(task, config.first_seed + number, False)
+    simulator, seed = draw(task, seed, False)
     seen, rng = observe(memory, simulator), np.random.default_rng(seed)
     off = {
         camera: {name: told(spoilt(memory, camera, T), seen) for name, T in errors(rng).items()}
@@ -121,7 +127,7 @@ def main(config: WrongCalibrationConfig) -> dict[str, Any]:
     code = [Path(str(module.__file__)) for module in (evaluate, places)]
     files = [*checkpoint_files(checkpoint), *code]
     folder = measured_folder(Path(config.output), files, [str(config.tuning)], __file__)
-    jobs = {f"{task} {i}": (config, checkpoint, task, i) for task in tasks() for i in range(config.scenes)}
+    jobs = {f"{task} {seed}": (config, checkpoint, task, seed) for task, seed in config.drawn(list(tasks()))}
     rows = resume(folder / "scenes.jsonl", jobs, look_at_scene, config.workers)
     measured = {"seed": config.first_seed, "n": len(rows), **summary(rows)}
     return measured if config.tuning else write("wrong_calibration_libero", measured, config.workers)

@@ -107,7 +107,7 @@ def test_kinds_of_objects_are_compared_line_by_line(results):
             all={"found": found, "within_10_mm": RATE, "position_mm_median": 4.2},
         )  # fmt: skip
     page = tables.results_page()
-    told = "1 of 2 | 50.0 % | 50.0 % | 15.0 to 85.0 % | 4.2 | 50.0 % of 4 | 310.0 |"
+    told = "1 of 2 | 50.0 % | 50.0 % | 15.0 to 85.0 % | 4.2 | 50.0 % of 4 | 15.0 to 85.0 % | 310.0 |"
     assert f"| all, as in LIBERO, 10 a task | {told}" in page
     assert "| shape, as in LIBERO, 10 a task | 1 of 2 | - | 50.0 %" in page
 

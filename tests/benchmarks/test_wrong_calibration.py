@@ -66,6 +66,12 @@ def test_every_camera_and_error_is_looked_at_and_counted(monkeypatch: pytest.Mon
         assert (row["success"], row["named"]) == ((1.0, 2) if error.startswith("2 cm") else (0.0, 0))
 
 
+def test_no_two_scenes_have_the_same_seed():
+    drawn = WrongCalibrationConfig(scenes=5).drawn(["one", "another"])
+    assert [task for task, _ in drawn] == ["one", "another", "one", "another", "one"]
+    assert len({seed for _, seed in drawn}) == 5
+
+
 @pytest.mark.parametrize("told", [["observation.images.wrist"], [FRONT, "observation.images.wrist"]])
 def test_an_error_for_which_another_camera_is_blamed_too_is_told_but_not_named(told: list[str]):
     row = {"right": [], "off": {FRONT: {"2 cm along x": told}}}
@@ -78,5 +84,5 @@ def test_an_error_for_which_another_camera_is_blamed_too_is_told_but_not_named(t
 def test_none_of_anything_is_refused():
     with pytest.raises(ValueError, match="must be at least 1, got 0 and 2"):
         WrongCalibrationConfig(scenes=0)
-    with pytest.raises(ValueError, match="must be at least 1, got 2 and 0"):
+    with pytest.raises(ValueError, match="must be at least 1, got 20 and 0"):
         WrongCalibrationConfig(workers=0)
