@@ -80,12 +80,12 @@ def _cost(result: Quoted) -> str:
             "its surface, and not by its patches, which know it where it stood. That is timed in one scene."
         )
     return (
-        f"{result['episodes']} episodes; the ten tasks share their scenes seed by seed. "
-        f"A look for {found['objects']} objects in {found['views']} views of 256 pixels takes {first['median']:.1f} ms (median; p99 {first['p99']:.1f}) at the start of an "
-        f"episode, where {found['found']} of them are found and the cameras are compared, and "
-        f"{followed['median']:.1f} ms ({followed['p99']:.1f}) when they are followed.{moved} A step of the "
-        f"filter takes {one['median']:.0f} us for one object and {twenty['median']:.0f} us for twenty; one "
-        "thread."
+        f"{result['episodes']} episodes; the ten tasks share their scenes seed by seed. A look for "
+        f"{found['objects']} objects in {found['views']} views of 256 pixels takes {first['median']:.1f} ms "
+        f"(median; p99 {first['p99']:.1f}) at the start of an episode, where {found['found']} of them are "
+        f"found and the cameras are compared, and {followed['median']:.1f} ms ({followed['p99']:.1f}) when "
+        f"they are followed.{moved} A step of the filter takes {one['median']:.0f} us for one object and "
+        f"{twenty['median']:.0f} us for twenty; one thread."
     )
 
 
