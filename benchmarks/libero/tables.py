@@ -50,6 +50,10 @@ TOUCHED = (
     "more than 1 cm."
 )
 
+SEEN_BEFORE = (
+    "[libero.md](libero.md) says how often these episodes were run while the policy was developed, and what "
+    "was learned from them."
+)
 SORTED = (
     "Failed episodes by a rule; the first that fits counts. Words: the instruction was not understood. "
     "Perception: an object was not found or was lost, a camera was not believed, or a pose was more than "
@@ -124,7 +128,7 @@ def libero_sections() -> list[str]:
 
 def _variant(result: Quoted) -> str:
     per_task = grid({"all ten tasks": result, **result["per_task"]}, {**STEPS, **CONTACTS})
-    return f"{per_task}\n\n{TOUCHED}\n\n{_sorted(result)}{looked_at(result)}"
+    return f"{per_task}\n\n{TOUCHED} {SEEN_BEFORE}\n\n{_sorted(result)}{looked_at(result)}"
 
 
 def _sorted(result: Quoted) -> str:
