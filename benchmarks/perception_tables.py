@@ -74,7 +74,7 @@ def _cost(result: Quoted) -> str:
     if elsewhere := cost.get("moved"):
         anew, again = elsewhere["first_ms"], elsewhere["followed_ms"]
         moved = (
-            f" Where things have changed places it takes {anew['median']:.0f} ms ({anew['p99']:.0f}), where "
+            f" Where objects have changed places it takes {anew['median']:.0f} ms ({anew['p99']:.0f}), where "
             f"{elsewhere['found']} are found, and {again['median']:.0f} ms ({again['p99']:.0f}) when they "
             "are followed with all looks that are remembered: there each is sought over the whole table by "
             "its surface, and not by its patches, which know it where it stood. That is timed in one scene."

@@ -64,9 +64,9 @@ SORTED = (
 )
 # Of what scenes a figure is, where its suite does not say it.
 SCENES = {
-    "places_libero_object": "LIBERO's own draw hardly moves these things between the scenes of a task, some "
-    "not at all, so this figure proves little; the next one is of the same things, exchanged.",
-    "places_libero_object_exchanged": "All but the basket changed places, and LIBERO's range of each place "
+    "places_libero_object": "LIBERO's own draw hardly moves these objects between the scenes of a task, some "
+    "not at all, so this figure proves little; the next one is of the same objects, swapped.",
+    "places_libero_object_exchanged": "All but the basket swapped places, and LIBERO's range of each place "
     "was widened by 2 cm on every side.",
 }
 PLACES: Columns = {
@@ -102,14 +102,18 @@ def libero_sections() -> list[str]:
             section("How key poses are followed", "libero_ablations", _execution),
             section("Where key poses come from", "libero_ablations", _memory),
             section("Error of the object poses", "libero_accuracy", _accuracy),
-            section("The things of libero_spatial, found by a first look", "places_libero_spatial", _places),
-            section("The things of libero_object, found by a first look", "places_libero_object", _places),
+            section("Objects of libero_spatial, found by a first look", "places_libero_spatial", _places),
+            section("Objects of libero_object, found by a first look", "places_libero_object", _places),
             section(
-                "Things of libero_object that changed places, found by a first look",
+                "Objects of libero_object that swapped places, found by a first look",
                 "places_libero_object_exchanged",
                 _places,
             ),
-            section("Things of LIBERO-GOAL that changed places", "places_libero_goal_exchanged", _places),
+            section(
+                "Objects of LIBERO-GOAL that swapped places, found by a first look",
+                "places_libero_goal_exchanged",
+                _places,
+            ),
             section(
                 "Kinds of objects, and how many demonstrations",
                 [n for n in FIGURES if n.startswith("places_libero_goal")],
@@ -245,16 +249,16 @@ def _places(result: Quoted) -> str:
     note = (
         f"All that the hand touched in {learned['episodes']} demonstrations, and in how many it took hold of "
         "it. Seeded scenes that none of them shows; the hand is somewhere else in each. Shares are of the "
-        "scenes that hold the thing, whether it was learned or not; of several of a kind the one that the "
+        "scenes that hold the object, whether it was learned or not; of several of a kind the one that the "
         "instruction is about counts, as the policy tells it, and their column says in how many scenes each "
-        "of them is within 10 mm. A round thing is where its axis is. "
+        "of them is within 10 mm. A round object is where its axis is. "
         f"{percent(sure)} ({interval(sure)}) of {sure['n']} estimates with a confidence above 0.95 are "
         "within 10 mm and 10 degrees. "
         f"Learning the objects took {learned['learn_objects_s']:.0f} s of the "
         f"{learned['seconds']:.0f} s of mining. A first look at all of them takes {spent['median']:.0f} ms "
         f"of a processor (95th percentile {spent['p95']:.0f}). {SCENES.get(result.name, '')}"
     )
-    return f"{grid(rows, PLACES, 'Thing')}\n\n{note.strip()}"
+    return f"{grid(rows, PLACES, 'Object')}\n\n{note.strip()}"
 
 
 def _kinds(results: list[Quoted]) -> str:
@@ -274,11 +278,11 @@ def _kinds(results: list[Quoted]) -> str:
         "First look, ms": "spent",
     }
     note = (
-        "The kinds that are asked to learn, where things stand in the scenes, as LIBERO draws them or in one "
-        "another's places, and from how many demonstrations a task. All things that the hand touched, the "
-        "same scenes for all. Boxes are learned from a segmenter's masks and are not compared. Where all are "
-        "asked, objects that begin at a few places are learned by their surface, and those that are moved "
-        "about by their shape: see [method.md](method.md)."
+        "The kinds that are asked to learn, where objects stand in the scenes, as LIBERO draws them or in "
+        "one another's places, and from how many demonstrations a task. All objects that the hand touched, "
+        "the same scenes for all. Boxes are learned from a segmenter's masks and are not compared. Where "
+        "all are asked, objects that begin at a few places are learned by their surface, and those that "
+        "are moved about by their shape: see [method.md](method.md)."
     )
     return f"{grid(rows, columns, 'Kinds')}\n\n{note}"
 
