@@ -76,8 +76,8 @@ def _cost(result: Quoted) -> str:
         moved = (
             f" Where objects have changed places it takes {anew['median']:.0f} ms ({anew['p99']:.0f}), where "
             f"{elsewhere['found']} are found, and {again['median']:.0f} ms ({again['p99']:.0f}) when they "
-            "are followed with all looks that are remembered: there each is sought over the whole table by "
-            "its surface, and not by its patches, which know it where it stood. That is timed in one scene."
+            "are followed with all looks that are remembered. The first look there searches the whole table "
+            "by their surfaces; where objects stand as shown, patches find them. It is timed in one scene."
         )
     return (
         f"{result['episodes']} episodes; the ten tasks share their scenes seed by seed. A look for "

@@ -212,6 +212,7 @@ def test_first_looks_anywhere_are_told_beside_success_and_so_is_which_layouts_ar
     run = {**RATE, "per_task": {"a": 0.5}}
     put(results, "anywhere", n=4, runs={"anywhere": run}, instructions={"a": "do a"}, first_looks=looks)
     text = tables.results_page()
+    assert "| do a | 50.0 % | 15.0 to 85.0 % | 4 |" in text
     assert "| all that are known | 70 | 2 | 2.5 | 6.0 | 1.5 | 3 |" in text
     assert "| those that the task needs | 20 |" in text
     assert "it was reported in 50.0 % of 4 looks" in text
@@ -281,5 +282,6 @@ def test_what_had_no_episode_is_a_dash():
 def test_the_time_of_the_whole_is_told_where_nothing_was_kept(results):
     put(results, "tabletop", **RATE, train_s=100.0, total_s=200.0, per_task={"push_plate": 0.5})
     assert "with recording and evaluating 200 s" in tables.results_page()
+    assert "| push plate | 50.0 % | 15.0 to 85.0 % | 4 |" in tables.results_page()
     results["tabletop"]["total_s"] = None
     assert "with recording" not in tables.results_page()
