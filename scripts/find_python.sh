@@ -35,7 +35,8 @@ if command -v uv >/dev/null 2>&1; then
   found=$(uv python find --system '>=3.12,<3.14' 2>/dev/null </dev/null) && candidates+=("$found")
 fi
 candidates+=(python3.12 python3.13 python3 python)
-for pattern in "$HOME"/.pyenv/versions/3.12*/bin/python3.12 "$HOME"/.pyenv/versions/3.13*/bin/python3.13; do
+pyenv=${PYENV_ROOT:-$HOME/.pyenv}
+for pattern in "$pyenv"/versions/3.12*/bin/python3.12 "$pyenv"/versions/3.13*/bin/python3.13; do
   [ -x "$pattern" ] && candidates+=("$pattern")
 done
 

@@ -186,7 +186,7 @@ def _failures(result: Quoted) -> str:
     rows = [[name, count] for name, count in counts.items()]
     listed = "; ".join(
         f"{f['task'].replace('_', ' ')}, state {f['state']}: {f['reason']}, after {f['attempts']} further "
-        f"attempts, objects within {f['off_mm']} mm"
+        f"{'attempt' if f['attempts'] == 1 else 'attempts'}, objects within {f['off_mm']} mm"
         for f in result["failed"]
     )
     share = (

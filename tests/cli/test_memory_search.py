@@ -23,6 +23,7 @@ def test_without_a_scene_two_terms_are_shown(openspm: Openspm, checkpoint: Path)
     assert "asked: operation: put, target: bowl, relation: on, landmark: plate" in text
     assert text.count("'put the bowl on the plate' from local/openspm_tabletop#") == 2
     assert "turn on the stove" not in text
+    assert "... 1 more; --limit=3 lists all" in text
     assert (found["considered"], found["refusal"], found["status"], found["objects"]) == (3, None, None, {})
     for hit in found["entries"]:
         assert hit["geometric"] is None
@@ -48,6 +49,7 @@ def test_in_a_scene_all_three_are_and_the_scenes_own_demonstration_fits_best(
         assert hit["total"] == pytest.approx(terms)
         assert f"{hit['geometric']:.3f}" in text
     assert [hit["geometric"] for hit in found["entries"][3:]] == [None]
+    assert " more; " not in text
 
 
 def test_what_the_policy_refuses_says_why_and_what_is_nearest(

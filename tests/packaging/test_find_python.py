@@ -11,7 +11,9 @@ SCRIPT = Path(__file__).parents[2] / "scripts" / "find_python.sh"
 BASE = Path(sys._base_executable).resolve()  # type: ignore[attr-defined]
 
 
-def find(home: Path, *folders: Path, python: str = "") -> subprocess.CompletedProcess[str]:
+def find(
+    home: Path, *folders: Path, python: str = "", pyenv: Path | None = None
+) -> subprocess.CompletedProcess[str]:
     """Run the script with nothing on PATH but `folders` and the shell's own tools."""
     tools = home / "tools"
     tools.mkdir(exist_ok=True)
@@ -21,6 +23,7 @@ def find(home: Path, *folders: Path, python: str = "") -> subprocess.CompletedPr
                 next(p for p in (Path("/bin", tool), Path("/usr/bin", tool)) if p.exists())
             )
     env = {"PATH": os.pathsep.join(map(str, [*folders, tools])), "HOME": str(home), "PYTHON": python}
+    env |= {"PYENV_ROOT": str(pyenv)} if pyenv else {}
     return subprocess.run([SCRIPT], env=env, capture_output=True, text=True, check=False)
 
 
@@ -57,6 +60,13 @@ def test_pyenv_versions_are_found_behind_their_shims(tmp_path: Path, broken: Pat
     program(tmp_path / ".pyenv/versions/3.12.9/bin/python3.12", f'exec "{BASE}" "$@"')
     done = find(tmp_path, broken)
     assert done.returncode == 0, done.stderr
+    assert Path(done.stdout.strip()).resolve() == BASE
+
+
+def test_pyenv_may_be_installed_elsewhere(tmp_path: Path, broken: Path):
+    program(tmp_path / "tools/pyenv/versions/3.13.1/bin/python3.13", f'exec "{BASE}" "$@"')
+    assert find(tmp_path, broken).returncode == 1
+    done = find(tmp_path, broken, pyenv=tmp_path / "tools/pyenv")
     assert Path(done.stdout.strip()).resolve() == BASE
 
 

@@ -6,7 +6,7 @@ import logging
 import subprocess
 import sys
 
-from draccus.utils import ParsingError
+from draccus.utils import DecodingError, ParsingError
 
 from lerobot_openspm.cli.options import run_command
 from lerobot_openspm.errors import OpenSPMError
@@ -42,7 +42,13 @@ def main() -> None:
 
 
 def reason(error: BaseException) -> BaseException:
-    """What a configuration said of its own values, where the parser only says that it could not be made."""
+    """What a configuration said of its own values, or which option could not be read, and why."""
+    unread = None
     while isinstance(error, ParsingError) and error.__cause__ is not None:
+        unread = error if isinstance(error, DecodingError) else None
         error = error.__cause__
-    return error
+    if unread is None:
+        return error
+    # Of an option that takes several types, the parser tells about each on a line; ours take one, or none.
+    *_, said = unread.message.strip().splitlines()
+    return OpenSPMError(f"--{'.'.join(unread.key_path)}: {said.strip()}")

@@ -100,6 +100,8 @@ def _lines(found: Found, limit: int) -> list[str]:
     for number, part in enumerate(found.parts, start=1):
         lines += [f"  part {number} of {len(found.parts)}:"] if len(found.parts) > 1 else []
         lines += [_hit(hit) for hit in part[:limit]]
+        left_out = len(part) - limit
+        lines += [f"  ... {left_out} more; --limit={len(part)} lists all"] if left_out > 0 else []
     if others := _others(found, limit):
         lines += ["  not considered, the best entry of each task:", *map(_hit, others)]
     return lines

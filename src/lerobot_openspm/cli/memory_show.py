@@ -168,7 +168,7 @@ def _table(entry: MemoryEntry) -> list[str]:
         f"{trials}"
     )
     names = f"{'phase':10s} {'place':18s} {'axes':18s}"
-    columns = f"  {names} {'hand in its frame, mm':>24s} {'turn, deg':>22s} gripper conf."
+    columns = f"  {names} {'hand in its frame, mm':>24s} {'rotation vector, deg':>22s} gripper conf."
     rows = (_row(pose) for pose in entry.key_poses)
     return [head, columns, *rows, *(_outcome_row(outcome) for outcome in entry.outcomes)]
 
