@@ -47,9 +47,12 @@ NOTES = {
     "two_bowls": "No demonstration shows two bowls; which one is meant is told from where the objects are.",
     "anywhere": "Every object stands within 25 cm of the table's middle at any yaw, beside two distractors "
     "of the colours of bowl and box and a second object of the kind, or a second bowl where the task is a "
-    "drawer or a stove, from the usual demonstrations. A layout "
-    "is used only if some camera shows half of each of the two objects of the same kind, and the scripted "
-    "expert reaches the goal in it; else another one is drawn.",
+    "drawer or a stove, from the usual demonstrations. Layouts are drawn so that nothing touches, the hand "
+    "has room around what can be grasped, the way of a drawer or a push that is asked for is free and in "
+    "reach, and the words leave no doubt (left and right by 12 cm). Of these one is used only if some camera "
+    "shows half of each of the two objects of the same kind, and the scripted expert reaches the goal in it; "
+    "else another one is drawn. The same episodes were run before: at first 91.5 %, then 96.0 % succeeded. "
+    "Why they failed was read from them; what was mended for it was tried on other seeds.",
 }
 PAGE, README = ROOT / "docs/results.md", ROOT / "README.md"
 # What stands between these lines of README is written here.
@@ -118,6 +121,7 @@ def _headlines() -> str:
         ),
         _headline("LIBERO-PRO, objects exchanged", "libero_goal_swap"),
         _headline("LIBERO-PRO, other words", "libero_goal_lan"),
+        _headline("LIBERO-PRO, other looks", "libero_goal_object"),
     ]
     there = [row for row in rows if row is not None]
     if not there:
@@ -200,7 +204,7 @@ def _anywhere(result: Quoted) -> str:
         f"{percent(sure)} ({interval(sure)}) are within 10 mm and 10 degrees. For these scenes "
         f"{layouts['drawn']} layouts were drawn, and {left_out} ({share(left_out / layouts['drawn'])}) not "
         f"used: {layouts['hidden']} do not show one of the two objects well enough, and the expert does not "
-        f"solve {layouts['unsolved']}."
+        f"solve {layouts['unsolved']}. One that is found turned round by half weighs much in a mean yaw."
     )
     success = f"{_selection(result)}{looked_at(result)}"
     return f"{success}\n\n{grid(rows, columns, 'Objects')}\n\n{told}"

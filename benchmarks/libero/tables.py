@@ -65,9 +65,13 @@ SORTED = (
 # Of what scenes a figure is, where its suite does not say it.
 SCENES = {
     "places_libero_object": "LIBERO's own draw hardly moves these objects between the scenes of a task, some "
-    "not at all, so this figure proves little; the next one is of the same objects, swapped.",
-    "places_libero_object_exchanged": "All but the basket swapped places, and LIBERO's range of each place "
-    "was widened by 2 cm on every side.",
+    "not at all, so this figure proves little; the next one is of the same objects, exchanged.",
+    "places_libero_object_exchanged": "The places of all objects but the basket are dealt out anew at "
+    "random: the soup stands elsewhere in 118 of 150 scenes, the cheese in 114 of 150, the dressing in 84 of "
+    "100. LIBERO's range of each place was widened by 2 cm on every side.",
+    "places_libero_goal_exchanged": "One or two pairs of objects are exchanged, and furniture in some "
+    "scenes: the bowl stands elsewhere in 65 of 100 scenes, the cheese in 64, the plate in 58, the bottle "
+    "in 55, the cabinet in 43, the stove in 35, the rack in 26.",
 }
 PLACES: Columns = {
     "Known by": lambda row: row["learned"] or "not learned",
@@ -96,7 +100,7 @@ def libero_sections() -> list[str]:
             section("Success from pixels", "libero_goal", _main),
             section("Time of a decision", "libero_latency", _latency),
             section("Failures", "libero_goal", _failures),
-            section("Objects that changed places (LIBERO-PRO)", "libero_goal_swap", _variant),
+            section("Objects exchanged (LIBERO-PRO)", "libero_goal_swap", _variant),
             section("Instructions in other words (LIBERO-PRO)", "libero_goal_lan", _variant),
             section("Objects that look otherwise (LIBERO-PRO)", "libero_goal_object", _variant),
             section("How key poses are followed", "libero_ablations", _execution),
@@ -105,12 +109,12 @@ def libero_sections() -> list[str]:
             section("Objects of libero_spatial, found by a first look", "places_libero_spatial", _places),
             section("Objects of libero_object, found by a first look", "places_libero_object", _places),
             section(
-                "Objects of libero_object that swapped places, found by a first look",
+                "Objects of libero_object where places are exchanged, found by a first look",
                 "places_libero_object_exchanged",
                 _places,
             ),
             section(
-                "Objects of LIBERO-GOAL that swapped places, found by a first look",
+                "Objects of LIBERO-GOAL where places are exchanged, found by a first look",
                 "places_libero_goal_exchanged",
                 _places,
             ),
@@ -151,7 +155,7 @@ def _main(result: Quoted) -> str:
     per_task = grid({**result["per_task"], "**all**": result}, {**STEPS, **CONTACTS}, "Task")
     return (
         f"{compared}\n\nThe rows above ours are quoted from the paper.\n\n{per_task}\n\n{TOUCHED}\n\n"
-        f"Mining and training {taken}."
+        f"Mining and training {taken}. {SEEN_BEFORE}"
     )
 
 
