@@ -171,6 +171,7 @@ def test_collecting_into_a_foreign_folder_is_one_line(openspm: Openspm, tmp_path
         ),
         (("collect", "--episodes=0"), "episodes must be at least 1, got 0"),
         (("collect", "--episodes=abc"), "openspm collect: --episodes: Couldn't parse 'abc' into an int\n"),
+        (("collect", "--overwrite=maybe"), "--overwrite: Couldn't parse 'maybe' into a bool\n"),
         (
             ("mine", "--policy.reach_margin_m=far"),
             "--policy.reach_margin_m: Couldn't parse 'far' into a float\n",

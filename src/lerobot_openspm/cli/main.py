@@ -47,6 +47,8 @@ def reason(error: BaseException) -> BaseException:
     while isinstance(error, ParsingError) and error.__cause__ is not None:
         unread = error if isinstance(error, DecodingError) else None
         error = error.__cause__
+    if isinstance(error, DecodingError) and error.key_path:
+        unread = error
     if unread is None:
         return error
     # Of an option that takes several types, the parser tells about each on a line; ours take one, or none.
