@@ -26,6 +26,6 @@ def test_every_phase_is_marked_where_it_can_be_seen(apart_m: float):
     phases = ["approach", "grasp", "lift", "place", "release"]
     poses = [hand(0.02, apart_m * (i - 2)) for i in range(len(phases))]
     picture = draw_key_poses(View(WHITE, CAMERA, T_WORLD_CAM), poses, phases)
-    picture[: 18 + 16 * len(phases), :120] = 255  # the legend
+    picture[:100, :100] = 255  # the legend
     seen = {phase: int((picture == PHASE_COLOURS[phase]).all(axis=-1).sum()) for phase in phases}
     assert min(seen.values()) > 20, seen

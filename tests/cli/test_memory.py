@@ -88,7 +88,9 @@ def test_list(openspm: Openspm, memory: Path):
     assert out.splitlines()[0].split() == ["2", "entries", "mean", "quality", "0.75", *repr(BOWL).split()]
     assert len(out.splitlines()) == 2
     assert "limit is -1, expected" in refused(openspm, memory, "list", "--limit=-1")
-    assert "2 more; --limit=3" in openspm("memory", "list", f"--path={memory}", "--limit=1")[1]
+    _, out, _ = openspm("memory", "list", f"--path={memory}", "--limit=1")
+    assert "... 2 more; --limit=3 lists all" in out
+    assert json.loads(out.splitlines()[-1])["listed"] == 1
 
 
 def test_show(openspm: Openspm, memory: Path):
@@ -108,6 +110,7 @@ def test_show(openspm: Openspm, memory: Path):
 def test_show_says_where_an_object_is_found(openspm: Openspm, memory: Path):
     write_memory(replace(made(), objects={**OBJECTS, "stove": patch_model("stove")}), memory)
     _, out, _ = openspm("memory", "show", f"--path={memory}", "--limit=1")
+    assert "... 2 more; --limit=3 shows all" in out
     where = {
         line.split("'")[1]: line.partition(": found ")[2] for line in out.splitlines() if "known by" in line
     }

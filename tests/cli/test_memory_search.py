@@ -24,6 +24,7 @@ def test_without_a_scene_two_terms_are_shown(openspm: Openspm, checkpoint: Path)
     assert text.count("'put the bowl on the plate' from local/openspm_tabletop#") == 2
     assert "turn on the stove" not in text
     assert "... 1 more; --limit=3 lists all" in text
+    assert "... 1 more of other tasks; --limit=4 lists all" in text
     assert (found["considered"], found["refusal"], found["status"], found["objects"]) == (3, None, None, {})
     for hit in found["entries"]:
         assert hit["geometric"] is None

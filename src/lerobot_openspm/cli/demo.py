@@ -68,4 +68,5 @@ def main(args: list[str]) -> None:
         "checkpoint": str(checkpoint),
         "report": str(report),
     }
+    print(f"the page: {report}")
     print(json.dumps(summary))

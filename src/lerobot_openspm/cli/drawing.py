@@ -17,17 +17,19 @@ Image = NDArray[np.uint8]
 # One colour per phase, RGB; the same in every picture.
 PHASE_COLOURS = {
     "approach": (66, 135, 245), "grasp": (230, 60, 60), "lift": (245, 160, 40), "pre-place": (170, 90, 220),
-    "place": (40, 170, 90), "release": (20, 120, 60), "retreat": (120, 120, 120), "push": (230, 60, 60),
-    "open": (200, 40, 120), "turn": (200, 40, 120),
+    "place": (40, 170, 90), "release": (0, 190, 200), "retreat": (30, 30, 30), "push": (230, 60, 60),
+    "open": (130, 80, 40), "turn": (130, 80, 40),
 }  # fmt: skip
 AXIS_M = 0.025
-# Marks are rings. One that would lie on others is drawn around them, so that all are seen.
-RING_PX, WIDTH_PX = 4, 2
+# Marks are discs. One that would lie on others is a ring around them, so that all are seen.
+DISC_PX, RING_PX = 4, 2
+# Of the legend: a row for each phase, on white.
+ROW_PX, LEGEND_PX = 16, 92
 FONT = cv2.FONT_HERSHEY_SIMPLEX
 
 
 def draw_key_poses(view: View, poses: Sequence[Array], phases: Sequence[str], scale: int = 2) -> Image:
-    """Draw hand poses ``T_world_ee`` ``(4, 4)`` into a view: the way, at each the hand's axes and a ring."""
+    """Draw hand poses ``T_world_ee`` ``(4, 4)`` into a view: the way, at each the hand's axes and a mark."""
     height, width = view.image.shape[:2]
     image = cv2.resize(view.image, (width * scale, height * scale), interpolation=cv2.INTER_CUBIC)
     image = np.asarray(image, np.uint8)
@@ -41,7 +43,7 @@ def draw_key_poses(view: View, poses: Sequence[Array], phases: Sequence[str], sc
         for line in (across, back):
             cv2.line(image, line[0].tolist(), line[1].tolist(), colour, 2, cv2.LINE_AA)
     for tip, radius, phase in zip(pixels, _radii(pixels), phases, strict=True):
-        _ring(image, tip.tolist(), radius, phase)
+        _mark(image, tip.tolist(), radius, phase)
     _write_legend(image, phases)
     return image
 
@@ -60,21 +62,23 @@ def _pixels(view: View, points_world: Array, scale: int) -> NDArray[np.int32]:
 
 
 def _radii(pixels: NDArray[np.int32]) -> list[int]:
-    """Radius of the ring at each pixel ``(n, 2)``: one size more than of those before it that it meets."""
+    """Radius of the mark at each pixel ``(n, 2)``: one size more than of those before it that it meets."""
     radii: list[int] = []
     for i, pixel in enumerate(pixels):
         apart = np.linalg.norm(pixels[:i] - pixel, axis=1)
-        met = [radius for radius, px in zip(radii, apart, strict=True) if px < 2 * RING_PX]
-        radii.append(max(met, default=RING_PX - 2 * WIDTH_PX) + 2 * WIDTH_PX)
+        met = [radius for radius, px in zip(radii, apart, strict=True) if px < 2 * DISC_PX]
+        radii.append(max(met) + 2 * RING_PX if met else DISC_PX)
     return radii
 
 
-def _ring(image: Image, center: Sequence[int], radius: int, phase: str) -> None:
-    cv2.circle(image, (center[0], center[1]), radius, PHASE_COLOURS[phase], WIDTH_PX, cv2.LINE_AA)
+def _mark(image: Image, center: Sequence[int], radius: int, phase: str) -> None:
+    width = cv2.FILLED if radius == DISC_PX else RING_PX
+    cv2.circle(image, (center[0], center[1]), radius, PHASE_COLOURS[phase], width, cv2.LINE_AA)
 
 
 def _write_legend(image: Image, phases: Sequence[str]) -> None:
-    for i, phase in enumerate(dict.fromkeys(phases)):
-        at = (8, 18 + 16 * i)
-        _ring(image, (at[0] + 4, at[1] - 4), RING_PX, phase)
-        cv2.putText(image, phase, (at[0] + 14, at[1]), FONT, 0.42, (20, 20, 20), 1, cv2.LINE_AA)
+    named = list(dict.fromkeys(phases))
+    image[: ROW_PX * len(named) + ROW_PX // 2, :LEGEND_PX] = 255
+    for row, phase in enumerate(named, start=1):
+        _mark(image, (12, ROW_PX * row - 4), DISC_PX, phase)
+        cv2.putText(image, phase, (22, ROW_PX * row), FONT, 0.42, (20, 20, 20), 1, cv2.LINE_AA)

@@ -103,7 +103,10 @@ def _lines(found: Found, limit: int) -> list[str]:
         left_out = len(part) - limit
         lines += [f"  ... {left_out} more; --limit={len(part)} lists all"] if left_out > 0 else []
     if others := _others(found, limit):
-        lines += ["  not considered, the best entry of each task:", *map(_hit, others)]
+        lines += ["  not considered, the best entry of each other task:", *map(_hit, others)]
+    if left_out := len(found.others) - len(others):
+        n_all = sum(map(len, found.parts)) + len(found.others)
+        lines.append(f"  ... {left_out} more of other tasks; --limit={n_all} lists all")
     return lines
 
 

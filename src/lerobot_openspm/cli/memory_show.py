@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 from collections import Counter, defaultdict
 from dataclasses import dataclass, replace
-from itertools import islice
 from pathlib import Path
 
 import draccus
@@ -66,8 +65,7 @@ def list_entries(args: list[str]) -> None:
             tasks[entry.language].append(entry.quality)
             if not config.tasks and len(lines) < config.limit:
                 lines.append(_line(entry))
-    n_listed = sum(map(len, tasks.values()))
-    n_lines = len(tasks) if config.tasks else n_listed
+    n_lines = len(tasks) if config.tasks else sum(map(len, tasks.values()))
     if config.tasks:
         lines = [
             f"{len(qualities):6d} entries  mean quality {np.mean(qualities):.2f}  {language!r}"
@@ -83,19 +81,20 @@ def list_entries(args: list[str]) -> None:
         print(f"... {n_lines - config.limit} more; --limit={n_lines} lists all")
     counts = {"entries": len(memory.entries), "superseded": len(memory.superseded)}
     per_task = {language: len(qualities) for language, qualities in tasks.items()}
-    print(json.dumps({**counts, "listed": n_listed, "per_task": per_task}))
+    print(json.dumps({**counts, "listed": min(n_lines, config.limit), "per_task": per_task}))
 
 
 def show(args: list[str]) -> None:
     """Print entries with all their numbers, how objects are known and what is not, then one JSON object."""
     config = draccus.parse(ShowConfig, args=args)
     memory = read_memory(Path(config.path))
-    wanted = (
-        entry
-        for entry in memory.entries
-        if config.instruction in entry.language and config.source in ("", entry.source)
-    )
-    shown = list(islice(wanted, config.limit))
+    shown: list[MemoryEntry] = []  # as many as are printed: a memory may hold a million entries
+    n_wanted = 0
+    for entry in memory.entries:
+        if config.instruction in entry.language and config.source in ("", entry.source):
+            n_wanted += 1
+            if len(shown) < config.limit:
+                shown.append(entry)
     if config.source and not shown:
         raise OpenSPMError(
             f"the memory at {config.path} holds nothing from {config.source!r}; `openspm memory list "
@@ -103,6 +102,8 @@ def show(args: list[str]) -> None:
         )
     for entry in shown:
         print("\n".join(_table(entry)), end="\n\n")
+    if n_wanted > config.limit:
+        print(f"... {n_wanted - config.limit} more; --limit={n_wanted} shows all", end="\n\n")
     for model in memory.objects.values():
         print(_known_by(model))
     for one in memory.not_learned:
