@@ -49,11 +49,11 @@ def judged(
         return row
     period, model = true_period(name, LIBERO), models[name]
     shows_yaw = period > 0 and model.yaw_period > 0 and not isinstance(model, PatchModel)
-    # However a round thing is found turned, its axis stays. The simulator's frame lies on that, the learned
-    # one may lie beside it.
-    middle = se3.inverse(T_sim_obj) if period == 0 else np.eye(4)
-    there, found = [T @ middle for T in there], [T @ middle for T in (estimate.T_world_obj, *estimate.others)]
-    T_found = meant.T_world_obj @ middle
+    # A round thing is compared by its axis. The simulator's frame lies on it, the learned one may lie beside.
+    T_obj_sim = se3.inverse(T_sim_obj) if period == 0 else np.eye(4)
+    there = [T @ T_obj_sim for T in there]
+    found = [T @ T_obj_sim for T in (estimate.T_world_obj, *estimate.others)]
+    T_found = meant.T_world_obj @ T_obj_sim
     metres, radians = pose_error(there[0], T_found, period)
     off = T_found[:3, 3] - there[0][:3, 3]
     apart = [min(pose_error(T, one, 0.0)[0] for one in found) for T in there]

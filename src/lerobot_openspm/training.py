@@ -128,9 +128,10 @@ def memory_of(mined: MinedDataset, config: OpenSPMConfig) -> Memory:
         mined.robot if config.arm is None else replace(mined.robot, arm=fitting_arm(mined, Path(config.arm)))
     )
     entries = build_entries(mined)
+    episodes = len(mined.episodes) + len(mined.skipped)
     logger.info(
         "mined %d entries from %d episodes (%d skipped); objects: %s",
-        len(entries), len(mined.episodes), len(mined.skipped), ", ".join(sorted(mined.objects)),
+        len(entries), episodes, episodes - len(entries), ", ".join(sorted(mined.objects)),
     )  # fmt: skip
     not_learned = list_not_learned(mined)
     for one in not_learned:

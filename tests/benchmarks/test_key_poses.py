@@ -97,7 +97,7 @@ def test_mistakes_are_told():
 
 @pytest.mark.skipif(importlib.util.find_spec("libero") is not None, reason="LIBERO is installed")
 def test_without_libero_it_is_said_how_to_install_it():
-    with pytest.raises(ValueError, match=r"env.type=libero needs LIBERO.*pip install 'lerobot\[libero\]'"):
+    with pytest.raises(ValueError, match=r"env.type=libero needs LIBERO.*pip install '\.\[libero\]'"):
         EnvironmentOption("libero")
 
 

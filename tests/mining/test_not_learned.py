@@ -102,6 +102,20 @@ def test_it_is_said_of_what_the_hand_never_touched_too():
     assert list_not_learned(mined) == ()  # it is known, and so what is kept can be acted on
 
 
+@pytest.mark.parametrize("n_found", [2, 5])
+def test_demonstrations_that_do_not_show_what_is_known_are_told_as_left_out(n_found: int):
+    made = without("bowl", demonstrations(6), n_found)
+    episode = SimpleNamespace(sub_tasks=SUB_TASKS, episode=SimpleNamespace(task="put the bowl on the plate"))
+    anchors = consensus(demonstrations(6), SUB_TASKS)
+    task = MinedTask((episode,), tuple(made), anchors, (), (), ())
+    mined = SimpleNamespace(tasks=[task], object_poses=[one.object_poses for one in made], surfaces=(),
+                            unlearned={}, objects={"bowl": object()}, simulator_objects=())  # fmt: skip
+    (told,) = list_not_learned(mined)
+    assert (told.what, told.name, told.demonstrations) == ("demonstrations", "bowl", 6 - n_found)
+    count = {2: "4 demonstrations", 5: "1 demonstration"}[n_found]
+    assert str(told).startswith(f"{count} of 'bowl' left out: the first picture does not show it clearly; ")
+
+
 def test_what_is_put_on_the_table_is_put_relative_to_what_is_known():
     sub_tasks = parse_instruction("put the bowl on the table")
     made = without("plate", demonstrations(4, "bowl"))

@@ -39,11 +39,13 @@ def world(monkeypatch):
     return World()
 
 
-def images(x=0.12, noise=0.0):
-    """What the cameras show of a scene, with noise of so many levels."""
+def images(x=0.12, noise=0.0, lower_m=0.0):
+    """What the cameras show of a scene, with noise of so many levels, from a hand that has sunk."""
     rng = np.random.default_rng(0)
     shown = {}
-    for name, view in views_at(moved(x, 0.12, 0.0), looking_down(*HOME)).items():
+    T_world_ee = looking_down(*HOME)
+    T_world_ee[2, 3] -= lower_m
+    for name, view in views_at(moved(x, 0.12, 0.0), T_world_ee).items():
         image = view.image + noise * rng.standard_normal(view.image.shape)
         shown[name] = torch.as_tensor(image.clip(0, 255).transpose(2, 0, 1).copy()).float() / 255
     return shown
@@ -70,10 +72,20 @@ def test_the_same_pictures_are_searched_once(world, status):
     assert list(again) == ["cup", "block"]
 
 
-def test_what_has_changed_is_searched(world):
+def test_a_hand_that_sinks_a_little_shows_the_same(world):
     perception = Perception(world, 0.08)
     detect(perception, images())
-    detect(perception, images(0.15))
+    detect(perception, images(lower_m=0.002))
+    assert looks(world) == [1, 1]
+    detect(perception, images(lower_m=0.05))
+    assert looks(world) == [2, 2]
+
+
+@pytest.mark.parametrize("metres", [0.01, 0.03])
+def test_what_has_changed_is_searched(world, metres):
+    perception = Perception(world, 0.08)
+    detect(perception, images())
+    detect(perception, images(0.12 + metres))
     assert looks(world) == [2, 2]
     world.objects["cup"].status = "found"
     assert detect(perception, images())["cup"].status == "found"

@@ -26,6 +26,7 @@ SUITES: dict[str, Callable[[], Suite]] = {
     "libero": partial(_libero, "libero_goal"),
     "libero_spatial": partial(_libero, "libero_spatial"),
     "libero_object": partial(_libero, "libero_object"),
+    "libero_10": partial(_libero, "libero_10"),
 }
 
 

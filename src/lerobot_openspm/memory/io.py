@@ -69,7 +69,7 @@ Arrays = Mapping[str, NDArray[Any]]
 
 
 class _NotLearned(Record):
-    what: Literal["object", "instruction"]
+    what: Literal["object", "demonstrations", "instruction"]
     name: Name
     demonstrations: Count
     reason: Name

@@ -1,4 +1,4 @@
-"""What demonstrations could not teach: objects, and instructions of which nothing is remembered."""
+"""What could not be learned: objects, whole instructions, or something from some demonstrations."""
 
 from __future__ import annotations
 
@@ -11,6 +11,8 @@ from lerobot_openspm.memory.entry import MemoryEntry
 # The longest name and reason that are kept, in characters, and how many records.
 MAX_CHARS, MAX_RECORDS = 1000, 1000
 NEXT_STEP = "docs/mining.md says what helps, by the reason"
+# An object that the hand touches; demonstrations of one that is known, which do not show it; an instruction.
+type What = Literal["object", "demonstrations", "instruction"]
 
 
 @dataclass(frozen=True)
@@ -18,13 +20,14 @@ class NotLearned:
     """One thing that mining could not learn, up to :data:`MAX_CHARS` characters of each text.
 
     Attributes:
-        what: Whether it is an object that the hand touches, or an instruction.
+        what: What could not be learned.
         name: The object's name, or the instruction.
-        demonstrations: In how many demonstrations the object is handled, or how many there are.
+        demonstrations: In how many demonstrations the object is handled, how many are left out, or how many
+            the instruction has.
         reason: Why it could not be learned.
     """
 
-    what: Literal["object", "instruction"]
+    what: What
     name: str
     demonstrations: int
     reason: str
@@ -34,12 +37,12 @@ class NotLearned:
         count = f"{self.demonstrations} demonstration{'s' * (self.demonstrations != 1)}"
         if self.what == "instruction":
             return f"{self.name!r} is not learned: none of its {count} is kept, because {self.reason}"
+        if self.what == "demonstrations":
+            return f"{count} of {self.name!r} left out: {self.reason}; {NEXT_STEP}"
         return f"{self.name!r} is handled in {count} and could not be learned: {self.reason}; {NEXT_STEP}"
 
 
-def not_learned(
-    what: Literal["object", "instruction"], name: str, demonstrations: int, reason: str
-) -> NotLearned:
+def not_learned(what: What, name: str, demonstrations: int, reason: str) -> NotLearned:
     """A record of texts of any length, on one line each."""
     return NotLearned(what, _on_one_line(name), demonstrations, _on_one_line(reason))
 

@@ -57,8 +57,8 @@ def list_not_learned(mined: MinedDataset) -> tuple[NotLearned, ...]:
         elif lost[name] and not is_known:
             objects.append(not_learned("object", name, count, UNTOUCHED))
         elif lost[name]:
-            why = f"its first picture does not show it clearly in {lost[name]} of them"
-            objects.append(not_learned("object", name, count, why))
+            why = "the first picture does not show it clearly"
+            objects.append(not_learned("demonstrations", name, lost[name], why))
     return (*objects, *instructions)[:MAX_RECORDS]
 
 

@@ -26,8 +26,9 @@ MOST_COMPARED = 8
 # where it was before, metres, or turned by so much, radians.
 MOST_REMEMBERED, ELSEWHERE_M, ELSEWHERE_RAD = 3, 0.05, 0.3
 # What was sought in vain is not sought again until pictures, made smaller by this, differ somewhere by so
-# many levels of 255.
-CHANGED_PX, CHANGED_LEVELS = 8, 6.0
+# many levels of 255, in the mean over a square of so many pixels. What is seen a pixel aside is the same, as
+# a hand that holds its place sinks a little.
+SMALLER, CHANGED_PX, CHANGED_LEVELS = 2, 4, 6.0
 # The hand and the arm behind it as balls along the hand's approach axis: from its fingertips this far back.
 TIP_M, BACK_M, BALLS = 0.01, -0.30, 12
 # The fingers are slimmer than what carries them; they end here.
@@ -250,14 +251,21 @@ def _middle(known: KnownObject, T_world_obj: Array) -> Array:
 
 
 def _small(view: View) -> Array:
-    """A view's picture, much smaller: what is left does not change by noise."""
-    height, width = (max(1, size // CHANGED_PX) for size in view.image.shape[:2])
+    """A view's picture, smaller, as numbers."""
+    height, width = (max(1, size // SMALLER) for size in view.image.shape[:2])
     return np.asarray(cv2.resize(view.image, (width, height), interpolation=cv2.INTER_AREA), float)
 
 
 def _differ(picture: Array, other: Array) -> bool:
-    """Whether two small pictures show something else somewhere."""
-    return picture.shape != other.shape or bool(np.abs(picture - other).max() > CHANGED_LEVELS)
+    """Whether two small pictures show something else somewhere, not only a pixel aside."""
+    return picture.shape != other.shape or _shows_more(picture, other) or _shows_more(other, picture)
+
+
+def _shows_more(picture: Array, other: Array) -> bool:
+    """Whether a small picture is somewhere darker or brighter than another one is within a pixel of there."""
+    darkest, brightest = (extreme(other, np.ones((3, 3), np.uint8)) for extreme in (cv2.erode, cv2.dilate))
+    beyond = np.maximum(np.maximum(darkest - picture, picture - brightest), 0)
+    return bool((cv2.blur(beyond, (CHANGED_PX, CHANGED_PX)) > CHANGED_LEVELS).any())
 
 
 def _is_elsewhere(look: Look, before: Look) -> bool:

@@ -1,6 +1,7 @@
 """Scripted experts for LIBERO's tasks: they read the true poses and act by the same 7-D actions.
 
-All of libero_goal's are here, beside the first of two other suites, see `picks`.
+All of libero_goal's are here; `picks` has those of libero_spatial and libero_object, `long_tasks` some of
+libero_10.
 
 Positions are in LIBERO's world frame unless a comment says otherwise: x points from the robot over the table,
 y to the robot's left, z up; the table's top is at z = 0.9. All lengths are in metres. Every object is always
@@ -17,6 +18,7 @@ from functools import partial
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from lerobot_openspm.envs.libero.long_tasks import LONG
 from lerobot_openspm.envs.libero.picks import OBJECT, SPATIAL
 from lerobot_openspm.envs.libero.puts import (
     BOWL_ON_PLATE,
@@ -195,6 +197,7 @@ _PUTS = {
 }
 EXPERTS: dict[str, Callable[[LiberoHand], Actions]] = {
     **{task: partial(take_and_put, put) for task, put in {**_PUTS, **SPATIAL, **OBJECT}.items()},
+    **LONG,
     "open_the_middle_drawer_of_the_cabinet": partial(_open_drawer, "middle"),
     "open_the_top_drawer_and_put_the_bowl_inside": _bowl_in_top_drawer,
     "push_the_plate_to_the_front_of_the_stove": _push_plate,

@@ -6,6 +6,7 @@ y to the robot's left, z up. All lengths are in metres.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -14,7 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from lerobot_openspm.envs.libero.simulator import LiberoSimulator
 from lerobot_openspm.envs.motions import DOWN, Actions, Pace, ScriptedHand, raised, yaw_matrix
-from lerobot_openspm.geometry.se3 import transform
+from lerobot_openspm.geometry.se3 import transform, yaw_of
 
 LiberoHand = ScriptedHand[LiberoSimulator]
 
@@ -44,10 +45,12 @@ class Put:
 
     Attributes:
         name: What.
-        grasp: Where from its origin to grasp it.
+        grasp: Where from its origin to grasp it, along the world's axes, or those of a hand that is turned.
         goal: Where its origin goes.
         rise: How high to lift it.
         lean: By which angle the hand leans towards the robot, radians.
+        along: The fingers open along this object's x axis instead of the world's y.
+        turn: By which angle the hand is turned about the vertical besides, radians.
     """
 
     name: str
@@ -55,13 +58,17 @@ class Put:
     goal: Callable[[LiberoHand], np.ndarray]
     rise: float = CARRY_RISE
     lean: float = 0.0
+    along: str | None = None
+    turn: float = 0.0
 
 
 def take_and_put(put: Put, hand: LiberoHand) -> Actions:
-    """Grasp from above, fingers opening along the world's y, lift straight up and place."""
+    """Grasp from above, lift straight up and place."""
     offset, turn = hand.grasp_noise()
+    yaw = put.turn if put.along is None else put.turn + yaw_of(hand.frame(put.along)) - math.pi / 2
     lean = Rotation.from_rotvec([0.0, -put.lean, 0.0]).as_matrix()
-    at_grasp = transform(yaw_matrix(turn) @ lean @ DOWN, hand.origin(put.name) + put.grasp + offset)
+    at = hand.origin(put.name) + yaw_matrix(yaw) @ put.grasp + offset
+    at_grasp = transform(yaw_matrix(yaw + turn) @ lean @ DOWN, at)
     yield from grasp(hand, at_grasp)
     yield from hand.travel(raised(at_grasp, put.rise))
     yield from place(hand, put.name, put.goal(hand))

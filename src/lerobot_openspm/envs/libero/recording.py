@@ -20,7 +20,7 @@ from lerobot_openspm.envs.recording import OBJECT_POSES, Names, pose_names, pose
 from lerobot_openspm.envs.selection import select
 
 # An expert that takes longer than the policy may is no use as a demonstration.
-MAX_STEPS = {"libero_goal": 300, "libero_spatial": 280, "libero_object": 280}
+MAX_STEPS = {"libero_goal": 300, "libero_spatial": 280, "libero_object": 280, "libero_10": 520}
 # LIBERO ends an episode when its goal first holds, often in mid-motion. A demonstration that ended there too
 # would teach a policy to stop at the very threshold, so it goes on a little, as people do.
 STEPS_AFTER_SUCCESS = 10
@@ -89,7 +89,7 @@ class LiberoSuite:
         }
 
     def tasks(self, selection: str) -> list[str]:
-        """See `Suite`. Of some suites, experts do the first tasks only."""
+        """See `Suite`. Of libero_10, experts do some tasks only."""
         known = [task for task in tasks(self._suite) if task in EXPERTS]
         return select(selection, known, {"all": known, self._suite: known}, self._suite)
 
