@@ -13,12 +13,13 @@ from benchmarks.libero.variants import OTHER_OBJECTS, PRO_SUITES, exchanged, var
 from benchmarks.libero_pro import ProConfig
 
 from lerobot_openspm.envs.libero.experts import EXPERTS
+from lerobot_openspm.envs.libero.long_tasks import LONG
 from lerobot_openspm.envs.libero.picks import OBJECT, SPATIAL
 from lerobot_openspm.envs.libero.simulator import DO_NOTHING, SUITE, LiberoSimulator, task_file, tasks
 from lerobot_openspm.envs.suites import find_suite
 
 TASK = "put_the_bowl_on_the_plate"
-GOAL_TASKS = [task for task in EXPERTS if task not in {*SPATIAL, *OBJECT}]
+GOAL_TASKS = [task for task in EXPERTS if task not in {*SPATIAL, *OBJECT, *LONG}]
 PLACED = re.compile(r"\(On (\w+) (?:main_table|floor)_(\w+)\)")
 
 

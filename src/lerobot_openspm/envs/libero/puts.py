@@ -65,7 +65,7 @@ class Put:
 def take_and_put(put: Put, hand: LiberoHand) -> Actions:
     """Grasp from above, lift straight up and place."""
     offset, turn = hand.grasp_noise()
-    yaw = put.turn if put.along is None else put.turn + yaw_of(hand.frame(put.along)) - math.pi / 2
+    yaw = put.turn if put.along is None else put.turn + float(yaw_of(hand.frame(put.along))) - math.pi / 2
     lean = Rotation.from_rotvec([0.0, -put.lean, 0.0]).as_matrix()
     at = hand.origin(put.name) + yaw_matrix(yaw) @ put.grasp + offset
     at_grasp = transform(yaw_matrix(yaw + turn) @ lean @ DOWN, at)
