@@ -70,7 +70,7 @@ class Episode:
             "key_pose": state.index,
             "phase": targets[state.index].key_pose.phase if targets else None,
             "attempts": state.attempts,
-            "entry": state.used[-1].source if state.used else None,
+            "entry": " and ".join(one.source for one in state.used[-1]) if state.used else None,
         }
 
 

@@ -136,8 +136,8 @@ def acted_entries(
     T_world_ee = se3.transform(_HAND_DOWN, [0.0, 0.0, 0.3])
     acted: list[MemoryEntry] = []
     for part in parts:
-        rivals = sorted(part, key=lambda one: (not is_meant(one.source), one.semantic))
+        rivals = sorted(part, key=lambda one: (not is_meant(one.sources[0]), one.semantic))
         layout = {name: T for one in rivals for name, T in one.entry.object_poses.items()}
         best = context.rank(part, layout, T_world_ee)[0].entry
-        acted.append(next(one.source for one in part if one.entry is best))
+        acted.append(next(one.sources[0] for one in part if one.entry is best))
     return tuple(acted)

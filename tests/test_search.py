@@ -49,11 +49,11 @@ def test_an_instruction_of_which_only_the_parts_are_known_is_found_part_by_part(
     found = search_memory(f"open the top drawer and {BOWL}", (*MEMORY, both))
     assert found.refusal == ""
     opened, placed = found.parts
-    assert [(hit.entry.language, hit.source is both) for hit in opened] == [
+    assert [(hit.entry.language, hit.sources[0] is both) for hit in opened] == [
         ("open the top drawer of the cabinet", True)
     ]
     assert sources(placed) == ["good", "poor"]
-    assert all(hit.source is hit.entry for hit in placed)
+    assert all(hit.sources[0] is hit.entry for hit in placed)
     assert sorted(sources(found.others)) == ["rack", "stove"]
     refused = search_memory(f"open the bottom drawer and {BOWL}", MEMORY)
     assert (refused.parts, "is a part of the instruction" in refused.refusal) == ((), True)

@@ -11,6 +11,7 @@ import numpy as np
 
 from lerobot_openspm.errors import DatasetError, InstructionError
 from lerobot_openspm.language.names import TABLE_NAMES, NameSimilarity
+from lerobot_openspm.memory.combine import UNKNOWN_LOOKS, Looks
 from lerobot_openspm.memory.compose import Candidate, plan_parts
 from lerobot_openspm.memory.entry import MemoryEntry
 from lerobot_openspm.memory.indexed_entries import indexed, near
@@ -29,14 +30,14 @@ class Hit:
 
     Attributes:
         entry: What would be executed: an entry of the memory, or one sub-task of it.
-        source: The entry of the memory.
+        sources: The entry of the memory, or the two that it was put together from: grasp and place.
         semantic: ``S_sem``.
         geometric: ``S_geo``; None where no scene was looked at.
         total: The weighted sum of the terms there are.
     """
 
     entry: MemoryEntry
-    source: MemoryEntry
+    sources: tuple[MemoryEntry, ...]
     semantic: float
     geometric: float | None
     total: float
@@ -65,7 +66,10 @@ class Found:
 
 
 def search_memory(
-    instruction: str, entries: Sequence[MemoryEntry], names: NameSimilarity = TABLE_NAMES
+    instruction: str,
+    entries: Sequence[MemoryEntry],
+    names: NameSimilarity = TABLE_NAMES,
+    looks: Looks = UNKNOWN_LOOKS,
 ) -> Found:
     """What an instruction would be carried out by, without a scene: by ``S_sem`` and quality.
 
@@ -73,6 +77,7 @@ def search_memory(
         instruction: What is asked.
         entries: The memory.
         names: Says which names mean the same thing.
+        looks: What is known of the objects, to put one where another was shown.
 
     Raises:
         InstructionError: There is not a word in the instruction.
@@ -83,13 +88,13 @@ def search_memory(
     entries = near(asked, entries, score)
     refusal, plan = "", tuple[tuple[Candidate, ...], ...]()
     try:
-        plan = plan_parts(instruction, asked, entries, names)
+        plan = plan_parts(instruction, asked, entries, names, looks)
     except InstructionError as error:
         refusal = str(error)
     parts = tuple(_ranked(part, names) for part in plan)
-    keys = {one.source.key.sub_tasks for part in plan for one in part}
+    keys = {source.key.sub_tasks for part in plan for one in part for source in one.sources}
     others = [
-        _without_scene(entry, entry, score(asked, entry.key.sub_tasks))
+        _without_scene(entry, (entry,), score(asked, entry.key.sub_tasks))
         for entry in _one_of_each_key(asked, entries)
         if entry.key.sub_tasks not in keys
     ]
@@ -99,14 +104,14 @@ def search_memory(
 
 def _ranked(part: Sequence[Candidate], names: NameSimilarity) -> tuple[Hit, ...]:
     """What a part can be carried out by, in the order of retrieval, where nothing is known of the scene."""
-    sources = {id(one.entry): one.source for one in part}
+    sources = {id(one.entry): one.sources for one in part}
     found = retrieve([(one.entry, one.semantic) for one in part], lambda _: 1.0, names)
     return tuple(_without_scene(one.entry, sources[id(one.entry)], one.semantic) for one in found)
 
 
-def _without_scene(entry: MemoryEntry, source: MemoryEntry, semantic: float) -> Hit:
+def _without_scene(entry: MemoryEntry, sources: tuple[MemoryEntry, ...], semantic: float) -> Hit:
     lambda_s, _, lambda_r = LAMBDAS
-    return Hit(entry, source, semantic, None, lambda_s * semantic + lambda_r * entry.quality)
+    return Hit(entry, sources, semantic, None, lambda_s * semantic + lambda_r * entry.quality)
 
 
 def _one_of_each_key(asked: Sequence[SubTask], entries: Sequence[MemoryEntry]) -> list[MemoryEntry]:
@@ -131,7 +136,7 @@ def search_scene(policy: OpenSPMPolicy, observation: Observation) -> Found:
         ObservationError: The observation lacks a camera, or its images are no pictures.
     """
     entries = policy.require_memory().entries
-    in_words = search_memory(observation.instruction, entries, policy.names)
+    in_words = search_memory(observation.instruction, entries, policy.names, policy.require_memory().looks)
     if in_words.refusal:
         return in_words
     policy.reset()
@@ -140,7 +145,7 @@ def search_scene(policy: OpenSPMPolicy, observation: Observation) -> Found:
     state = controller.state
     if state.refusal:
         return replace(in_words, parts=(), refusal=state.refusal, status=state.status.value)
-    sources = {id(one.entry): one.source for one in state.parts[0]}
+    sources = {id(one.entry): one.sources for one in state.parts[0]}
     ranked = tuple(
         Hit(one.entry, sources[id(one.entry)], one.semantic, one.geometric, one.total) for one in state.ranked
     )

@@ -266,7 +266,7 @@ def test_the_hand_of_an_episode_rises_over_what_it_was_not_asked_about():
         one = controller(shown, points=points, hand_radius_m=radius / BESIDE)
         observe(one, HAND, sees)
         assert one.state.status is Status.RUNNING
-        assert one.state.used == (shown,)
+        assert one.state.used == ((shown,),)
         assert (len(one.state.plan.entry.key_poses) > len(shown.key_poses)) == bool(more)
 
 

@@ -63,7 +63,7 @@ def finish_part(one, perception, hand=None):
 def test_the_second_part_goes_where_the_first_one_has_put_things():
     perception, one = Perception(LAYOUT), controller(PLATE, BOX)
     observe(one, HAND, perception)
-    assert one.state.used == (PLATE,)
+    assert one.state.used == ((PLATE,),)
     assert sorted(perception.asked[0]) == ["bowl", "box", "plate"], "what comes later is looked for at once"
     hand = finish_part(one, perception, HAND)
     assert one.state.status is Status.RUNNING
@@ -71,7 +71,7 @@ def test_the_second_part_goes_where_the_first_one_has_put_things():
     assert not np.allclose(perception.object_poses["bowl"], LAYOUT["bowl"])
     place = next(target for target in one.executor.targets if target.key_pose.phase == "place")
     assert_allclose(place.T_world_ee, perception.object_poses["bowl"] @ place.key_pose.T_obj_ee, atol=2e-3)
-    assert [used.source for used in one.state.used] == [PLATE.source, BOX.source]
+    assert [used.source for (used,) in one.state.used] == [PLATE.source, BOX.source]
     finish_part(one, perception, hand)
     assert one.state.status is Status.DONE
 
@@ -147,7 +147,7 @@ def test_the_whole_is_preferred_where_it_was_demonstrated():
     whole = entry(BOTH, PLATE.key_poses, LAYOUT, source="local/demos#9")
     one = controller(PLATE, BOX, whole)
     observe(one, HAND, Perception(LAYOUT))
-    assert one.state.used == (whole,)
+    assert one.state.used == ((whole,),)
     assert len(one.executor.targets) == len(whole.key_poses)
 
 
@@ -159,7 +159,7 @@ def test_a_part_of_an_entry_is_used_in_the_name_of_the_entry():
     assert one.state.status is Status.RUNNING
     assert one.state.ranked[0].entry.language == "open the top drawer of the cabinet"
     assert len(one.state.used) == 1
-    assert one.state.used[0] is whole
+    assert one.state.used[0] == (whole,)
 
 
 def test_an_opened_drawer_looks_different_and_is_not_looked_for_again():
@@ -235,12 +235,12 @@ def test_a_part_that_cannot_be_found_is_waited_for():
     observe(one, HAND, perception)
     hand = finish_part(one, perception, HAND)
     assert one.state.status is Status.OBJECT_NOT_FOUND
-    assert one.state.used == (PLATE,)
+    assert one.state.used == ((PLATE,),)
     assert not one.executor.next_action(hand)[:6].any()
     perception.object_poses["box"] = LAYOUT["box"]
     watch(one, perception, hand, LOOK_AGAIN_STEPS)
     assert one.state.status is Status.RUNNING
-    assert one.state.used == (PLATE, BOX)
+    assert one.state.used == ((PLATE,), (BOX,))
 
 
 def test_a_part_out_of_reach_is_infeasible():

@@ -125,7 +125,9 @@ def test_where_another_entry_grasps_from_elsewhere_it_is_taken_if_it_means_the_s
         turned, key=replace(turned.key, sub_tasks=(replace(turned.key.sub_tasks[0], target="cup"),))
     )
     for second, taken in ((turned, "turned"), (other, shown.source)):
-        both = [Candidate(one, 1.0 - i / 10, one, one.key.sub_tasks) for i, one in enumerate((shown, second))]
+        both = [
+            Candidate(one, 1.0 - i / 10, (one,), one.key.sub_tasks) for i, one in enumerate((shown, second))
+        ]
         found = poses | {"post": place}
         plan, problems = context.choose(context.rank(both, found, home), found, home)
         assert (plan.entry.source, problems) == (taken, [])
@@ -135,7 +137,7 @@ def test_what_is_out_of_reach_is_not_exchanged_for_another_thing():
     shown, other = entry(), entry("put the mug on the plate")
     context = planning_context(shown, other)
     poses = {**shown.object_poses, "mug": shown.object_poses["bowl"], "bowl": se3.from_yaw([5.0, 0, 0], 0.0)}
-    both = [Candidate(one, 1.0, one, one.key.sub_tasks) for one in (shown, other)]
+    both = [Candidate(one, 1.0, (one,), one.key.sub_tasks) for one in (shown, other)]
     ranked = sorted(context.rank(both, poses, HOME), key=lambda one: one.entry is other)
     plan, problems = context.choose(ranked, poses, HOME)
     assert plan.entry is shown

@@ -87,7 +87,7 @@ def test_references_are_told_by_the_names_of_the_entry():
         RetrievalKey((SubTask("put", "black bowl", "", "on", "plate"),), ()), "", (), 1.0, 1, ""
     )
     known = {"shelf": "rack"}
-    assert references(Candidate(entry, 1.0, entry, (asked,)), lambda name: known.get(name, name)) == {
+    assert references(Candidate(entry, 1.0, (entry,), (asked,)), lambda name: known.get(name, name)) == {
         "black bowl": NEXT_TO_RACK,
         "plate": Reference("left"),
     }
@@ -187,7 +187,7 @@ def test_only_demonstrations_of_that_very_instruction_count_and_only_for_unknown
     same, more = spoken(NEXT_TO_RACK, {"bowl": NEAR}), spoken(NEXT_TO_RACK, {"bowl": FAR})
     others = (spoken(Reference("next to", ("cup",))), spoken(Reference("on", ("rack",))), spoken(None))
     asked = same.key.sub_tasks
-    candidates = [Candidate(one, 1.0, one, asked) for one in (same, *others, more)]
+    candidates = [Candidate(one, 1.0, (one,), asked) for one in (same, *others, more)]
     found = demonstrations(candidates, str, {"bowl", "plate"})
     assert found == {"bowl": (same.object_poses, more.object_poses)}
     assert demonstrations(candidates, str, {"bowl", "plate", "rack"}) == {}

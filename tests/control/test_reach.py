@@ -36,7 +36,7 @@ def scene(panda, yaw, x=-0.1, turn=0.0):
 
 def chosen(context, poses, home):
     (shown,) = context.entries
-    candidate = Candidate(shown, 1.0, shown, shown.key.sub_tasks)
+    candidate = Candidate(shown, 1.0, (shown,), shown.key.sub_tasks)
     return context.choose(context.rank([candidate], poses, home), poses, home)
 
 

@@ -34,7 +34,13 @@ PLATE, BOX = entry(source="local/demos#0"), entry("put the box in the bowl", sou
 
 def fared(success, used, ended, now, n_parts=2):
     """Successes by source, of parts that ended with some verdicts and one that is carried out now."""
-    state = EpisodeState(parts=((),) * n_parts, part=len(ended), used=used, verdicts=ended, verdict=now)
+    state = EpisodeState(
+        parts=((),) * n_parts,
+        part=len(ended),
+        used=tuple((one,) for one in used),
+        verdicts=ended,
+        verdict=now,
+    )
     return {one.source: done for one, done in state.entry_successes(success)}
 
 
@@ -61,4 +67,12 @@ def test_a_part_that_was_never_begun_is_not_held_against_the_one_that_was_seen_t
 
 def test_an_entry_that_was_used_for_two_parts_counts_once_and_by_the_worse_one():
     assert fared(False, (PLATE, PLATE), (True,), False) == {PLATE.source: False}
-    assert len(EpisodeState(used=(PLATE, PLATE)).entry_successes(success=True)) == 1
+    assert len(EpisodeState(used=((PLATE,), (PLATE,))).entry_successes(success=True)) == 1
+
+
+def test_what_was_put_together_counts_for_the_grasp_and_for_the_place():
+    state = EpisodeState(Status.DONE, parts=((),), used=((PLATE, BOX),), verdict=True)
+    assert {one.source: done for one, done in state.entry_successes(True)} == {
+        PLATE.source: True,
+        BOX.source: True,
+    }

@@ -108,12 +108,12 @@ def test_what_was_demonstrated_as_a_whole_wins():
 def test_a_part_of_something_else_is_experience_too_and_remembers_its_source():
     whole = drawer_entry()
     ((only,),) = planned("open the top drawer of the cabinet", [whole, PLATE])
-    assert only.source is whole
+    assert only.sources[0] is whole
     assert only.semantic == pytest.approx(1)
     assert only.entry.key.phases == ("approach", "grasp", "open", "release", "retreat")
     first, second = planned("open the top drawer and put the bowl on the plate", [whole, PLATE])
-    assert first[0].source is whole
-    assert second[0].source is second[0].entry is PLATE
+    assert first[0].sources[0] is whole
+    assert second[0].sources[0] is second[0].entry is PLATE
 
 
 def test_a_part_without_experience_is_named():
@@ -139,7 +139,7 @@ def test_what_may_mean_different_things_is_asked_back_alone_and_as_a_part():
     for instruction in ("open the drawer", "open the drawer and turn on the stove"):
         with pytest.raises(InstructionError, match="did you mean"):
             planned(instruction, [top, middle, STOVE])
-        assert planned(instruction, [top, STOVE])[0][0].source is top
+        assert planned(instruction, [top, STOVE])[0][0].sources[0] is top
 
 
 def test_parts_can_be_carried_over_to_a_scene():
@@ -158,9 +158,9 @@ def test_what_the_grammar_cannot_read_is_carried_out_sentence_by_sentence():
     entries = [entry(WIPE, source="wipe"), entry(SINK, source="sink")]
     for asked in (f"{WIPE}, and then {SINK}", f"Please {WIPE}. Then {SINK}!", f"{WIPE} and {SINK}"):
         chain = planned(asked, entries)
-        assert [[one.source.source for one in part] for part in chain] == [["wipe"], ["sink"]]
+        assert [[one.sources[0].source for one in part] for part in chain] == [["wipe"], ["sink"]]
     chain = planned(f"{SINK} and {WIPE}", entries)
-    assert [[one.source.source for one in part] for part in chain] == [["sink"], ["wipe"]]
+    assert [[one.sources[0].source for one in part] for part in chain] == [["sink"], ["wipe"]]
     for asked in (f"sing, then {SINK}", f"{WIPE} and then sing", f"do not {WIPE}, then {SINK}"):
         with pytest.raises(InstructionError, match="it knows"):
             planned(asked, entries)

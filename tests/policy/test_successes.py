@@ -23,7 +23,7 @@ def test_successes_change_the_entries_that_were_acted_by_and_are_saved(
     policy.select_action(batch_of([recorded[0][0], recorded[3][0], recorded[4][0]]))
     used = [one.controller.state.used for one in policy.episodes]
     assert [len(entries) for entries in used] == [1, 1, 1]
-    bowl, stove = used[0][0], used[1][0]
+    (bowl,), (stove,) = used[0][0], used[1][0]
     policy.report_successes([False, True, None])
     assert trials(policy) == {bowl.source: (1, 0), stove.source: (1, 1)}
     quality = {e.source: e.quality for e in policy.require_memory().entries}
@@ -32,7 +32,7 @@ def test_successes_change_the_entries_that_were_acted_by_and_are_saved(
     # An episode counts once; what was not known may follow later.
     policy.report_successes([True, False, True])
     policy.report_successes([True, False, False])
-    third = used[2][0].source
+    third = used[2][0][0].source
     expected = {bowl.source: (1, 0), stove.source: (1, 1)}
     tried, succeeded = expected.get(third, (0, 0))
     expected[third] = (tried + 1, succeeded + 1)
@@ -49,7 +49,7 @@ def test_without_a_word_from_outside_what_the_policy_saw_itself_counts(
     assert policy.successes == [None, None, None]
     policy.report_successes()
     assert trials(policy) == {}
-    seen, missed = (policy.episodes[i].controller.state.used[0].source for i in (0, 1))
+    seen, missed = (policy.episodes[i].controller.state.used[0][0].source for i in (0, 1))
     for episode, verdict in zip(policy.episodes[:2], (True, False), strict=True):
         episode.controller.executor.stop(Status.DONE)
         episode.controller.state.verdict = verdict
@@ -64,7 +64,7 @@ def test_the_next_episodes_choose_by_what_was_learned(policy: OpenSPMPolicy, rec
     for _ in range(12):
         policy.reset()
         policy.select_action(frame)
-        chosen.append(policy.episodes[0].controller.state.used[0].source)
+        chosen.append(policy.episodes[0].controller.state.used[0][0].source)
         policy.report_successes([False])
     # What goes on failing is left for another demonstration of the same task.
     assert len(set(chosen)) > 1
@@ -94,4 +94,4 @@ def test_a_failure_counts_for_the_part_that_failed_and_not_for_the_one_that_was_
     done.begin_next_part()
     done.verdicts = (True,)
     policy.report_successes([False, None])
-    assert trials(policy) == {done.used[0].source: (1, 1), done.used[1].source: (1, 0)}
+    assert trials(policy) == {done.used[0][0].source: (1, 1), done.used[1][0].source: (1, 0)}

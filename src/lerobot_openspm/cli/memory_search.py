@@ -65,8 +65,8 @@ def search(args: list[str]) -> None:
 
 def _search(instruction: str, config: SearchConfig) -> Found:
     if config.dataset.root is None and config.dataset.repo_id is None:
-        entries = read_memory(Path(config.path)).entries
-        return search_memory(instruction, entries, _names(config.path))
+        memory = read_memory(Path(config.path))
+        return search_memory(instruction, memory.entries, _names(config.path), memory.looks)
     from lerobot_openspm.mining.dataset import dataset_metadata, open_dataset
     from lerobot_openspm.modeling_openspm import OpenSPMPolicy
 
@@ -118,7 +118,13 @@ def _others(found: Found, limit: int) -> tuple[Hit, ...]:
 def _hit(hit: Hit) -> str:
     geometric = "-" if hit.geometric is None else f"{hit.geometric:.3f}"
     terms = f"{hit.total:6.3f} {hit.semantic:6.3f} {geometric:>6s} {hit.entry.quality:6.3f}"
-    of = f", a part of {hit.source.language!r}," if hit.entry is not hit.source else ""
+    first, *others = hit.sources
+    if others:
+        return (
+            f"  {terms}  {hit.entry.language!r}, put together: grasped as in {first.language!r} from "
+            f"{first.source}, placed as in {others[0].language!r} from {others[0].source}"
+        )
+    of = f", a part of {first.language!r}," if hit.entry is not first else ""
     return f"  {terms}  {hit.entry.language!r}{of} from {hit.entry.source}, version {hit.entry.version}"
 
 

@@ -125,7 +125,8 @@ class EpisodeController:
         if not state.parts:
             try:
                 asked = read_instruction(self.instruction, context.entries, context.names)
-                state.parts = plan_parts(self.instruction, asked, context.entries, context.names)
+                rest = context.entries, context.names, context.looks
+                state.parts = plan_parts(self.instruction, asked, *rest)
             except InstructionError as error:
                 return self._refuse(error)
             state.start_height = float(hand.T_world_ee[2, 3])
@@ -155,7 +156,7 @@ class EpisodeController:
         else:
             state.refusal = ""
             state.plan = self._context.clear(plan)
-            state.used = (*state.used, next(one.source for one in candidates if one.entry is plan.entry))
+            state.used = (*state.used, next(one.sources for one in candidates if one.entry is plan.entry))
             self._begin(0, hand)
             if self._is_tracking:  # else no later look could end the waiting
                 self._wait_for_what_is_needed(hand)

@@ -58,11 +58,11 @@ def demonstrations(
     """
     shown: dict[str, list[Mapping[str, Array]]] = {}
     for one in candidates:
-        own = Candidate(one.entry, 1.0, one.entry, one.entry.key.sub_tasks)
+        own = Candidate(one.entry, 1.0, (one.entry,), one.entry.key.sub_tasks)
         told, then = references(one, object_meant), references(own, object_meant)
         for name, where in told.items():
             if then.get(name) == where and not set(where.landmarks) <= set(known):
-                shown.setdefault(name, []).append(one.source.object_poses)
+                shown.setdefault(name, []).append(one.sources[0].object_poses)
     return {name: tuple(poses) for name, poses in shown.items()}
 
 

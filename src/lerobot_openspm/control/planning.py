@@ -23,6 +23,7 @@ from lerobot_openspm.geometry import se3
 from lerobot_openspm.geometry.se3 import Array
 from lerobot_openspm.language.meaning import means_the_same
 from lerobot_openspm.language.names import TABLE_NAMES, NameSimilarity
+from lerobot_openspm.memory.combine import Looks
 from lerobot_openspm.memory.compose import Candidate
 from lerobot_openspm.memory.entry import MemoryEntry
 from lerobot_openspm.memory.retrieval import Scored, retrieve
@@ -115,6 +116,11 @@ class PlanningContext:
             if all(_is_at(T, middle) for T in shown):
                 usual[name] = middle
         return usual
+
+    @cached_property
+    def looks(self) -> Looks:
+        """What decides how one object takes the place of another."""
+        return Looks(self.points, self.symmetries)
 
     @property
     def surfaces(self) -> dict[str, Array]:

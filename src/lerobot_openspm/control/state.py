@@ -70,7 +70,8 @@ class EpisodeState:
         ranked: The entries of the last retrieval with their scores, best first.
         plan: What is acted by, and where.
         refused: The plan that was last found to be infeasible.
-        used: For each part that was begun, the entry of the memory that it was carried out by.
+        used: For each part that was begun, the entries of the memory that it was carried out by: one, or two
+            that were put together.
         verdicts: For each part that was ended, whether it is seen to be done; None where that is not known.
         index: The key pose that is approached.
         replans: Chunks asked for so far; seeds the noise of each.
@@ -90,7 +91,7 @@ class EpisodeState:
     ranked: tuple[Scored, ...] = ()
     plan: Plan = NO_PLAN
     refused: Plan = NO_PLAN
-    used: tuple[MemoryEntry, ...] = ()
+    used: tuple[tuple[MemoryEntry, ...], ...] = ()
     verdicts: tuple[bool | None, ...] = ()
     index: int = 0
     replans: int = 0
@@ -137,7 +138,7 @@ class EpisodeState:
         seen = list(zip(self.used, (*self.verdicts, self.verdict), strict=False))
         is_denied = len(seen) == len(self.parts) and all(verdict is True for _, verdict in seen)
         fared: dict[int, tuple[MemoryEntry, bool]] = {}
-        for entry, verdict in seen:
+        for entry, verdict in ((entry, verdict) for entries, verdict in seen for entry in entries):
             _, before = fared.get(id(entry), (entry, True))
             fared[id(entry)] = entry, before and (success or (verdict is True and not is_denied))
         return list(fared.values())

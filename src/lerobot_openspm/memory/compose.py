@@ -1,7 +1,8 @@
 """Compound tasks: what an entry teaches by its parts, and by which entries an instruction is carried out.
 
 "open the top drawer and put the bowl inside" also teaches "open the top drawer". An instruction that no
-demonstration shows as a whole is carried out by entries of its parts, one after another.
+demonstration shows as a whole is carried out by entries of its parts, one after another. A part that none
+shows either is put together from a grasp and a place, see :mod:`~lerobot_openspm.memory.combine`.
 """
 
 from __future__ import annotations
@@ -14,11 +15,12 @@ from functools import partial
 from lerobot_openspm.errors import InstructionError
 from lerobot_openspm.language.descriptions import phrase
 from lerobot_openspm.language.meaning import semantic_score
-from lerobot_openspm.language.names import TABLE_NAMES, NameSimilarity
+from lerobot_openspm.language.names import TABLE_NAMES, AmongKnown, NameSimilarity
 from lerobot_openspm.language.own_words import split_steps
+from lerobot_openspm.memory.combine import UNKNOWN_LOOKS, Looks, combinations
 from lerobot_openspm.memory.entry import CONTACT_PHASES, MemoryEntry, RetrievalKey
 from lerobot_openspm.memory.indexed_entries import near
-from lerobot_openspm.memory.retrieval import candidates_for, read_instruction, why_unread
+from lerobot_openspm.memory.retrieval import MIN_SEMANTIC, candidates_for, read_instruction, why_unread
 from lerobot_openspm.types import SubTask
 
 # A sub-task takes hold of something and lets it go again.
@@ -32,13 +34,13 @@ class Candidate:
     Attributes:
         entry: What is executed: an entry of the memory, or one sub-task of it.
         semantic: Its ``S_sem``.
-        source: The entry of the memory.
+        sources: The entry of the memory; of what was put together, that of the grasp and that of the place.
         asked: What of the instruction it carries out, one for each of the entry's sub-tasks.
     """
 
     entry: MemoryEntry
     semantic: float
-    source: MemoryEntry
+    sources: tuple[MemoryEntry, ...]
     asked: tuple[SubTask, ...] = ()
 
 
@@ -90,6 +92,7 @@ def plan_parts(
     asked: tuple[SubTask, ...],
     entries: Sequence[MemoryEntry],
     names: NameSimilarity = TABLE_NAMES,
+    looks: Looks = UNKNOWN_LOOKS,
 ) -> tuple[tuple[Candidate, ...], ...]:
     """What an instruction can be carried out by: for each part, in order, the entries that are about it.
 
@@ -101,20 +104,21 @@ def plan_parts(
         asked: Its sub-tasks, as :func:`read_instruction` reads it.
         entries: The memory.
         names: Says which names mean the same thing.
+        looks: What is known of the objects, to put one where another was shown.
 
     Raises:
         InstructionError: There is no memory of the instruction or of one of its sub-tasks; the error
             says why it could not be read or names the sub-task, and lists what the memory knows.
     """
     if asked[0].words:
-        return _plan_by_words(instruction, asked, entries, names)
+        return _plan_by_words(instruction, asked, entries, names, looks)
     entries = near(asked, entries, partial(semantic_score, names=names))
     chain: list[tuple[Candidate, ...]] = []
     left = asked
     while left:
         said = instruction if len(asked) == 1 else phrase(left[0])
         try:
-            found = _longest_run(left, said, entries, names)
+            found = _longest_run(left, said, entries, names, looks)
         except InstructionError as error:
             if len(asked) == 1:
                 raise
@@ -127,19 +131,23 @@ def plan_parts(
 
 
 def _plan_by_words(
-    instruction: str, asked: tuple[SubTask, ...], entries: Sequence[MemoryEntry], names: NameSimilarity
+    instruction: str,
+    asked: tuple[SubTask, ...],
+    entries: Sequence[MemoryEntry],
+    names: NameSimilarity,
+    looks: Looks,
 ) -> tuple[tuple[Candidate, ...], ...]:
     """Likewise where the grammar cannot read: as a whole, else step by step."""
     try:
         # By their words things are not told from others of their name, so what is asked is what was shown.
         found = candidates_for(asked, instruction, entries, names)
-        return (tuple(Candidate(one, score, one, one.key.sub_tasks) for one, score in found),)
+        return (tuple(Candidate(one, score, (one,), one.key.sub_tasks) for one, score in found),)
     except InstructionError as error:
         steps = split_steps(instruction, names.lexicon)
         with suppress(InstructionError):
             chain: list[tuple[Candidate, ...]] = []
             for one in steps:
-                chain += plan_parts(one, read_instruction(one, entries, names), entries, names)
+                chain += plan_parts(one, read_instruction(one, entries, names), entries, names, looks)
             if chain:
                 return tuple(chain)
         why = why_unread(instruction, entries, names)
@@ -147,9 +155,11 @@ def _plan_by_words(
 
 
 def _longest_run(
-    asked: Sequence[SubTask], said: str, entries: Sequence[MemoryEntry], names: NameSimilarity
+    asked: Sequence[SubTask], said: str, entries: Sequence[MemoryEntry], names: NameSimilarity, looks: Looks
 ) -> tuple[Candidate, ...]:
     """Candidates for the first sub-tasks, for as many as were demonstrated together.
+
+    Where not even the first one was, it is put together.
 
     Raises:
         InstructionError: There are none for the first one, which is called as ``said``, or entries about
@@ -159,8 +169,32 @@ def _longest_run(
         run = tuple(asked[:n_sub_tasks])
         with suppress(InstructionError):
             found = candidates_for(run, said, entries, names)
-            return tuple(Candidate(one, score, one, run) for one, score in found)
+            return tuple(Candidate(one, score, (one,), run) for one, score in found)
     sources = [(part, entry) for entry in entries for part in parts(entry)]
     source_of = {id(part): entry for part, entry in sources}
-    found = candidates_for(asked[:1], said, [part for part, _ in sources], names)
-    return tuple(Candidate(one, score, source_of[id(one)], tuple(asked[:1])) for one, score in found)
+    try:
+        found = candidates_for(asked[:1], said, [part for part, _ in sources], names)
+    except InstructionError as error:
+        return _put_together(asked[0], sources, names, looks, error)
+    return tuple(Candidate(one, score, (source_of[id(one)],), tuple(asked[:1])) for one, score in found)
+
+
+def _put_together(
+    asked: SubTask,
+    parts: Sequence[tuple[MemoryEntry, MemoryEntry]],
+    names: NameSimilarity,
+    looks: Looks,
+    unknown: InstructionError,
+) -> tuple[Candidate, ...]:
+    """Candidates for a sub-task that no entry is about, or the error that says so."""
+    known = {part.key.sub_tasks for part, _ in parts}
+    among = AmongKnown(names, {name for key in known for sub_task in key for name in sub_task.objects})
+    if any(semantic_score((asked,), key, among) >= MIN_SEMANTIC for key in known):
+        raise unknown  # several are, and which one is meant is open
+    try:
+        found = combinations(asked, parts, lambda one, other: semantic_score((one,), (other,), among), looks)
+    except InstructionError as error:
+        raise InstructionError(f"{error}, and {unknown}") from error
+    if not found:
+        raise unknown
+    return tuple(Candidate(one.entry, one.semantic, (one.grasp, one.place), (asked,)) for one in found)

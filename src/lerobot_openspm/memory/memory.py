@@ -13,6 +13,7 @@ from lerobot_openspm.errors import MemoryFormatError
 from lerobot_openspm.geometry.camera import Camera
 from lerobot_openspm.geometry.se3 import Array
 from lerobot_openspm.geometry.vector_layout import VectorLayout
+from lerobot_openspm.memory.combine import Looks
 from lerobot_openspm.memory.entry import MemoryEntry
 from lerobot_openspm.memory.not_learned import NotLearned, still_not_learned
 from lerobot_openspm.memory.quality import with_success
@@ -79,6 +80,11 @@ class Memory:
             return {}
         symmetries = {name: model.symmetry for name, model in self.objects.items()}
         return {name: one for name, one in symmetries.items() if one is not None}
+
+    @property
+    def looks(self) -> Looks:
+        """What decides how one object takes the place of another."""
+        return Looks(self.points, self.symmetries)
 
     def appended(self, newer: Memory) -> Memory:
         """This memory with the entries of another one added.
