@@ -24,8 +24,9 @@ logger = logging.getLogger(__name__)
 
 # Corrections per key pose, and attempts beyond the first in a part of the instruction.
 MAX_CORRECTIONS, MAX_ATTEMPTS = 8, 3
-# An opening below this share of the demonstrated one means that the fingers hold nothing.
-HELD_SHARE = 0.4
+# An opening below this share of the demonstrated one, or this much less, metres, means that the fingers hold
+# nothing, or something else.
+HELD_SHARE, OTHER_OPENING_M = 0.4, 0.012
 # Where the demonstration's fingers stood further apart than this share of open, they held something.
 HOLDING_SHARE = 0.03
 # What is carried is held up from below where the hand is so far above its place, from and to, at most so far
@@ -224,12 +225,11 @@ class Executor:
     def has_lost_grip(self, hand: Hand) -> bool:
         """Whether the fingers closed further than the demonstration's did around the object."""
         felt = self._felt_opening()
-        return felt is not None and hand.opening < HELD_SHARE * felt
+        return felt is not None and hand.opening < max(HELD_SHARE * felt, felt - OTHER_OPENING_M)
 
     def feels_grip(self, hand: Hand) -> bool:
         """Whether the fingers are as far apart as the demonstration's were around the object."""
-        felt = self._felt_opening()
-        return felt is not None and hand.opening >= HELD_SHARE * felt
+        return self._felt_opening() is not None and not self.has_lost_grip(hand)
 
     def _felt_opening(self) -> float | None:
         """How far apart the demonstration's fingers were around what is held now, metres.

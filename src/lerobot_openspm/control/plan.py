@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from lerobot_openspm.control.feasibility import Miss, check_reach, check_transfer
+from lerobot_openspm.control.finger_room import shifted
 from lerobot_openspm.control.pushes import pushed_by_landmark
 from lerobot_openspm.control.putting import put_aside, put_turned
 from lerobot_openspm.control.transfer import (
@@ -64,6 +65,7 @@ class Plan:
         aside: How far beside its place what is carried is put down, x and y in the world, metres.
         around: How far it is turned where it is put on or in something round, radians.
         out: How far ``(3,)`` beside key poses the hand passes by, by their index, in the world, metres.
+        shifts: How far the hand goes to one side as it takes hold, by sub-task, along its y axis, metres.
         not_meant: By name, poses ``T_world_obj`` ``(4, 4)`` of others of its kind, which stand about.
     """
 
@@ -78,6 +80,7 @@ class Plan:
     aside: tuple[float, float] = (0.0, 0.0)
     around: float = 0.0
     out: Mapping[int, Array] = field(default_factory=dict[int, Array])
+    shifts: Mapping[int, float] = field(default_factory=dict[int, float])
     not_meant: Mapping[str, Sequence[Array]] = field(default_factory=dict[str, Sequence[Array]])
 
     def targets(
@@ -104,7 +107,8 @@ class Plan:
             targets = put_turned(targets, self.around, entry.carried, object_poses, context.symmetries)
         if self.out:
             targets = tuple(_beside(target, self.out.get(i)) for i, target in enumerate(targets))
-        return half_turned(targets) if self.is_half_turned else targets
+        targets = half_turned(targets) if self.is_half_turned else targets
+        return shifted(targets, self.shifts)
 
     def symmetric_grasps(self, context: PlanningContext) -> dict[int, str]:
         """What is grasped to be carried and turns into itself, by sub-task; a handle is on one side only."""
@@ -147,13 +151,13 @@ class Plan:
         ]
 
     def following(self, moved: Mapping[str, Array]) -> Plan:
-        """The plan with some objects elsewhere, at poses ``T_world_obj`` ``(4, 4)``, and led out nowhere yet.
+        """The plan with some objects elsewhere, at poses ``T_world_obj`` ``(4, 4)``, led aside nowhere yet.
 
         Beside a place that has moved, things may stand otherwise.
         """
         ends = {name for one in self._puts for name in one.anchor.objects} & moved.keys()
         went = [se3.distances(moved[name], self.object_poses.get(name, NOWHERE))[0] for name in ends]
-        plan = replace(self, object_poses={**self.object_poses, **moved}, out={})
+        plan = replace(self, object_poses={**self.object_poses, **moved}, out={}, shifts={})
         if any(metres >= ASIDE_KEPT_M for metres in went):
             plan = replace(plan, aside=(0.0, 0.0), around=0.0)
         return plan

@@ -15,6 +15,7 @@ from lerobot_openspm.control.feasibility import (
     find_stance,
     geometric_score,
 )
+from lerobot_openspm.control.finger_room import finger_room
 from lerobot_openspm.control.joint_room import ways_out
 from lerobot_openspm.control.plan import Plan
 from lerobot_openspm.control.pushes import pushed_by_landmark
@@ -262,7 +263,7 @@ class PlanningContext:
 
         Where the arm cannot follow such ways, the plan stays as it is, and that is said.
         """
-        return self._with_room(self._lifted(plan))
+        return self._with_room(self._with_finger_room(self._lifted(plan)))
 
     def _lifted(self, plan: Plan) -> Plan:
         points, targets = self._points(plan), plan.targets(self)
@@ -288,7 +289,13 @@ class PlanningContext:
             plan: The plan.
             moved: Where they are now, ``T_world_obj`` ``(4, 4)`` by name.
         """
-        return self._with_room(plan.following(moved)).followed(self)
+        return self._with_room(self._with_finger_room(plan.following(moved))).followed(self)
+
+    def _with_finger_room(self, plan: Plan) -> Plan:
+        """A plan that takes hold beside what stands close, where the arm can follow it so."""
+        shifts = finger_room(plan.entry, plan.targets(self), self._points(plan), self.robot.open_width)
+        aside = replace(plan, shifts=shifts)
+        return plan if not shifts or aside.followed(self)[1] else aside
 
     def _with_room(self, plan: Plan) -> Plan:
         """A plan that is led out where the arm's joints have no room."""

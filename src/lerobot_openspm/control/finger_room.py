@@ -1,0 +1,78 @@
+"""Room for the fingers: a hand takes hold a little to one side where something stands close by.
+
+The fingers close on what is between them and move it to their middle, so that it is in the hand as it was
+shown, whichever finger meets it first.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from lerobot_openspm.control.transfer import Target
+from lerobot_openspm.geometry import se3
+from lerobot_openspm.geometry.se3 import Array
+from lerobot_openspm.memory.entry import MemoryEntry
+
+# How far to one side, metres, the least first; both fingers stay this far from what they close on.
+SHIFTS_M = (0.0, 0.003, -0.003, 0.006, -0.006, 0.009, -0.009, 0.012, -0.012)
+LEAST_ROOM_M = 0.004
+# A finger in the hand's frame, which is between the fingertips: half its width along x, how thick it is along
+# y beyond the opening, with some room to what stands beside it, and from where to where it reaches along z.
+HALF_WIDTH_M, THICKNESS_M, FROM_M, TO_M = 0.016, 0.028, -0.05, 0.01
+# Fewer points of other objects in the fingers' way are noise.
+NOISE_POINTS = 3
+
+
+def finger_room(
+    entry: MemoryEntry, targets: Sequence[Target], points: Mapping[str, Array], open_width: float
+) -> dict[int, float]:
+    """By sub-task, how far the hand goes along its y axis to one side as it takes hold, metres.
+
+    Only what is carried off is grasped so; a handle stays where it is.
+
+    Args:
+        entry: What is to be executed.
+        targets: Its key poses in the scene.
+        points: Points ``(n, 3)`` in the world of the objects that were found, by name.
+        open_width: Of the gripper, metres.
+    """
+    shifts: dict[int, float] = {}
+    for target in targets:
+        pose = target.key_pose
+        if pose.phase != "grasp" or entry.carried.get(pose.sub_task) != pose.anchor.place:
+            continue
+        others = [own for name, own in points.items() if name not in pose.anchor.objects]
+        if not others:
+            continue
+        near = se3.apply(se3.inverse(target.T_world_ee), np.concatenate(others))
+        most = (open_width - pose.opening) / 2 - LEAST_ROOM_M
+        choices = [metres for metres in SHIFTS_M if abs(metres) <= max(most, 0.0)]
+        in_way = [_in_fingers(near, metres, open_width) for metres in choices]
+        best = int(np.argmin(in_way))
+        if in_way[0] >= NOISE_POINTS and choices[best]:
+            shifts[pose.sub_task] = choices[best]
+    return shifts
+
+
+def _in_fingers(points: Array, shift: float, open_width: float) -> int:
+    """How many points ``(n, 3)`` in the hand's frame are in the way of the fingers of a shifted hand."""
+    x, y, z = np.abs(points[:, 0]), np.abs(points[:, 1] - shift), points[:, 2]
+    return int(((x < HALF_WIDTH_M) & (y < open_width / 2 + THICKNESS_M) & (z > FROM_M) & (z < TO_M)).sum())
+
+
+def shifted(targets: Sequence[Target], shifts: Mapping[int, float]) -> tuple[Target, ...]:
+    """The same key poses, with the hand to one side until it takes hold."""
+    taken: set[int] = set()
+    found: list[Target] = []
+    for target in targets:
+        pose = target.key_pose
+        if pose.sub_task in shifts and pose.sub_task not in taken and pose.phase in ("approach", "grasp"):
+            step = se3.transform(np.eye(3), np.array([0.0, shifts[pose.sub_task], 0.0]))
+            target = replace(target, T_world_ee=target.T_world_ee @ step)
+        if pose.phase == "grasp":
+            taken.add(pose.sub_task)
+        found.append(target)
+    return tuple(found)
