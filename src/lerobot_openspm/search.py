@@ -11,11 +11,11 @@ import numpy as np
 
 from lerobot_openspm.errors import DatasetError, InstructionError
 from lerobot_openspm.language.names import TABLE_NAMES, NameSimilarity
-from lerobot_openspm.memory.combine import UNKNOWN_LOOKS, Looks
 from lerobot_openspm.memory.compose import Candidate, plan_parts
 from lerobot_openspm.memory.entry import MemoryEntry
 from lerobot_openspm.memory.indexed_entries import indexed, near
 from lerobot_openspm.memory.key_vector import key_vector, key_vectors
+from lerobot_openspm.memory.looks import UNKNOWN_LOOKS, Looks
 from lerobot_openspm.memory.retrieval import LAMBDAS, read_instruction, retrieve, semantic_score
 from lerobot_openspm.perception.observation import Observation, split_batch
 from lerobot_openspm.types import SubTask

@@ -11,8 +11,9 @@ from tests.memory.builders import entry, hand_pose, key_pose, pick_and_place, pl
 from lerobot_openspm.control.transfer import transfer
 from lerobot_openspm.errors import InstructionError
 from lerobot_openspm.geometry import se3
-from lerobot_openspm.memory.combine import Looks, combined
+from lerobot_openspm.memory.combine import combined
 from lerobot_openspm.memory.entry import Anchor, Outcome
+from lerobot_openspm.memory.looks import Looks
 from lerobot_openspm.types import Symmetry
 
 BOWL_ON_PLATE = entry(source="local/demos#0")

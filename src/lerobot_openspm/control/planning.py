@@ -24,9 +24,9 @@ from lerobot_openspm.geometry import se3
 from lerobot_openspm.geometry.se3 import Array
 from lerobot_openspm.language.meaning import means_the_same
 from lerobot_openspm.language.names import TABLE_NAMES, NameSimilarity
-from lerobot_openspm.memory.combine import Looks
 from lerobot_openspm.memory.compose import Candidate
 from lerobot_openspm.memory.entry import MemoryEntry
+from lerobot_openspm.memory.looks import Looks
 from lerobot_openspm.memory.retrieval import Scored, retrieve
 from lerobot_openspm.memory.robot import RobotModel
 from lerobot_openspm.types import Execution, Symmetry

@@ -7,7 +7,7 @@ where the bowl went on the plate: what the bottle stands on takes the way that w
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from itertools import chain, cycle, islice, zip_longest
 
 import numpy as np
@@ -17,7 +17,9 @@ from lerobot_openspm.geometry import se3
 from lerobot_openspm.geometry.se3 import Array
 from lerobot_openspm.language.descriptions import phrase
 from lerobot_openspm.memory.entry import WORLD, Anchor, MemoryEntry, MemoryKeyPose, Outcome, RetrievalKey
-from lerobot_openspm.types import SubTask, Symmetry
+from lerobot_openspm.memory.looks import UNKNOWN_LOOKS, Looks
+from lerobot_openspm.memory.rim_grasps import Part, Score, by_rim
+from lerobot_openspm.types import SubTask
 
 # Below this semantic score a demonstration grasps another thing, or puts things elsewhere.
 MIN_SEMANTIC = 0.75
@@ -32,39 +34,6 @@ MOST_TILT_RAD = 0.35
 # In what is put together, a thing is somewhere by being put or by being pushed there.
 MOVING = ("put", "push")
 ARRIVING = ("pre-place", "place", "release")
-
-# S_sem of what is asked and what is known.
-Score = Callable[[SubTask, SubTask], float]
-
-
-@dataclass(frozen=True)
-class Looks:
-    """What is known of the objects that decides how one takes the place of another.
-
-    Attributes:
-        points: Points ``(n, 3)`` of each object's surface in its frame, where its shape is known.
-        symmetries: How objects turn into themselves, of those that do.
-    """
-
-    points: Mapping[str, Array] = field(default_factory=dict[str, Array])
-    symmetries: Mapping[str, Symmetry] = field(default_factory=dict[str, Symmetry])
-
-    def underside(self, name: str) -> Array:
-        """The middle ``(3,)`` of what an object stands on, in its frame, metres.
-
-        Its frame's origin as far as nothing is known.
-        """
-        points, symmetry = self.points.get(name), self.symmetries.get(name)
-        middle, height = np.zeros(2), 0.0
-        if points is not None and len(points):
-            low, high = np.percentile(points[:, :2], (5, 95), axis=0)
-            middle, height = (low + high) / 2, float(np.percentile(points[:, 2], 1))
-        if symmetry is not None:
-            middle = np.asarray(symmetry.middle)
-        return np.array([*middle, height])
-
-
-UNKNOWN_LOOKS = Looks()
 
 
 @dataclass(frozen=True)
@@ -86,7 +55,7 @@ class Combination:
 
 def combinations(
     asked: SubTask,
-    parts: Sequence[tuple[MemoryEntry, MemoryEntry]],
+    parts: Sequence[Part],
     score: Score,
     looks: Looks = UNKNOWN_LOOKS,
 ) -> list[Combination]:
@@ -112,6 +81,15 @@ def combinations(
     places = _best(shown, lambda known: score(asked, _done_with(asked, known)), _is_place, "landmark")
     if not grasps and not places:
         return []
+    sag_m = 0.0
+    if not grasps:
+        grasps = _best(
+            by_rim(asked, shown, score, MIN_SEMANTIC, looks),
+            lambda known: score(asked, _going_as(asked, known)),
+            _is_grasp,
+            "target",
+        )
+        sag_m = max((_radius(part, looks) for part, _, _ in grasps), default=0.0)
     if not grasps:
         raise InstructionError(f"no demonstration takes hold of the {asked.target} to carry it")
     if not places:
@@ -121,10 +99,15 @@ def combinations(
     for (grasp, own, a), (place, other, b) in islice(
         zip(cycle(grasps), cycle(places), strict=False), n_pairs
     ):
-        entry = combined(grasp, place, looks)
+        entry = combined(grasp, place, looks, sag_m)
         if entry is not None:
             found.append(Combination(entry, min(a, b), own, other))
     return found
+
+
+def _radius(part: MemoryEntry, looks: Looks) -> float:
+    rim = looks.rim(part.key.sub_tasks[0].target)
+    return 0.0 if rim is None else rim.radius
 
 
 def _place_name(asked: SubTask) -> str:
@@ -163,7 +146,7 @@ def _carries_level(part: MemoryEntry) -> bool:
 
 
 def _best(
-    parts: Sequence[tuple[MemoryEntry, MemoryEntry]],
+    parts: Sequence[Part],
     score: Callable[[SubTask], float],
     is_usable: Callable[[MemoryEntry], bool],
     what: str,
@@ -186,7 +169,9 @@ def _best(
     return [one for one in chain.from_iterable(zip_longest(*by_task.values())) if one is not None]
 
 
-def combined(grasp: MemoryEntry, place: MemoryEntry, looks: Looks = UNKNOWN_LOOKS) -> MemoryEntry | None:
+def combined(
+    grasp: MemoryEntry, place: MemoryEntry, looks: Looks = UNKNOWN_LOOKS, sag_m: float = 0.0
+) -> MemoryEntry | None:
     """An entry that takes what one entry grasps to where another one puts something.
 
     The hand keeps the direction in which it grasped. Each key pose of the second entry is met by what the
@@ -196,6 +181,7 @@ def combined(grasp: MemoryEntry, place: MemoryEntry, looks: Looks = UNKNOWN_LOOK
         grasp: How the target is grasped, an entry of one sub-task.
         place: How something is put or pushed to its landmark, an entry of one sub-task.
         looks: What is known of the objects.
+        sag_m: How far the far side of the target may hang below its underside as it is carried, metres.
 
     Returns:
         None where both are about the same thing, which cannot stand on itself.
@@ -210,7 +196,7 @@ def combined(grasp: MemoryEntry, place: MemoryEntry, looks: Looks = UNKNOWN_LOOK
     }
     index, T_grasp = _grasped(grasp)
     stood, other_stood = _same_surface(grasp, place, looks)
-    way = _way(place, other_stood)
+    way = _way(place, other_stood).higher(sag_m)
     placing = _placing(grasp.key_poses[index], T_grasp, T_grasp[:3, 3] - stood, way, object_poses, sub_task)
     key_poses = (*_taking(grasp, index, way.rise_m), *placing)
     outcome = _outcome(sub_task, way, place, looks)
@@ -269,6 +255,12 @@ class _Way:
     poses: tuple[MemoryKeyPose, ...]
     points: tuple[Array, ...]
     rise_m: float
+
+    def higher(self, metres: float) -> _Way:
+        """The same way with more room below, but for the place itself."""
+        up = [metres if pose.phase == "pre-place" else 0.0 for pose in self.poses]
+        points = [point + np.array([0.0, 0.0, z]) for point, z in zip(self.points, up, strict=True)]
+        return replace(self, points=tuple(points), rise_m=self.rise_m + metres)
 
 
 def _way(place: MemoryEntry, stood: Array) -> _Way:

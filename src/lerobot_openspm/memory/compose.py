@@ -14,12 +14,14 @@ from functools import partial
 
 from lerobot_openspm.errors import InstructionError
 from lerobot_openspm.language.descriptions import phrase
-from lerobot_openspm.language.meaning import semantic_score
+from lerobot_openspm.language.lexicon import Lexicon
+from lerobot_openspm.language.meaning import same_meaning, semantic_score
 from lerobot_openspm.language.names import TABLE_NAMES, AmongKnown, NameSimilarity
 from lerobot_openspm.language.own_words import split_steps
-from lerobot_openspm.memory.combine import UNKNOWN_LOOKS, Looks, combinations
+from lerobot_openspm.memory.combine import combinations
 from lerobot_openspm.memory.entry import CONTACT_PHASES, MemoryEntry, RetrievalKey
 from lerobot_openspm.memory.indexed_entries import near
+from lerobot_openspm.memory.looks import UNKNOWN_LOOKS, Looks
 from lerobot_openspm.memory.retrieval import MIN_SEMANTIC, candidates_for, read_instruction, why_unread
 from lerobot_openspm.types import SubTask
 
@@ -125,9 +127,38 @@ def plan_parts(
             raise InstructionError(
                 f"{said!r} is a part of the instruction {instruction!r} that cannot be done: {error}"
             ) from error
+        done = (*asked[: len(asked) - len(left)], *(one.asked[0] for (one, *_) in chain))
+        needed = _condition(found, done, names.lexicon)
+        if needed is not None:
+            chain.append(_longest_run((needed,), phrase(needed), entries, names, looks))
         chain.append(found)
         left = left[len(found[0].asked) :]
     return tuple(chain)
+
+
+def _condition(found: Sequence[Candidate], done: Sequence[SubTask], lexicon: Lexicon) -> SubTask | None:
+    """What has to be done before a part that nobody asked for, as all demonstrations of that did it.
+
+    Before something goes into a drawer, that is opened.
+
+    Args:
+        found: What the part can be carried out by.
+        done: The sub-tasks that are carried out before it.
+        lexicon: Says which words mean the same.
+    """
+    needed: SubTask | None = None
+    for one in found:
+        put, shown = one.entry.key.sub_tasks[0], one.sources[-1].key.sub_tasks
+        own = next((i for i, other in enumerate(shown) if _place(other) == _place(put)), 0)
+        before = [other for other in shown[:own] if put.part and _place(put) == (other.target, other.part)]
+        if not before or any(same_meaning((before[-1],), (other,), lexicon) for other in done):
+            return None
+        needed = before[-1]
+    return needed
+
+
+def _place(sub_task: SubTask) -> tuple[str, str]:
+    return sub_task.landmark, sub_task.part
 
 
 def _plan_by_words(
@@ -191,8 +222,12 @@ def _put_together(
     among = AmongKnown(names, {name for key in known for sub_task in key for name in sub_task.objects})
     if any(semantic_score((asked,), key, among) >= MIN_SEMANTIC for key in known):
         raise unknown  # several are, and which one is meant is open
+
+    def score(one: SubTask, other: SubTask) -> float:
+        return semantic_score((one,), (other,), among)
+
     try:
-        found = combinations(asked, parts, lambda one, other: semantic_score((one,), (other,), among), looks)
+        found = combinations(asked, parts, score, looks)
     except InstructionError as error:
         raise InstructionError(f"{error}, and {unknown}") from error
     if not found:

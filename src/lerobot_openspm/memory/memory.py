@@ -13,8 +13,8 @@ from lerobot_openspm.errors import MemoryFormatError
 from lerobot_openspm.geometry.camera import Camera
 from lerobot_openspm.geometry.se3 import Array
 from lerobot_openspm.geometry.vector_layout import VectorLayout
-from lerobot_openspm.memory.combine import Looks
 from lerobot_openspm.memory.entry import MemoryEntry
+from lerobot_openspm.memory.looks import Looks
 from lerobot_openspm.memory.not_learned import NotLearned, still_not_learned
 from lerobot_openspm.memory.quality import with_success
 from lerobot_openspm.memory.robot import RobotModel
