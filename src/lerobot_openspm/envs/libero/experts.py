@@ -1,6 +1,6 @@
 """Scripted experts for LIBERO's tasks: they read the true poses and act by the same 7-D actions.
 
-All of libero_goal's are here; `picks` has those of libero_spatial and libero_object, `long_tasks` some of
+All of libero_goal's are here; `picks` has those of libero_spatial and libero_object, `long_tasks` those of
 libero_10.
 
 Positions are in LIBERO's world frame unless a comment says otherwise: x points from the robot over the table,
@@ -18,6 +18,7 @@ from functools import partial
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from lerobot_openspm.envs.libero.fixtures import HANDLE_X, HANDLE_Y, turn_on_stove
 from lerobot_openspm.envs.libero.long_tasks import LONG
 from lerobot_openspm.envs.libero.picks import OBJECT, SPATIAL
 from lerobot_openspm.envs.libero.puts import (
@@ -60,18 +61,12 @@ DRAWER_CARRY_RISE = 0.25
 RACK_CARRY_RISE = 0.33
 
 # In the cabinet's frame, whose -y points out of the drawers.
-HANDLE_X, HANDLE_Y = -0.003, -0.1016
 HANDLE_Z = {"top": 0.184, "middle": 0.1104}
 DRAWER_PULL = 0.15
 DRAWER_BACK_OFF = 0.06
 # The open drawer overhangs the bowl: the hand leans away, and the bowl moves aside before it rises.
 BOWL_LEAN = math.radians(35)
 BOWL_ASIDE = np.array([-0.02, 0.09, 0.08])
-
-# In the stove's frame. The fingers lean back towards the robot, or its arm would fold up to its limits.
-KNOB = np.array([-0.004, 0.001, 0.035])
-KNOB_LEAN = math.radians(20)
-KNOB_TURN = math.radians(60)
 
 # Of the ee behind the plate's origin when it stands clear, and when both fingers touch the edge.
 PLATE_CLEAR, PLATE_TOUCHING = 0.085, 0.063
@@ -140,17 +135,6 @@ def _bowl_in_top_drawer(hand: LiberoHand) -> Actions:
     yield from place(hand, "bowl", region(hand, "wooden_cabinet_1_top_region") + BOWL_IN_DRAWER)
 
 
-def _turn_on_stove(hand: LiberoHand) -> Actions:
-    offset, turn = hand.grasp_noise()
-    stove = hand.frame("stove")
-    lean = Rotation.from_rotvec([0.0, KNOB_LEAN, 0.0]).as_matrix()
-    at_knob = transform(stove[:3, :3] @ yaw_matrix(turn) @ lean @ DOWN, in_world(stove, KNOB) + offset)
-    yield from grasp(hand, at_knob)
-    yield from hand.advance(transform(yaw_matrix(KNOB_TURN) @ at_knob[:3, :3], at_knob[:3, 3]))
-    yield from hand.grip(closing=False)
-    yield from hand.retreat(RETREAT_RISE)
-
-
 def _push_plate(hand: LiberoHand) -> Actions:
     """Push the plate's edge with both fingertips of the open hand: two points of contact keep it straight."""
     plate = hand.origin("plate")
@@ -201,5 +185,5 @@ EXPERTS: dict[str, Callable[[LiberoHand], Actions]] = {
     "open_the_middle_drawer_of_the_cabinet": partial(_open_drawer, "middle"),
     "open_the_top_drawer_and_put_the_bowl_inside": _bowl_in_top_drawer,
     "push_the_plate_to_the_front_of_the_stove": _push_plate,
-    "turn_on_the_stove": _turn_on_stove,
+    "turn_on_the_stove": turn_on_stove,
 }

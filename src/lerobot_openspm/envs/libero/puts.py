@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -51,6 +51,8 @@ class Put:
         lean: By which angle the hand leans towards the robot, radians.
         along: The fingers open along this object's x axis instead of the world's y.
         turn: By which angle the hand is turned about the vertical besides, radians.
+        slant: Where from the goal, seen from above, the lowering begins (3,): it is lowered at a slant.
+        like: It is put down with its axes along those of this object, not as it stood.
     """
 
     name: str
@@ -60,6 +62,8 @@ class Put:
     lean: float = 0.0
     along: str | None = None
     turn: float = 0.0
+    slant: np.ndarray = field(default_factory=lambda: np.zeros(3))
+    like: str | None = None
 
 
 def take_and_put(put: Put, hand: LiberoHand) -> Actions:
@@ -71,7 +75,7 @@ def take_and_put(put: Put, hand: LiberoHand) -> Actions:
     at_grasp = transform(yaw_matrix(yaw + turn) @ lean @ DOWN, at)
     yield from grasp(hand, at_grasp)
     yield from hand.travel(raised(at_grasp, put.rise))
-    yield from place(hand, put.name, put.goal(hand))
+    yield from place(hand, put.name, put.goal(hand), put.slant, put.like)
 
 
 def grasp(hand: LiberoHand, at_grasp: np.ndarray) -> Actions:
@@ -81,23 +85,37 @@ def grasp(hand: LiberoHand, at_grasp: np.ndarray) -> Actions:
     yield from hand.grip(closing=True)
 
 
-def place(hand: LiberoHand, name: str, goal: np.ndarray) -> Actions:
+def place(
+    hand: LiberoHand,
+    name: str,
+    goal: np.ndarray,
+    slant: np.ndarray | tuple[float, ...] = (0.0, 0.0, 0.0),
+    like: str | None = None,
+) -> Actions:
     """Put the grasped object's origin at a world point (3,), let go and retreat upwards.
 
-    The object crosses the table at the height that it was lifted to.
+    The object crosses the table at the height that it was lifted to, and turns on the way until its axes are
+    those of another one that it is to stand `like`. It is lowered straight down or from a `slant` (3,) beside
+    the goal.
     """
     release = goal + hand.grasp_noise()[0] + [0.0, 0.0, RELEASE_GAP]
     above = np.array([release[0], release[1], max(hand.origin(name)[2], release[2] + LOWERING)])
-    yield from hand.travel(carried(hand, name, above))
-    yield from hand.advance(carried(hand, name, release))
+    yield from hand.travel(carried(hand, name, above + slant, like))
+    yield from hand.advance(carried(hand, name, release, like))
     yield from hand.grip(closing=False)
     yield from hand.retreat(RETREAT_RISE)
 
 
-def carried(hand: LiberoHand, name: str, goal: np.ndarray) -> np.ndarray:
-    """T_world_ee that brings the grasped object to a world point (3,), the hand keeping its orientation."""
-    T_world_ee = hand.simulator.ee_pose()
-    return transform(T_world_ee[:3, :3], T_world_ee[:3, 3] + goal - hand.origin(name))
+def carried(hand: LiberoHand, name: str, goal: np.ndarray, like: str | None = None) -> np.ndarray:
+    """T_world_ee that brings the grasped object to a world point (3,).
+
+    The hand keeps its orientation, or turns about the vertical until the object's axes are those of `like`.
+    """
+    T_world_ee, T_world_obj = hand.simulator.ee_pose(), hand.frame(name)
+    turn = 0.0 if like is None else float(yaw_of(hand.frame(like)) - yaw_of(T_world_obj))
+    rotation = yaw_matrix(turn)
+    position = goal + rotation @ (T_world_ee[:3, 3] - T_world_obj[:3, 3])
+    return transform(rotation @ T_world_ee[:3, :3], position)
 
 
 def backed(T_world_ee: np.ndarray, distance: float) -> np.ndarray:

@@ -89,7 +89,7 @@ class LiberoSuite:
         }
 
     def tasks(self, selection: str) -> list[str]:
-        """See `Suite`. Of libero_10, experts do some tasks only."""
+        """See `Suite`."""
         known = [task for task in tasks(self._suite) if task in EXPERTS]
         return select(selection, known, {"all": known, self._suite: known}, self._suite)
 
