@@ -114,3 +114,15 @@ def test_closed_fingers_that_push_after_something_was_put_down_hold_nothing_that
         assert not executor.has_lost_grip(fist), phases[index]
     executor.begin(executor.targets, fist, phases.index("lift"))
     assert executor.has_lost_grip(fist)
+
+
+@pytest.mark.parametrize(
+    ("opening", "is_lost"), [(0.03, False), (0.024, False), (0.016, True), (0.005, True)]
+)
+def test_fingers_that_are_much_closer_than_shown_hold_something_else(opening, is_lost):
+    executor, world = make(), World()
+    run(executor, world, until=lambda e: e.targets[e.state.index].key_pose.phase == "lift")
+    assert executor.targets[executor.state.index - 1].key_pose.opening == 0.03
+    hand = Hand(world.T, opening)
+    assert executor.has_lost_grip(hand) == is_lost
+    assert executor.feels_grip(hand) != is_lost

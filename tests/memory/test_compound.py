@@ -172,3 +172,19 @@ def test_an_instruction_kept_by_its_words_is_one_part_however_much_it_moved():
     ((one,),) = planned("please set the table", [two])
     assert (one.entry, one.asked, one.semantic) == (two, two.key.sub_tasks, 1.0)
     assert parts(two) == (two,)
+
+
+def test_what_all_demonstrations_did_before_is_done_before():
+    whole = drawer_entry()
+    opened_first, put = planned("put the bowl in the top drawer of the cabinet", [whole, PLATE])
+    assert [one.entry.key.sub_tasks[0].operation for one in opened_first] == ["open"]
+    assert [one.entry.key.sub_tasks[0].landmark for one in put] == ["cabinet"]
+    # Who opens it asks for no more.
+    assert len(planned("open the top drawer and put the bowl in the top drawer", [whole, PLATE])) <= 2
+
+
+def test_what_some_demonstration_did_without_is_no_condition():
+    whole = drawer_entry()
+    (_, only) = planned("put the bowl in the top drawer of the cabinet", [whole])
+    alone = replace(only[0].entry, source="local/demos#9")
+    assert len(planned("put the bowl in the top drawer of the cabinet", [whole, alone])) == 1
