@@ -20,11 +20,15 @@ def test_what_a_scene_does_not_hold_is_left_out():
 
 def test_a_name_is_that_of_a_noun_with_all_of_its_words():
     poses = {
-        name: se3.from_yaw([i, 0, 0], 0.0) for i, name in enumerate(("bowl", "alphabet_soup", "cookie_box"))
+        name: se3.from_yaw([i, 0, 0], 0.0)
+        for i, name in enumerate(("bowl", "alphabet_soup", "cookie_box", "white_mug", "yellow_and_white_mug"))
     }
-    named = name_simulator_poses(poses, ["black bowl", "alphabet soup", "soup", "cookie box", "box"], {})
+    nouns = ["black bowl", "alphabet soup", "soup", "cookie box", "box", "white mug", "yellow and white mug"]
+    named = name_simulator_poses(poses, nouns, {})
     assert {noun: T[0, 3] for noun, T in named.items()} == {
         "black bowl": 0,
         "alphabet soup": 1,
         "cookie box": 2,
+        "white mug": 3,
+        "yellow and white mug": 4,
     }

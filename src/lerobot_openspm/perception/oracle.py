@@ -30,13 +30,15 @@ def name_simulator_poses(
 ) -> dict[str, Array]:
     """Simulator poses under the nouns of the instructions: "bottle" is the "wine bottle".
 
-    A name in several words, such as "cookie_box", is that of a noun with all of them.
+    A name in several words, such as "cookie_box", is that of a noun with all of them. The name with most
+    words counts, and of those the first.
 
     The yaw of a body of revolution is dropped, as perception, which cannot see it, does.
     """
     named = {}
     for noun in nouns:
-        match = next((name for name in poses if set(name.split("_")) <= set(noun.split())), None)
+        fitting = [name for name in poses if set(name.split("_")) <= set(noun.split())]
+        match = max(fitting, key=lambda name: name.count("_"), default=None)
         if match is None:
             continue
         T = poses[match]
