@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 
 from benchmarks.results import run, write
-from benchmarks.stages import EnvironmentOption, dataset
+from benchmarks.stages import EnvironmentOption
 from lerobot_openspm.calibration.estimate import estimate_camera
 from lerobot_openspm.calibration.tracks import track_features
 from lerobot_openspm.cli.calibrate import errors
@@ -48,7 +48,7 @@ class CalibrationConfig:
 
 def main(config: CalibrationConfig) -> dict[str, Any]:
     """Measure, write and return the result."""
-    root = dataset(config.env.type)
+    root = config.env.dataset()
     cv2.setNumThreads(1)
     source = read(root, OpenSPMConfig(device="cpu", push_to_hub=False, rotation="axis_angle"))
     name, rows = config.env.type.removeprefix("openspm_"), {}

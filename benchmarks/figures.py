@@ -98,8 +98,9 @@ CALIBRATION = (
     *_benchmarks("calibration", "stages"),
 )
 NOISE = (*ALONG, *_benchmarks("measurement_noise"))
-# As `make libero` types it.
-LIBERO_GOAL = "--demos=10 --states=50 --tasks=0-9"
+# As `make libero` types it; libero_goal is not named.
+WHOLE_SUITE = "--demos=10 --states=50 --tasks=0-9"
+OTHER_SUITES = ("libero_spatial", "libero_object", "libero_10")
 # Scenes of each task: 50 of each of three, and 10 of each of ten. With other kinds than all, the same scenes.
 PLACES = {
     "libero_spatial": "--suite=libero_spatial",
@@ -147,6 +148,9 @@ def _with(figure: Figure, *paths: str) -> Figure:
     return replace(figure, paths=(*figure.paths, *paths))
 
 
+ERRORS = ("libero/accuracy", "truth")
+# The other suites' scenes get a copy of it that stands elsewhere.
+ARM = "configs/arms/libero_panda.urdf"
 COMPARISONS = ("tabletop", "execution", "oracle", "conditioning", "compound", "two_bowls", "anywhere")
 ON_LIBERO = "--env.type=libero"
 FIGURES: dict[str, Figure] = {
@@ -167,12 +171,15 @@ FIGURES: dict[str, Figure] = {
     "memory": _figure("memory", MEMORY),
     "measurement_noise": _figure("measurement_noise", (*TABLETOP, *NOISE)),
     "measurement_noise_libero": _figure("measurement_noise", (*LIBERO, *NOISE), ON_LIBERO),
-    "libero_goal": _libero("run", "libero/accuracy", "truth", options=LIBERO_GOAL),
-    "libero_accuracy": _libero("run", "libero/accuracy", "truth", options=LIBERO_GOAL),
+    **{name: _libero("run", *ERRORS, options=WHOLE_SUITE) for name in ("libero_goal", "libero_accuracy")},
+    **{
+        suite: _with(_libero("run", *ERRORS, options=f"--suite={suite} {WHOLE_SUITE}"), ARM)
+        for suite in OTHER_SUITES
+    },
     **{
         suite: _figure(
             "libero_pro",
-            (*LIBERO, *_benchmarks("libero_pro", "libero/accuracy", "truth")),
+            (*LIBERO, *_benchmarks("libero_pro", *ERRORS)),
             f"--suite={suite} --states=50",
         )
         for suite in ("libero_goal_swap", "libero_goal_lan", "libero_goal_object")
@@ -196,7 +203,7 @@ FIGURES: dict[str, Figure] = {
     },
     "libero_losses": _libero("losses"),
     "libero_latency": _with(_libero("latency"), f"{PACKAGE}/bench"),
-    "libero_equality": _libero("equality"),
+    "libero_equality": _libero("equality", "libero/run", *ERRORS),
     "perception_libero": _figure("perception", (*LIBERO, *ALONG), ON_LIBERO),
     "keyposes_libero": _figure("key_poses", (*KEY_POSES, *RECORDING["libero"]), ON_LIBERO),
     "calibration": _figure("calibration", (*CALIBRATION, *RECORDING["openspm_tabletop"])),

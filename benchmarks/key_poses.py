@@ -161,7 +161,7 @@ def summary(verdicts: Sequence[Verdict]) -> dict[str, Any]:
 def _episode(recording: Recording, index: int) -> Episode:
     """What mining reads of a recording, by the same layouts as of a dataset."""
     kind = ROTATIONS[recording.job.env_type]
-    names = find_suite(recording.job.env_type).names
+    names = find_suite(recording.job.env_type, recording.job.task).names
     state = parse_layout(_flat(names["observation.state"]), "state", kind)
     action = parse_layout(_flat(names["action"]), "action", kind)
     vectors = recording.state.astype(float)

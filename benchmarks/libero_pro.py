@@ -13,7 +13,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
-from benchmarks.libero.accuracy import accuracy
+from benchmarks.libero.accuracy import accuracy, found_errors
 from benchmarks.libero.evaluate import SEED, STATES, EvaluationConfig, evaluate, summary
 from benchmarks.libero.variants import EXCHANGED, PRO_SUITES
 from benchmarks.results import run, write
@@ -61,7 +61,8 @@ def main(config: ProConfig) -> dict[str, Any]:
             tuning=config.tuning,
         )
     )
-    figures = summary(episodes, accuracy(checkpoint, dataset(LIBERO), episodes)["found_off_mm"])
+    errors = found_errors(checkpoint, dataset(LIBERO), episodes)
+    figures = summary(episodes, accuracy(episodes, errors)["found_off_mm"])
     if config.states == STATES and config.task == "all" and not config.tuning:
         write(config.suite, {"seed": SEED, "demonstrations": DEMOS, **figures}, THREADS)
     return {

@@ -19,7 +19,7 @@ from benchmarks.harness import Row, checkpoint_files, measured_folder, resume
 from benchmarks.libero.evaluate import kept_simulator, move_hand
 from benchmarks.libero.variants import exchanged
 from benchmarks.results import run, write
-from benchmarks.stages import LIBERO, CheckpointConfig, DatasetOption, dataset
+from benchmarks.stages import LIBERO, CheckpointConfig, DatasetOption
 from benchmarks.truth import Error, Truth, offsets, pose_error, summary, true_period
 from benchmarks.worlds import WORLDS, LiberoWorld, World
 from lerobot_openspm.bench.latency import times_ms
@@ -58,7 +58,7 @@ class PerceptionConfig(CheckpointConfig):
 
     def demonstrations(self) -> Path:
         """Folder of the demonstrations, recorded if they are the default ones."""
-        return Path(self.dataset.root) if self.dataset.root else dataset(self.env.type)
+        return Path(self.dataset.root) if self.dataset.root else self.env.dataset()
 
 
 def main(config: PerceptionConfig) -> dict[str, Any]:

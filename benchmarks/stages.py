@@ -6,6 +6,7 @@ They lie where `make demo` and `make libero` leave theirs, and are made by which
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -13,13 +14,16 @@ from pathlib import Path
 from lerobot_openspm.cli.options import require_checkpoint
 from lerobot_openspm.cli.pipeline import TRAIN_CONFIG, collect_dataset, train
 from lerobot_openspm.envs.collection import SUMMARY_FILE
-from lerobot_openspm.envs.suites import find_suite
+from lerobot_openspm.envs.suites import find_suite, whole_suite
+from lerobot_openspm.files import write_beside
 
 # The demonstrations a task of the published figures; whoever asks for fewer takes the first of them.
 DEMOS = 10
 TABLETOP, LIBERO = "openspm_tabletop", "libero"
 RUNS = {TABLETOP: Path("outputs/demo"), LIBERO: Path("outputs/libero")}
 TRAIN_CONFIGS = {TABLETOP: TRAIN_CONFIG, LIBERO: Path("configs/openspm_libero_train.yaml")}
+# LIBERO's, as it stands in libero_goal.
+ARM = Path("configs/arms/libero_panda.urdf")
 
 
 @dataclass
@@ -27,8 +31,8 @@ class EnvironmentOption:
     """Where to measure.
 
     Args:
-        type: openspm_tabletop, or libero (its suite libero_goal).
-        task: A task's name, several with commas, or "all".
+        type: openspm_tabletop, or libero.
+        task: A task's name, several with commas, or "all"; of libero also a suite, "all" is libero_goal.
     """
 
     type: str = TABLETOP
@@ -44,7 +48,11 @@ class EnvironmentOption:
 
     def tasks(self) -> list[str]:
         """Names of the tasks. Raises ValueError if there is no such simulator or task."""
-        return find_suite(self.type).tasks(self.task)
+        return find_suite(self.type, self.task).tasks(self.task)
+
+    def dataset(self) -> Path:
+        """The demonstrations of all tasks of the suite, recorded if need be."""
+        return dataset(self.type, selection=whole_suite(self.type, self.task))
 
 
 @dataclass
@@ -104,7 +112,7 @@ class CheckpointConfig(EpisodesConfig):
     def checkpoint(self) -> Path:
         """The checkpoint, trained if it is the default one. Raises FileNotFoundError when there is none."""
         if self.policy.path is None:
-            return policy(self.env.type)[0]
+            return policy(self.env.type, selection=whole_suite(self.env.type, self.env.task))[0]
         require_checkpoint(Path(self.policy.path), "--policy.path")
         return Path(self.policy.path)
 
@@ -113,20 +121,25 @@ class CheckpointConfig(EpisodesConfig):
         return Path(self.output or f"outputs/bench/{name}_{self.env.type}")
 
 
-def run_folder(simulator: str, demos: int = DEMOS, selected: Sequence[str] | None = None) -> Path:
-    """Where everything made of so many demonstrations a task lies; a part of the tasks has its own folder."""
-    names = list(find_suite(simulator).tasks("all"))
-    chosen = names if selected is None else list(selected)
+def run_folder(simulator: str, demos: int = DEMOS, selection: str = "all") -> Path:
+    """Where everything made of so many demonstrations a task lies; a part of the tasks has its own folder.
+
+    Args:
+        simulator: As --env.type takes it.
+        demos: Of each task.
+        selection: The tasks, as --env.task takes them.
+    """
+    suite = find_suite(simulator, selection)
+    names, chosen = suite.tasks("all"), suite.tasks(selection)
     some = "" if chosen == names else "_tasks_" + "_".join(str(names.index(task)) for task in chosen)
-    return RUNS[simulator] / f"demos_{demos}{some}"
+    of_suite = "" if suite.name == simulator else suite.name
+    return RUNS[simulator] / of_suite / f"demos_{demos}{some}"
 
 
-def dataset(simulator: str, demos: int = DEMOS, selected: Sequence[str] | None = None) -> Path:
-    """The demonstrations, recorded if need be."""
-    root = run_folder(simulator, demos, selected) / "dataset"
-    if selected is None or list(selected) == find_suite(simulator).tasks("all"):
-        selected = ["all"]
-    collect_dataset(root, demos, simulator, ",".join(selected))
+def dataset(simulator: str, demos: int = DEMOS, selection: str = "all") -> Path:
+    """The demonstrations, recorded if need be; see :func:`run_folder`."""
+    root = run_folder(simulator, demos, selection) / "dataset"
+    collect_dataset(root, demos, simulator, selection)
     return root
 
 
@@ -136,6 +149,7 @@ def policy(
     *options: str,
     root: Path | None = None,
     episodes: Sequence[int] | None = None,
+    selection: str = "all",
 ) -> tuple[Path, float | None]:
     """Checkpoint and seconds of a variant, mined and trained if need be.
 
@@ -145,15 +159,32 @@ def policy(
         options: Further options of lerobot-train.
         root: The demonstrations; those of the published figures if not given.
         episodes: The demonstrations that may be learned from; all if not given.
+        selection: The tasks that were demonstrated, as --env.task takes them.
 
     Returns:
         The seconds are None if the training was interrupted: how long it took in all is not known.
     """
-    root = dataset(simulator) if root is None else root
+    root = dataset(simulator, selection=selection) if root is None else root
+    if find_suite(simulator, selection).name != simulator:
+        options = (*_as_its_scenes(root, find_suite(simulator, selection).tasks(selection)[0]), *options)
     if episodes is not None:
         chosen = json.dumps(list(episodes))
         options = (f"--dataset.episodes={chosen}", f"--policy.memory_episodes={chosen}", *options)
     return train(root, root.with_name(variant), options, TRAIN_CONFIGS[simulator])
+
+
+def _as_its_scenes(root: Path, task: str) -> tuple[str, str]:
+    """The options by which the cameras and the arm stand as in the scenes of a task of LIBERO."""
+    from lerobot_openspm.envs.libero.simulator import LiberoSimulator
+
+    simulator = LiberoSimulator(task)
+    simulator.reset(0)
+    place = " ".join(f"{x:.6g}" for x in simulator.body_pose("robot0_base")[:3, 3])
+    simulator.close()
+    urdf = re.sub(r'(<joint name="base".*?<origin xyz=")[^"]*', rf"\g<1>{place}", ARM.read_text(), flags=re.S)
+    arm = root.with_name("arm.urdf")
+    write_beside(arm, urdf.encode())
+    return f"--policy.cameras={root}/meta/openspm_cameras.json", f"--policy.arm={arm}"
 
 
 def first_episodes(root: Path, demos: int, without: str | None = None) -> list[int]:

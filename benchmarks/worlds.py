@@ -14,7 +14,6 @@ if TYPE_CHECKING:
     from lerobot_openspm.envs.tabletop.env import TabletopEnv
 
 IMAGE_SIZE, LIBERO_IMAGE_SIZE = 256, 360  # of LIBERO lerobot-eval's default
-LIBERO_MAX_STEPS = 300
 
 
 class World(Protocol):
@@ -68,11 +67,11 @@ class TabletopWorld:
 
 
 class LiberoWorld:
-    """One task of libero_goal, in the scene that its simulator is in; LIBERO ends an episode at success."""
+    """One task of LIBERO, in the scene that its simulator is in; LIBERO ends an episode at success."""
 
     def __init__(self, simulator: LiberoSimulator) -> None:
         self.simulator = simulator
-        self.instruction, self.max_steps = simulator.instruction, LIBERO_MAX_STEPS
+        self.instruction, self.max_steps = simulator.instruction, simulator.max_steps
         self.state, self.image, self.object_poses = simulator.state, simulator.image, simulator.object_poses
 
     def step(self, action: np.ndarray) -> tuple[bool, bool]:
@@ -92,7 +91,7 @@ def tabletop(task: str, seed: int) -> Generator[TabletopWorld]:
 
 @contextlib.contextmanager
 def libero(task: str, seed: int) -> Generator[LiberoWorld]:
-    """A task's scene of libero_goal, drawn from a seed; the benchmark's own are :func:`initial_states`."""
+    """A task's scene of LIBERO, drawn from a seed; the benchmark's own are :func:`initial_states`."""
     from lerobot_openspm.envs.libero.simulator import LiberoSimulator
 
     with contextlib.closing(LiberoSimulator(task, LIBERO_IMAGE_SIZE)) as simulator:
@@ -105,10 +104,10 @@ WORLDS = {"openspm_tabletop": tabletop, "libero": libero}
 
 @functools.cache
 def initial_states(task: str) -> np.ndarray:
-    """The 50 initial states of a task of libero_goal, flattened as LIBERO keeps them."""
+    """The 50 initial states of a task of LIBERO, flattened as LIBERO keeps them."""
     from lerobot.envs.libero import _get_suite, get_task_init_states
 
-    from lerobot_openspm.envs.libero.simulator import SUITE
+    from lerobot_openspm.envs.libero.simulator import suite_of
 
-    suite = _get_suite(SUITE)
+    suite = _get_suite(suite_of(task))
     return np.asarray(get_task_init_states(suite, [one.name for one in suite.tasks].index(task)))

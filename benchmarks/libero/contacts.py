@@ -3,26 +3,31 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
 
 from lerobot_openspm.envs.libero.simulator import OBJECTS, SUITE, LiberoSimulator
 
-# The objects of libero_goal, in whose scenes contacts are counted.
-THINGS = tuple(OBJECTS[SUITE])
 # What was moved farther than this from where it stood.
 MOVED_M = 0.010
 NOTHING, ROBOT = -1, 0
 ROBOT_BODIES = ("robot0_", "gripper0_")
 
 
-def task_objects(instruction: str, file: Path) -> set[str]:
-    """Those of `THINGS` that an instruction names, or the goal of LIBERO's description of the task."""
-    words = re.findall(r"\w+", instruction.lower())
-    goal = file.read_text().partition("(:goal")[2]
-    return {name for name in THINGS if name in words or re.search(rf"(?<![a-z]){name}_\d", goal)}
+def task_objects(instruction: str, file: Path, suite: str = SUITE) -> set[str]:
+    """Those of a suite's `OBJECTS` that an instruction names, or the goal of LIBERO's file of the task.
+
+    A variant of the task may hold another bowl, whose name ends as ours does.
+    """
+    goal, words, found = file.read_text().partition("(:goal")[2], instruction.lower(), set[str]()
+    # The yellow and white mug is no white mug: what a longer name stands for is no shorter one.
+    for name in sorted(OBJECTS[suite], key=len, reverse=True):
+        words, named = re.subn(rf"\b{name.replace('_', ' ')}\b", "", words)
+        if named or re.search(rf"(?<![a-z])({name}_\d|{OBJECTS[suite][name]}(?!\d))", goal):
+            found.add(name)
+    return found
 
 
 def shares(found: Sequence[Mapping[str, float]]) -> dict[str, float | None]:
@@ -49,9 +54,10 @@ class Contacts:
         of_task: The objects that may be touched.
     """
 
-    def __init__(self, simulator: LiberoSimulator, of_task: set[str]) -> None:
+    def __init__(self, simulator: LiberoSimulator, of_task: Collection[str]) -> None:
         model, self._data = simulator.sim.model._model, simulator.sim.data._data
-        roots = {model.body(simulator.root_body(name)).id: i for i, name in enumerate(THINGS, start=1)}
+        self._things = tuple(simulator.object_poses())
+        roots = {model.body(simulator.root_body(name)).id: i for i, name in enumerate(self._things, start=1)}
         owners = np.full(model.nbody, NOTHING)
         # A body comes after the one that it is fixed to.
         for body in range(1, model.nbody):
@@ -60,7 +66,7 @@ class Contacts:
             owners[body] = ROBOT if is_robot else roots.get(body, inherited if inherited > ROBOT else NOTHING)
         self._owners = owners[model.geom_bodyid]
         self._start = self._data.geom_xpos.copy()
-        self._watched = [name for name in THINGS if name not in of_task]
+        self._watched = [name for name in self._things if name not in of_task]
         self._touched: set[str] = set()
 
     def note(self) -> None:
@@ -70,7 +76,7 @@ class Contacts:
         geoms, others = np.concatenate([pairs, pairs[:, ::-1]]).T
         touched = self._owners[others]
         found = moves[geoms] & (touched > ROBOT) & (touched != self._owners[geoms])
-        self._touched.update(THINGS[owner - 1] for owner in touched[found])
+        self._touched.update(self._things[owner - 1] for owner in touched[found])
 
     def told(self) -> dict[str, float]:
         """How far from where it stood each object is now, in mm, that was touched and is not of the task.
@@ -79,7 +85,9 @@ class Contacts:
         object that is more than 1 cm away was touched, between two moments that were looked at if need be.
         """
         moved_m = self._moved_m()
-        farthest = {name: moved_m[self._owners == THINGS.index(name) + 1].max() for name in self._watched}
+        farthest = {
+            name: moved_m[self._owners == self._things.index(name) + 1].max() for name in self._watched
+        }
         return {
             name: round(1000 * float(distance), 1)
             for name, distance in farthest.items()

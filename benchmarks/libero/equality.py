@@ -1,4 +1,7 @@
-"""Whether the harness acts as plain lerobot-eval does: the same episodes, compared action by action."""
+"""Whether the harness acts as plain lerobot-eval does: the same episodes, compared action by action.
+
+python -m benchmarks.libero.equality --suite=libero_spatial --states=2
+"""
 
 from __future__ import annotations
 
@@ -9,8 +12,9 @@ from typing import Any
 import numpy as np
 from benchmarks.episodes import load, run_episode
 from benchmarks.libero.evaluate import SEED
+from benchmarks.libero.run import learned
 from benchmarks.results import run, write
-from benchmarks.stages import LIBERO, policy
+from benchmarks.stages import DEMOS, LIBERO
 from benchmarks.worlds import LIBERO_IMAGE_SIZE, LiberoWorld, initial_states
 from lerobot.envs.configs import LiberoEnv
 from lerobot.envs.factory import make_env, make_env_pre_post_processors
@@ -18,24 +22,31 @@ from lerobot.policies.factory import make_pre_post_processors
 from lerobot.scripts.lerobot_eval import rollout
 from tqdm import tqdm
 
-from lerobot_openspm.envs.libero.simulator import SUITE, LiberoSimulator, tasks
+from lerobot_openspm.envs.libero.simulator import OBJECTS, SUITE, LiberoSimulator, tasks
+from lerobot_openspm.envs.suites import find_suite
 from lerobot_openspm.modeling_openspm import OpenSPMPolicy
 
 
 @dataclass
 class EqualityConfig:
-    """How many of the benchmark's initial states a task to compare."""
+    """Which suite, and how many of the benchmark's initial states a task to compare."""
 
+    suite: str = SUITE
     states: int = 2
+
+    def __post_init__(self) -> None:
+        if self.suite not in OBJECTS:
+            raise ValueError(f"suite is {self.suite!r}, expected one of {', '.join(OBJECTS)}")
 
 
 def main(config: EqualityConfig) -> dict[str, Any]:
     """Run every episode twice, compare, write and return the result."""
-    checkpoint, _ = policy(LIBERO)
-    acting = load(str(checkpoint))
+    parts = learned(config.suite, DEMOS, find_suite(LIBERO, config.suite).tasks("all"))
+    policies = {task: part.checkpoint for part in parts for task in part.tasks}
     plain, lazy = [], []
-    for number, task in enumerate(tqdm(tasks(), unit="task")):
-        plain += _plain(acting, checkpoint, number, config.states)
+    for task, checkpoint in tqdm(policies.items(), unit="task"):
+        acting = load(str(checkpoint))
+        plain += _plain(acting, checkpoint, task, config)
         simulator = LiberoSimulator(task, LIBERO_IMAGE_SIZE)
         for state in range(config.states):
             simulator.reset_to(SEED + state, initial_states(task)[state])
@@ -44,7 +55,7 @@ def main(config: EqualityConfig) -> dict[str, Any]:
     equal = [len(a) == len(b) and np.array_equal(a, b) for a, b in zip(plain, lazy, strict=True)]
     together = [np.abs(a[: len(b)] - b[: len(a)]).max() for a, b in zip(plain, lazy, strict=True)]
     return write(
-        "libero_equality",
+        "libero_equality" if config.suite == SUITE else f"{config.suite}_equality",
         {
             "seed": SEED,
             "n": len(equal),
@@ -55,14 +66,15 @@ def main(config: EqualityConfig) -> dict[str, Any]:
     )
 
 
-def _plain(acting: OpenSPMPolicy, checkpoint: Path, number: int, states: int) -> list[np.ndarray]:
+def _plain(acting: OpenSPMPolicy, checkpoint: Path, task: str, config: EqualityConfig) -> list[np.ndarray]:
     """Actions of one task's episodes as lerobot-eval takes them."""
-    env_config = LiberoEnv(task=SUITE, task_ids=[number])
-    vector_env = make_env(env_config, n_envs=1)[SUITE][number]
+    number = list(tasks(config.suite)).index(task)
+    env_config = LiberoEnv(task=config.suite, task_ids=[number])
+    vector_env = make_env(env_config, n_envs=1)[config.suite][number]
     before, after = make_env_pre_post_processors(env_config, policy_cfg=acting.config)
     prepare, finish = make_pre_post_processors(acting.config, pretrained_path=str(checkpoint))
     found = []
-    for state in range(states):
+    for state in range(config.states):
         told = rollout(vector_env, acting, before, after, prepare, finish, seeds=[SEED + state])
         done = told["done"][0].numpy()
         found.append(told["action"][0].numpy()[: int(np.argmax(done)) + 1 if done.any() else None])

@@ -1,17 +1,18 @@
-"""Evaluate a checkpoint on libero_goal's 50 initial states a task, resumably and without needless rendering.
+"""Evaluate a checkpoint on a suite's 50 initial states a task, resumably and without needless rendering.
 
-    python -m benchmarks.libero.evaluate --checkpoint=FOLDER --output=FOLDER
+    python -m benchmarks.libero.evaluate --checkpoint=FOLDER --output=FOLDER --suite=libero_spatial
 
-An episode is the one of `lerobot-eval --env.type=libero --env.task=libero_goal --seed=1000` with one
-environment: initial state i, seed 1000 + i, ten settling steps, at most 300 steps. `equality.py` compares the
-two action by action. Every episode is written down as it ends; a second run does the rest.
+An episode is the one of `lerobot-eval --env.type=libero --env.task=libero_spatial --seed=1000` with one
+environment: initial state i, seed 1000 + i, ten settling steps, at most as many steps as LeRobot gives it.
+`equality.py` compares the two action by action. Every episode is written down as it ends; a second run does
+the rest.
 """
 
 from __future__ import annotations
 
 import functools
 import gc
-from collections.abc import Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -29,7 +30,7 @@ from benchmarks.worlds import LIBERO_IMAGE_SIZE, LiberoWorld
 from lerobot_openspm.cli.pipeline import rate
 from lerobot_openspm.control.controller import EpisodeController
 from lerobot_openspm.control.state import Status
-from lerobot_openspm.envs.libero.simulator import SUITE, LiberoSimulator, task_file, tasks
+from lerobot_openspm.envs.libero.simulator import OBJECTS, SUITE, LiberoSimulator, suite_of, task_file, tasks
 from lerobot_openspm.envs.seeds import TUNING_SEED_START
 from lerobot_openspm.geometry import se3
 from lerobot_openspm.language.instruction import parse_instruction
@@ -39,6 +40,7 @@ from lerobot_openspm.perception.oracle import name_simulator_poses
 from lerobot_openspm.types import Execution
 
 STATES, SEED = 50, 1000
+SUITES = (*OBJECTS, *PRO_SUITES)
 # Tuning scenes of the benchmark, apart from those that tests use.
 TUNING_SEED = TUNING_SEED_START + 100_000
 
@@ -51,7 +53,7 @@ class EvaluationConfig:
         checkpoint: Folder of the policy.
         output: Folder for episodes.jsonl.
         task: A task's name, several with commas, or "all".
-        suite: libero_goal, or one of LIBERO-PRO's variants of it.
+        suite: One of LIBERO's, or one of LIBERO-PRO's variants of libero_goal.
         episodes: Initial states a task, from the first on.
         tuning: Draw as many scenes from tuning seeds instead of taking the benchmark's initial states; of a
             variant, with exchanges of our own.
@@ -71,10 +73,11 @@ class EvaluationConfig:
     execution: Execution | None = None
 
     def __post_init__(self) -> None:
-        if self.suite not in (SUITE, *PRO_SUITES):
-            raise ValueError(f"suite is {self.suite!r}, expected one of {', '.join((SUITE, *PRO_SUITES))}")
-        if self.tuning and self.suite not in (SUITE, EXCHANGED):
-            raise ValueError(f"tuning scenes are drawn for {SUITE} and {EXCHANGED}, not for {self.suite}")
+        if self.suite not in SUITES:
+            raise ValueError(f"suite is {self.suite!r}, expected one of {', '.join(SUITES)}")
+        drawn = (*OBJECTS, EXCHANGED)
+        if self.tuning and self.suite not in drawn:
+            raise ValueError(f"tuning scenes are drawn for {', '.join(drawn)}, not for {self.suite}")
 
 
 def main(config: EvaluationConfig) -> dict[str, Any]:
@@ -87,9 +90,10 @@ def evaluate(config: EvaluationConfig) -> list[Row]:
 
     Episodes of another policy, other settings or other code are removed, not mixed in.
     """
-    wanted = list(tasks()) if config.task == "all" else config.task.split(",")
-    if unknown := [task for task in wanted if task not in tasks()]:
-        raise ValueError(f"libero_goal has no tasks {unknown}, expected some of {', '.join(tasks())}")
+    known = tasks(SUITE if config.suite in PRO_SUITES else config.suite)
+    wanted = list(known) if config.task == "all" else config.task.split(",")
+    if unknown := [task for task in wanted if task not in known]:
+        raise ValueError(f"{config.suite} has no tasks {unknown}, expected some of {', '.join(known)}")
     settings = [f"{key}={getattr(config, key)}" for key in ("suite", "tuning", "tuning_seed", "execution")]
     code = [Path(str(module.__file__)) for module in (contacts, failures, pro_objects, variants)]
     files = [*checkpoint_files(Path(config.checkpoint)), *code]
@@ -104,12 +108,11 @@ def evaluate_states(
     states: int = STATES,
     selected: Sequence[str] | None = None,
     execution: Execution | None = None,
+    suite: str = SUITE,
 ) -> list[Row]:
     """Episodes on the first of the benchmark's initial states of all tasks or some, run if need be."""
     names = ",".join(selected) if selected else "all"
-    return evaluate(
-        EvaluationConfig(str(checkpoint), str(output), names, episodes=states, execution=execution)
-    )
+    return evaluate(EvaluationConfig(str(checkpoint), str(output), names, suite, states, execution=execution))
 
 
 def summary(episodes: list[Row], off_mm: Sequence[float] | None = None) -> dict[str, Any]:
@@ -120,9 +123,8 @@ def summary(episodes: list[Row], off_mm: Sequence[float] | None = None) -> dict[
         off_mm: For each the largest error among the poses that were found at first, where that is known.
     """
     names = dict.fromkeys(e["task"] for e in episodes)
-    own = {
-        task: [e for e in episodes if e["task"] == task] for task in sorted(names, key=list(tasks()).index)
-    }
+    order = list(tasks(suite_of(next(iter(names)))))
+    own = {task: [e for e in episodes if e["task"] == task] for task in sorted(names, key=order.index)}
     errors = [None] * len(episodes) if off_mm is None else off_mm
     failed = [
         {
@@ -172,7 +174,7 @@ def evaluate_one(config: EvaluationConfig, task: str, state: int) -> Row:
         ``gripped`` as `Grips` does.
     """
     seed = (config.tuning_seed if config.tuning else SEED) + state
-    is_exchanged = config.tuning and config.suite != SUITE
+    is_exchanged = config.tuning and config.suite == EXCHANGED
     file = exchanged(task, seed) if is_exchanged else variant_file(config.suite, task)
     policy, simulator = _policy(config.checkpoint, config.execution), kept_simulator(task, file)
     if config.tuning:
@@ -182,7 +184,8 @@ def evaluate_one(config: EvaluationConfig, task: str, state: int) -> Row:
         simulator.reset_to(seed, variant_states(config.suite, task)[state])
     sub_tasks = parse_instruction(simulator.instruction)
     named = list(dict.fromkeys(name for sub_task in sub_tasks for name in sub_task.objects))
-    watch = Contacts(simulator, task_objects(simulator.instruction, file or task_file(task)))
+    of_task = task_objects(simulator.instruction, file or task_file(task), simulator.suite)
+    watch = Contacts(simulator, of_task)
     grips, places = Grips(), dict[str, Any]()
 
     def note(step: int, observation: Observation, controller: EpisodeController) -> None:
@@ -190,7 +193,8 @@ def evaluate_one(config: EvaluationConfig, task: str, state: int) -> Row:
         state, targets = controller.state, controller.executor.targets
         grips.note(state.part, [target.key_pose.phase for target in targets], state.index)
         if step == 0:
-            true = name_simulator_poses(simulator.object_poses(), named, policy.require_memory().objects)
+            poses = without_several(simulator.object_poses(), of_task)
+            true = name_simulator_poses(poses, named, policy.require_memory().objects)
             seen = controller.scene.tracker.poses(observation.hand.T_world_ee)
             places["seen"] = {name: _place(T) for name, T in seen.items()}
             places["true"] = {name: _place(T) for name, T in true.items()}
@@ -199,6 +203,12 @@ def evaluate_one(config: EvaluationConfig, task: str, state: int) -> Row:
     watch.note()
     found = {"contacts": watch.told(), "gripped": grips.told(), **places}
     return {"task": task, "state": state, "seed": seed, **episode.told(), **found}
+
+
+def without_several(poses: Mapping[str, np.ndarray], of_task: Collection[str]) -> dict[str, np.ndarray]:
+    """Poses without those of two of a kind that a task is about: a name may mean either."""
+    kinds = {name[:-2] for name in of_task if name.endswith("_2")}
+    return {name: T for name, T in poses.items() if name.removesuffix("_2") not in kinds}
 
 
 def move_hand(simulator: LiberoSimulator, rng: np.random.Generator) -> None:

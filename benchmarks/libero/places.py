@@ -32,7 +32,6 @@ from benchmarks.truth import offsets_in
 from benchmarks.worlds import LiberoWorld
 
 from benchmarks import calls, truth
-from lerobot_openspm.cli.pipeline import collect_dataset
 from lerobot_openspm.configuration_openspm import OpenSPMConfig
 from lerobot_openspm.envs.collection import SUMMARY_FILE
 from lerobot_openspm.envs.libero.simulator import DO_NOTHING, OBJECTS, SUITE, LiberoSimulator
@@ -115,20 +114,11 @@ class PlacesConfig:
         scenes = itertools.product(tasks, range(self.scenes))
         return [(task, seed) for seed, (task, _) in enumerate(scenes, self.first_seed)]
 
-    @property
-    def simulator(self) -> str:
-        """The suite as --env.type takes it."""
-        return LIBERO if self.suite == SUITE else self.suite
-
     def demonstrations(self) -> Path:
         """Folder of the demonstrations, recorded if need be."""
         if self.dataset.root is not None:
             return Path(self.dataset.root)
-        if self.suite == SUITE:
-            return dataset(LIBERO, self.demos)
-        root = Path(f"outputs/{self.suite}/demos_{self.demos}/dataset")
-        collect_dataset(root, self.demos, self.simulator)
-        return root
+        return dataset(LIBERO, self.demos, self.suite)
 
 
 def learn(root: Path, folder: Path, kinds: Collection[str]) -> dict[str, Any]:
@@ -265,7 +255,7 @@ def main(config: PlacesConfig) -> dict[str, Any]:
     options = [config.suite, str(config.exchanged), *config.asked()]
     folder = measured_folder(output, files, options, __file__)
     learned = learn(root, folder, config.asked())
-    tasks = find_suite(config.simulator).tasks("all")
+    tasks = find_suite(LIBERO, config.suite).tasks("all")
     jobs = {f"{task} {seed}": (config, folder, task, seed) for task, seed in config.drawn(tasks)}
     rows = resume(folder / "scenes.jsonl", jobs, look_at_scene, config.workers)
     for told in learned["objects"].values():

@@ -11,7 +11,7 @@ import numpy as np
 from benchmarks.libero.pro_objects import register_objects
 from benchmarks.worlds import initial_states
 
-from lerobot_openspm.envs.libero.simulator import SUITE, suite_of, task_file
+from lerobot_openspm.envs.libero.simulator import OBJECTS, SUITE, suite_of, task_file
 
 # LIBERO-PRO's: things change places, look otherwise, or the instructions are worded otherwise.
 EXCHANGED, OTHER_OBJECTS = "libero_goal_swap", "libero_goal_object"
@@ -28,7 +28,7 @@ STAYING, WIDER_M = ("wooden_cabinet_1", "flat_stove_1", "basket_1"), 0.02
 
 
 def variant_file(suite: str, task: str) -> Path | None:
-    """The file of a task in a suite; None for libero_goal itself, whose files LIBERO finds.
+    """The file of a task in a suite; None for LIBERO's own suites, whose files it finds.
 
     Objects that only LIBERO-PRO has are made known to LIBERO, so that this process can make the task's scene.
 
@@ -36,7 +36,7 @@ def variant_file(suite: str, task: str) -> Path | None:
         ValueError: There is no such suite.
         FileNotFoundError: LIBERO-PRO's files are not there.
     """
-    if suite == SUITE:
+    if suite in OBJECTS:
         return None
     if suite == OTHER_OBJECTS:
         register_objects(_pro(suite) / "envs", _assets())
@@ -46,7 +46,7 @@ def variant_file(suite: str, task: str) -> Path | None:
 @functools.cache
 def variant_states(suite: str, task: str) -> np.ndarray:
     """The 50 initial states of a task in a suite, flattened as LIBERO keeps them. Raises as above."""
-    if suite == SUITE:
+    if suite in OBJECTS:
         return initial_states(task)
     with np.load(_pro(suite) / "init_files" / suite / f"{task}.pruned_init.npz", allow_pickle=False) as file:
         return np.asarray(file["states"])
@@ -54,7 +54,7 @@ def variant_states(suite: str, task: str) -> np.ndarray:
 
 def _pro(suite: str) -> Path:
     if suite not in PRO_SUITES:
-        raise ValueError(f"suite is {suite!r}, expected {SUITE} or one of {', '.join(PRO_SUITES)}")
+        raise ValueError(f"suite is {suite!r}, expected one of {', '.join((*OBJECTS, *PRO_SUITES))}")
     folder = _assets().parent / "pro/libero/libero"
     if not (folder / "bddl_files" / suite).is_dir():
         raise FileNotFoundError(

@@ -143,7 +143,7 @@ def test_liberos_scenes_are_drawn_from_the_guards_own_seeds(monkeypatch: pytest.
 
     monkeypatch.setattr(pipeline, "collect_dataset", lambda *given: collected.append(given))
     monkeypatch.setattr(guard.stages, "policy", lambda simulator, root: (checkpoint, 1.0))
-    monkeypatch.setattr(harness, "tasks", lambda: {"push_the_plate": "push the plate"})
+    monkeypatch.setattr(harness, "tasks", lambda _: {"push_the_plate": "push the plate"})
     monkeypatch.setattr(harness, "evaluate_one", run_one)
     monkeypatch.setattr(harness, "EvaluationConfig", partial(harness.EvaluationConfig, workers=1))
     standard = Standard(expected=0.95, demos=1, episodes=2, seed=STANDARDS["libero"].seed)

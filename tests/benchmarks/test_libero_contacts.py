@@ -7,9 +7,9 @@ from typing import Any
 import mujoco
 import numpy as np
 import pytest
-from benchmarks.libero.contacts import THINGS, Contacts, shares, task_objects
+from benchmarks.libero.contacts import Contacts, shares, task_objects
 
-from lerobot_openspm.envs.libero.simulator import LiberoSimulator
+from lerobot_openspm.envs.libero.simulator import OBJECTS, LiberoSimulator
 from lerobot_openspm.envs.seeds import TUNING_SEED_START
 
 # A robot's finger that is led along x pushes the bowl, the bowl the cheese that lies behind it and the bottle
@@ -25,6 +25,7 @@ ROW = """
   <actuator><position joint="x" kp="500"/></actuator>
 </mujoco>
 """
+THINGS = tuple(OBJECTS["libero_goal"])
 PLACES = {"bowl": (0.06, 0), "cheese": (0.12, 0), "bottle": (0.14, 0.0595)}
 
 
@@ -40,7 +41,9 @@ def scene() -> Any:
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)
     sim = SimpleNamespace(model=SimpleNamespace(_model=model), data=SimpleNamespace(_data=data))
-    return SimpleNamespace(sim=sim, root_body=lambda name: f"{name}_main")
+    return SimpleNamespace(
+        sim=sim, root_body=lambda name: f"{name}_main", object_poses=lambda: dict.fromkeys(THINGS)
+    )
 
 
 def lead(simulator: Any, watch: Contacts, x: float) -> dict[str, float]:
@@ -93,6 +96,41 @@ def test_objects_of_a_task_are_those_of_its_words_and_its_goal(tmp_path: Path, i
     file = tmp_path / "task.bddl"
     file.write_text(f"(:init (On wine_bottle_1 main_table_bottle_region))\n(:goal (And {goal}))")
     assert task_objects(instruction, file) == expected
+
+
+@pytest.mark.parametrize(
+    ("suite", "instruction", "goal", "expected"),
+    [
+        (
+            "libero_spatial",
+            "pick up the black bowl next to the cookie box and place it on the plate",
+            "(On akita_black_bowl_1 plate_1)",
+            {"bowl", "cookie_box", "plate"},
+        ),
+        (
+            "libero_object",
+            "pick up the tomato sauce and place it in the basket",
+            "(In tomato_sauce_1 basket_1_contain_region)",
+            {"tomato_sauce", "basket"},
+        ),
+        (
+            "libero_10",
+            "put the yellow and white mug in the microwave and close it",
+            "(In white_yellow_mug_1 microwave_1_heating_region)",
+            {"yellow_and_white_mug", "microwave"},
+        ),
+        (
+            "libero_10",
+            "put both moka pots on the stove",
+            "(On moka_pot_1 flat_stove_1_cook_region) (On moka_pot_2 flat_stove_1_cook_region)",
+            {"moka_pot", "moka_pot_2", "stove"},
+        ),
+    ],
+)
+def test_objects_of_other_suites_are_told_apart(tmp_path: Path, suite, instruction, goal, expected):
+    file = tmp_path / "task.bddl"
+    file.write_text(f"(:goal (And {goal}))")
+    assert task_objects(instruction, file, suite) == expected
 
 
 def test_shares_are_of_episodes():

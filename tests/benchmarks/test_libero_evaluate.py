@@ -3,11 +3,13 @@
 import json
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
+import numpy as np
 import pytest
 from benchmarks.harness import read
+from benchmarks.libero import accuracy, run
 from benchmarks.libero import evaluate as harness
-from benchmarks.libero import run
 from benchmarks.libero.evaluate import EvaluationConfig, evaluate, reason, summary
 
 from benchmarks import stages
@@ -15,11 +17,24 @@ from benchmarks import stages
 TASKS = {name: name.replace("_", " ") for name in ("push_the_plate", "put_the_bowl", "turn_on_the_stove")}
 
 
+def found_suite(_: str, selection: str = "all") -> SimpleNamespace:
+    """Two suites of the same tasks."""
+    return SimpleNamespace(
+        name="libero_10" if selection == "libero_10" else "libero",
+        tasks=lambda some: some.split(",") if some in ",".join(TASKS) else list(TASKS),
+    )
+
+
 @pytest.fixture(autouse=True)
 def suite(monkeypatch: pytest.MonkeyPatch) -> None:
     for module in (harness, run):
-        monkeypatch.setattr(module, "tasks", lambda: TASKS)
-    monkeypatch.setattr(stages, "find_suite", lambda _: SimpleNamespace(tasks=lambda _: list(TASKS)))
+        monkeypatch.setattr(module, "tasks", lambda _: TASKS)
+    monkeypatch.setattr(harness, "suite_of", lambda _: harness.SUITE)
+    for module in (stages, run):
+        monkeypatch.setattr(module, "find_suite", found_suite)
+
+
+EPISODE = {"steps": 100, "status": "done", "phase": "retreat", "attempts": 0, "contacts": {}}
 
 
 @pytest.fixture
@@ -135,6 +150,21 @@ def test_tasks_are_selected_by_number(selection, expected):
     assert run.select_tasks(selection) == [list(TASKS)[i] for i in expected]
 
 
+def test_tasks_that_no_expert_does_are_refused(monkeypatch: pytest.MonkeyPatch):
+    shown = SimpleNamespace(tasks=lambda _: list(TASKS)[::2])
+    monkeypatch.setattr(run, "find_suite", lambda *_: shown)
+    assert run.select_tasks("0,2", "libero_10") == shown.tasks("all")
+    with pytest.raises(
+        ValueError, match=r"no expert demonstrates tasks 1 of libero_10.*expected some of 0,2"
+    ):
+        run.select_tasks("0-2", "libero_10")
+
+
+def test_another_suite_is_refused_by_name():
+    with pytest.raises(ValueError, match="SUITE is 'tabletop', expected one of libero_goal, "):
+        run.RunConfig("tabletop")
+
+
 @pytest.mark.parametrize("selection", ["", "3", "2-1", "a", "0-", "-1", "0,,1"])
 def test_numbers_that_are_no_tasks_are_refused(selection):
     with pytest.raises(ValueError, match="TASKS must be numbers"):
@@ -151,5 +181,55 @@ def test_fewer_demonstrations_are_the_first_of_every_task(tmp_path):
 
 def test_a_part_of_the_suite_has_a_folder_of_its_own():
     names = list(TASKS)
-    assert stages.run_folder("libero", 3, names) == stages.run_folder("libero", 3)
-    assert stages.run_folder("libero", 3, names[:1]) != stages.run_folder("libero", 3, names[1:2])
+    assert stages.run_folder("libero", 3, ",".join(names)) == stages.run_folder("libero", 3)
+    assert stages.run_folder("libero", 3, names[0]) != stages.run_folder("libero", 3, names[1])
+
+
+def test_a_suite_has_a_folder_of_its_own():
+    assert stages.run_folder("libero", 3) == Path("outputs/libero/demos_3")
+    assert stages.run_folder("libero", 3, "libero_10") == Path("outputs/libero/libero_10/demos_3")
+
+
+def made_up(calls: list[Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Stand-ins for recording, training and evaluating; which tasks each was called for is noted."""
+
+    def recorded(_: str, demos: int, selection: str) -> Path:
+        calls.append((demos, selection))
+        return tmp_path / selection / "dataset"
+
+    monkeypatch.setattr(run, "scene_kind", lambda task: "kitchen" if "stove" in task else "living room")
+    monkeypatch.setattr(run, "dataset", recorded)
+    monkeypatch.setattr(run, "policy", lambda _, root, selection: (tmp_path / selection, 20.0))
+    monkeypatch.setattr(run, "found_errors", lambda _, __, rows: [{"plate": (0.03, None)} for _ in rows])
+    monkeypatch.setattr(
+        run,
+        "evaluate_states",
+        lambda checkpoint, _, states, names, suite: [
+            {**EPISODE, "task": task, "state": i, "seed": harness.SEED + i, "success": i > 0}
+            for task in names
+            for i in range(states)
+        ],
+    )
+    monkeypatch.setattr(accuracy, "suite_of", lambda _: "libero_10")
+    monkeypatch.setattr(accuracy, "tasks", lambda _: TASKS)
+
+
+def test_tasks_whose_cameras_stand_elsewhere_get_a_policy_of_their_own(tmp_path, monkeypatch):
+    calls, written = list[Any](), dict[str, Any]()
+    made_up(calls, tmp_path, monkeypatch)
+    monkeypatch.setattr(run, "write", lambda name, content, _: written.update({name: content}))
+    told = run.main(run.RunConfig("libero_10", tasks="0-2"))
+    assert calls == [(10, "push_the_plate,put_the_bowl"), (10, "turn_on_the_stove")]
+    assert (told["n"], told["mine_and_train_s"], told["position_mm_mean"]) == (150, 40.0, 30.0)
+    assert list(written) == ["libero_10"]
+    assert [(one["task"], one["state"], one["off_mm"]) for one in written["libero_10"]["failed"]] == [
+        (task, 0, 30.0) for task in TASKS
+    ]
+    run.main(run.RunConfig("libero_10", states=2, tasks="0-2"))
+    run.main(run.RunConfig("libero_10", tasks="0,1"))
+    assert len(written) == 1
+
+
+def test_poses_of_two_that_a_task_is_about_are_not_compared():
+    poses = dict.fromkeys(("bowl", "bowl_2", "moka_pot", "moka_pot_2"), np.eye(4))
+    assert list(harness.without_several(poses, {"moka_pot", "moka_pot_2", "bowl"})) == ["bowl", "bowl_2"]

@@ -14,6 +14,7 @@ from typing import Any
 import pytest
 from benchmarks.figures import FIGURES, PACKAGE, Figure
 from benchmarks.results import PROVENANCE, write
+from benchmarks.stages import EnvironmentOption
 from benchmarks.staleness import ROOT, Quote, origin, quotes, read_result
 
 from benchmarks import calibration, figures, results, tables
@@ -336,13 +337,13 @@ def test_cameras_are_estimated_of_one_simulator_at_a_time(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path, simulator: str
 ):
     recorded = []
-    monkeypatch.setattr(calibration, "dataset", lambda *given: recorded.append(given))
+    monkeypatch.setattr(EnvironmentOption, "dataset", lambda env: recorded.append(env.type))
     monkeypatch.setattr(calibration, "read", lambda *_: SimpleNamespace(cameras={}))
     monkeypatch.setattr(results, "RESULTS", tmp_path)
     monkeypatch.setattr(results, "is_published", lambda *_: True)
     config = calibration.CalibrationConfig()
     config.env.type = simulator
     calibration.main(config)
-    assert recorded == [(simulator,)]
+    assert recorded == [simulator]
     (name,) = [path.stem for path in tmp_path.iterdir()]
     assert FIGURES[name].command.endswith("--env.type=libero") is (simulator == "libero")

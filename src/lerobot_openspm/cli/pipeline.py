@@ -69,10 +69,8 @@ def collect_dataset(
 
 def recorded_by(simulator: str) -> str:
     """The digest of what makes a simulator's demonstrations, to be kept beside them."""
-    # Of LIBERO's other suites too, such as libero_spatial.
-    is_libero = simulator.startswith("libero")
-    assets = [LIBERO_ASSETS] if is_libero and LIBERO_ASSETS.is_file() else []
-    return digest(assets, [], RECORDED_BY["libero" if is_libero else simulator])
+    assets = [LIBERO_ASSETS] if simulator == "libero" and LIBERO_ASSETS.is_file() else []
+    return digest(assets, [], RECORDED_BY[simulator])
 
 
 def train(

@@ -11,7 +11,7 @@ import shutil
 import time
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import FIRST_EXCEPTION, Future, ProcessPoolExecutor, wait
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -25,9 +25,9 @@ from lerobot_openspm.envs.dataset import (
     video_encoder,
     write_episode,
 )
-from lerobot_openspm.envs.recording import record
+from lerobot_openspm.envs.recording import Suite, record
 from lerobot_openspm.envs.seeds import DEMO_SEED_START, require_demo_seeds
-from lerobot_openspm.envs.suites import find_suite
+from lerobot_openspm.envs.suites import find_suite, whole_suite
 from lerobot_openspm.files import write_json
 
 logger = logging.getLogger(__name__)
@@ -46,8 +46,13 @@ MAX_DISCARDED_SHARE = 0.5
 class SimulatorConfig:
     """Which simulator, and which of its tasks."""
 
-    type: str = "openspm_tabletop"  # or libero (its suite libero_goal), libero_spatial, libero_object
-    task: str = "all"  # a task name, a comma list of them, or "all"
+    type: str = "openspm_tabletop"  # or libero
+    # A task name, a comma list of them, or "all"; of libero also a suite, and "all" is libero_goal.
+    task: str = "all"
+
+    def suite(self) -> Suite:
+        """What the tasks are of."""
+        return find_suite(self.type, self.task)
 
 
 @dataclass
@@ -76,12 +81,15 @@ class CollectConfig:
             raise ValueError(f"images must have at least 64 pixels a side, got {self.height} x {self.width}")
         if self.workers < 0:
             raise ValueError(f"workers must not be negative, got {self.workers}")
-        suite = find_suite(self.env.type)
-        recorded = suite.tasks("all")
-        if other := [task for task in suite.tasks(self.env.task) if task not in recorded]:
+        suite = self.env.suite()
+        recorded, selected = suite.tasks("all"), suite.tasks(self.env.task)
+        if other := [task for task in selected if task not in recorded]:
             raise ValueError(f"no expert records {', '.join(other)}; expected some of {', '.join(recorded)}")
+        if selected == recorded:
+            # However they are named, the dataset is the same.
+            self.env = replace(self.env, task=whole_suite(self.env.type, self.env.task))
         require_demo_seeds(self.seed, SEEDS_PER_TASK * len(recorded))
-        self.repo_id = self.repo_id or f"local/{self.env.type}"
+        self.repo_id = self.repo_id or f"local/{suite.name}"
 
     def settings(self) -> dict[str, Any]:
         """What decides about a dataset's content."""
@@ -128,8 +136,13 @@ def collect(config: CollectConfig) -> dict[str, Any]:
     }
     document = {"summary": summary, "settings": config.settings()}
     write_json(merged / SUMMARY_FILE, {**document, "episodes": episodes, "discarded": discarded})
-    calibration = find_suite(config.env.type).calibration(config.height, config.width)
-    write_json(merged / "meta/openspm_cameras.json", calibration)
+    calibration = config.env.suite().calibration(config.height, config.width, config.env.task)
+    if calibration is None:
+        logger.warning(
+            "%s has no meta/openspm_cameras.json: the cameras do not stand alike in all of its tasks", root
+        )
+    else:
+        write_json(merged / "meta/openspm_cameras.json", calibration)
     if root.exists():
         shutil.rmtree(root)
     merged.rename(root)
@@ -167,7 +180,7 @@ def _open_parts(config: CollectConfig, partial: Path) -> dict[str, Path]:
     if not partial.exists():
         partial.mkdir(parents=True)
         write_json(made_for, settings)
-    parts = {task: partial / task for task in find_suite(config.env.type).tasks(config.env.task)}
+    parts = {task: partial / task for task in config.env.suite().tasks(config.env.task)}
     if kept := [task for task, part in parts.items() if (part / PART_FILE).is_file()]:
         logger.info("keeping what was recorded before an interruption: %s", ", ".join(kept))
     return parts
@@ -217,7 +230,7 @@ def record_part(config: CollectConfig, task: str, root: Path, done: Callable[[st
     Raises:
         RuntimeError: The expert failed too often.
     """
-    suite, size = find_suite(config.env.type), (config.height, config.width)
+    suite, size = config.env.suite(), (config.height, config.width)
     encoder = video_encoder(config.vcodec, config.pix_fmt, config.crf)
     interrupted, attempts = root / INTERRUPTED_FILE, {"episodes": [], "discarded": []}
     with quiet_libraries(), contextlib.closing(suite.scene(task, *size)) as scene:

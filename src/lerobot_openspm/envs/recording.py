@@ -99,6 +99,11 @@ class Suite(Protocol):
     """Tasks in one simulator, recorded in one layout."""
 
     @property
+    def name(self) -> str:
+        """What a dataset of it is called by default; also --env.task, if it is not --env.type."""
+        ...
+
+    @property
     def robot_type(self) -> str:
         """What the dataset calls the robot."""
         ...
@@ -125,8 +130,8 @@ class Suite(Protocol):
         """A task whose images have a size in pixels."""
         ...
 
-    def calibration(self, height: int, width: int) -> dict[str, Any]:
-        """The cameras in the calibration file's format."""
+    def calibration(self, height: int, width: int, selection: str = "all") -> dict[str, Any] | None:
+        """The cameras in the calibration file's format; None if they stand elsewhere in some of the tasks."""
         ...
 
 

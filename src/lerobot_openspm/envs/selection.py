@@ -3,6 +3,11 @@
 from collections.abc import Collection, Mapping
 
 
+def names_in(spec: str) -> list[str]:
+    """The names in what a user typed, which commas separate."""
+    return [part.strip() for part in spec.split(",") if part.strip()]
+
+
 def select(spec: str, tasks: Collection[str], groups: Mapping[str, Collection[str]], suite: str) -> list[str]:
     """Expand a task's name, a comma list of them or the name of a group into task names, in the order given.
 
@@ -15,7 +20,7 @@ def select(spec: str, tasks: Collection[str], groups: Mapping[str, Collection[st
     Raises:
         ValueError: A name is unknown, or there is none.
     """
-    names = [part.strip() for part in spec.split(",") if part.strip()]
+    names = names_in(spec)
     if len(names) == 1 and names[0] in groups:
         return list(groups[names[0]])
     unknown = [name for name in names if name not in tasks]

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from benchmarks.worlds import initial_states
 
+from lerobot_openspm.envs.collection import CollectConfig, SimulatorConfig
 from lerobot_openspm.envs.libero import recording
 from lerobot_openspm.envs.libero.recording import LiberoSuite
 from lerobot_openspm.envs.libero.simulator import DO_NOTHING, LiberoSimulator, tasks
@@ -43,6 +44,49 @@ def test_no_demonstration_starts_from_an_evaluation_state(task):
     simulator.reset_to(DEMO_SEED_START, states[7])
     assert away(simulator, states) < NEAR_M
     simulator.close()
+
+
+@pytest.mark.parametrize(
+    ("selection", "name", "count"),
+    [
+        ("all", "libero", 10),
+        ("libero_goal", "libero", 10),
+        ("libero_spatial", "libero_spatial", 10),
+        ("libero_object", "libero_object", 10),
+        ("pick_up_the_milk_and_place_it_in_the_basket", "libero_object", 1),
+        (f"{TASKS[0]}, {TASKS[1]}", "libero", 2),
+    ],
+)
+def test_a_selection_of_tasks_is_of_one_suite(selection, name, count):
+    config = CollectConfig(SimulatorConfig("libero", selection))
+    assert (config.repo_id, len(config.env.suite().tasks(config.env.task))) == (f"local/{name}", count)
+
+
+def test_however_all_tasks_are_named_the_dataset_is_the_same():
+    for suite, name in (("libero_goal", "all"), ("libero_spatial", "libero_spatial")):
+        for selection in (suite, ",".join(tasks(suite))):
+            assert CollectConfig(SimulatorConfig("libero", selection)).env.task == name
+
+
+@pytest.mark.parametrize(
+    ("selection", "message"),
+    [
+        (f"{TASKS[0]},libero_object", rf"2 suites \(of libero_goal: {TASKS[0]}; of libero_object: "),
+        ("fly", "no task 'fly', expected one of libero_goal: open_the_middle_drawer"),
+        ("", "unknown libero_goal task"),
+    ],
+)
+def test_a_selection_that_is_of_no_suite_or_of_two_is_refused(selection, message):
+    with pytest.raises(ValueError, match=message):
+        CollectConfig(SimulatorConfig("libero", selection))
+
+
+def test_cameras_that_do_not_stand_alike_have_no_calibration():
+    kitchen = "KITCHEN_SCENE8_put_both_moka_pots_on_the_stove"
+    living_room = next(iter(tasks("libero_10")))
+    suite = LiberoSuite("libero_10")
+    assert suite.calibration(256, 256, f"{living_room},{kitchen}") is None
+    assert suite.calibration(256, 256, kitchen) != suite.calibration(256, 256, living_room)
 
 
 def recorded(size: int) -> RecordedEpisode:

@@ -13,14 +13,14 @@ from lerobot_openspm.envs.libero.simulator import (
     OBJECTS,
     SUITE,
     LiberoSimulator,
+    scene_kind,
+    suite_of,
     tasks,
 )
 from lerobot_openspm.envs.motions import Actions
 from lerobot_openspm.envs.recording import OBJECT_POSES, Names, pose_names, pose_vector
-from lerobot_openspm.envs.selection import select
+from lerobot_openspm.envs.selection import names_in, select
 
-# An expert that takes longer than the policy may is no use as a demonstration.
-MAX_STEPS = {"libero_goal": 300, "libero_spatial": 280, "libero_object": 280, "libero_10": 520}
 # LIBERO ends an episode when its goal first holds, often in mid-motion. A demonstration that ended there too
 # would teach a policy to stop at the very threshold, so it goes on a little, as people do.
 STEPS_AFTER_SUCCESS = 10
@@ -32,13 +32,13 @@ class LiberoScene:
     def __init__(self, task: str, image_size: int) -> None:
         self._simulator = LiberoSimulator(task, image_size)
         self.instruction = self._simulator.instruction
-        self._max_steps = MAX_STEPS[self._simulator.suite]
-        self.status, self._steps_left = "failed", self._max_steps
+        # An expert that takes longer than the policy may is no use as a demonstration.
+        self.status, self._steps_left = "failed", self._simulator.max_steps
 
     def reset(self, seed: int) -> None:
         """See `Scene`."""
         self._simulator.reset(seed)
-        self.status, self._steps_left = "failed", self._max_steps
+        self.status, self._steps_left = "failed", self._simulator.max_steps
 
     def expert(self, rng: np.random.Generator) -> Actions:
         """See `Scene`."""
@@ -77,6 +77,7 @@ class LiberoSuite:
 
     def __init__(self, suite: str = SUITE) -> None:
         self._suite = suite
+        self.name = "libero" if suite == SUITE else suite
 
     @property
     def names(self) -> Mapping[str, Names]:
@@ -91,7 +92,7 @@ class LiberoSuite:
     def tasks(self, selection: str) -> list[str]:
         """See `Suite`."""
         known = [task for task in tasks(self._suite) if task in EXPERTS]
-        return select(selection, known, {"all": known, self._suite: known}, self._suite)
+        return select(selection, tasks(self._suite), {"all": known, self._suite: known}, self._suite)
 
     def scene(self, task: str, height: int, width: int) -> LiberoScene:
         """See `Suite`."""
@@ -99,12 +100,32 @@ class LiberoSuite:
             raise ValueError(f"LIBERO's images are recorded square, got {height} x {width}")
         return LiberoScene(task, height)
 
-    def calibration(self, height: int, width: int) -> dict[str, Any]:
+    def calibration(self, height: int, width: int, selection: str = "all") -> dict[str, Any] | None:
         """See `Suite`. LeRobot turns robosuite's images by 180 degrees, which leaves them mirrored."""
-        simulator = LiberoSimulator(next(iter(tasks(self._suite))))
+        names = self.tasks(selection)
+        if len({scene_kind(task) for task in names}) > 1:
+            return None
+        simulator = LiberoSimulator(names[0])
         simulator.reset(0)
         model, data, T_world_ee = simulator.sim.model._model, simulator.sim.data._data, simulator.ee_pose()
         size = height, width
         found = calibration(model, data, CAMERAS, CAMERA_MOUNTS, T_world_ee, size, mirrored=True)
         simulator.close()
         return found
+
+
+def selected_suite(selection: str) -> str:
+    """The suite that tasks are of: libero_goal for "all", else one that is named, or that of the named tasks.
+
+    Raises:
+        ValueError: A name is unknown, the tasks are of several suites, or LIBERO is not installed.
+    """
+    names, by_suite = names_in(selection), dict[str, list[str]]()
+    if names == ["all"]:
+        return SUITE
+    for name in names:
+        by_suite.setdefault(name if name in OBJECTS else suite_of(name), []).append(name)
+    if len(by_suite) > 1:
+        told = "; ".join(f"of {suite}: {', '.join(some)}" for suite, some in by_suite.items())
+        raise ValueError(f"env.task names tasks of {len(by_suite)} suites ({told}), expected those of one")
+    return next(iter(by_suite), SUITE)

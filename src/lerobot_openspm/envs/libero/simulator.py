@@ -81,6 +81,8 @@ OBJECTS = {
         "rack": "wine_rack_1",
     },
 }  # fmt: skip
+# As many as LeRobot gives an episode.
+MAX_STEPS = {"libero_goal": 300, "libero_spatial": 280, "libero_object": 280, "libero_10": 520}
 # Objects float or overlap a little after a reset; LeRobot's environment waits as long.
 SETTLING_STEPS = 10
 # Some of libero_10's fall from as high as a metre: in a drawn scene it is waited until nothing is faster than
@@ -136,6 +138,11 @@ def task_file(task: str) -> Path:
     return Path(get_libero_path("bddl_files")) / suite_of(task) / f"{task}.bddl"
 
 
+def scene_kind(task: str) -> str:
+    """LIBERO's name of the kind of a task's scenes; in all of one kind cameras and robot stand alike."""
+    return task_file(task).read_text().partition("(problem ")[2].partition(")")[0]
+
+
 class LiberoSimulator:
     """One LIBERO task.
 
@@ -156,7 +163,7 @@ class LiberoSimulator:
             use_camera_obs=False,
             has_offscreen_renderer=False,
         )
-        self.task = task
+        self.task, self.max_steps = task, MAX_STEPS[self.suite]
         self.instruction = tasks(self.suite)[task] if file is None else str(self._env.language_instruction)
         self._observation: dict[str, Any] = {}
         # The scene as it was when the last observation was sampled, MuJoCo's data.

@@ -59,7 +59,7 @@ class TabletopScene:
 class Tabletop:
     """The bundled tabletop, see `Suite`."""
 
-    robot_type = "openspm_tabletop"
+    name = robot_type = "openspm_tabletop"
     cameras = CAMERA_NAMES
 
     @property
@@ -79,7 +79,7 @@ class Tabletop:
         """See `Suite`."""
         return TabletopScene(task, height, width)
 
-    def calibration(self, height: int, width: int) -> dict[str, Any]:
+    def calibration(self, height: int, width: int, selection: str = "all") -> dict[str, Any]:
         """See `Suite`."""
         simulator = TabletopSimulator()
         # Where the bodies and cameras are is all that is needed: nothing was placed yet, so all overlap.
