@@ -10,7 +10,7 @@ import argparse
 from pathlib import Path
 from typing import Any
 
-from benchmarks.figures import FIGURES
+from benchmarks.figures import FIGURES, OTHER_SUITES
 from benchmarks.libero.tables import libero_sections
 from benchmarks.markdown import (
     STEPS,
@@ -119,6 +119,7 @@ def _headlines() -> str:
             _headline("LIBERO-GOAL", name, "mine_and_train_s")
             for name in ("libero_goal", "libero_few_shot_3", "libero_few_shot_1")
         ),
+        *(_headline(suite.upper().replace("_", "-"), suite, "mine_and_train_s") for suite in OTHER_SUITES),
         _headline("LIBERO-PRO, objects exchanged", "libero_goal_swap"),
         _headline("LIBERO-PRO, other words", "libero_goal_lan"),
         _headline("LIBERO-PRO, other looks", "libero_goal_object"),

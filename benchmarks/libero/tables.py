@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from benchmarks.figures import FIGURES
+from benchmarks.figures import FIGURES, OTHER_SUITES
 from benchmarks.libero.failures import FAR_OFF_MM as FAR_OFF
+from benchmarks.libero.places_tables import places_sections
 from benchmarks.markdown import (
     STEPS,
     SUCCESS,
@@ -11,7 +12,6 @@ from benchmarks.markdown import (
     Quoted,
     chapter,
     grid,
-    interval,
     looked_at,
     percent,
     section,
@@ -24,6 +24,11 @@ INTRODUCTION = """# On LIBERO-GOAL
 From scripted demonstrations of seeded scenes, with LIBERO's two RGB cameras, the robot's state and the
 instruction alone. Evaluation: the benchmark's own initial states, which no demonstration starts from, at most
 300 steps, images of 360 pixels as lerobot-eval renders them. "Paper" is what the paper reports of itself."""
+OTHERS = """# On LIBERO's other suites
+
+The same with at most 280 steps in libero_spatial and libero_object, and at most 520 in libero_10. Cameras and
+robot of libero_10 stand elsewhere in the living room, in the kitchen and in the study: a policy is learned
+for each room, and the figures are of all rooms together."""
 # As the paper's table quotes them: parameters, chunk length, success in percent, frequency in Hz.
 PUBLISHED = (
     ("Diffusion Policy", "260 M", 8, 68.3, 14.2),
@@ -62,39 +67,15 @@ SORTED = (
     "gripped or pushed but without reaching the goal. Collisions are told by a look alone: objects that are "
     "not of the task are touched in episodes that succeed too."
 )
-# Of what scenes a figure is, where its suite does not say it.
-SCENES = {
-    "places_libero_object": "LIBERO's own draw hardly moves these objects between the scenes of a task, some "
-    "not at all, so this figure proves little; the next one is of the same objects, exchanged.",
-    "places_libero_object_exchanged": "The places of all objects but the basket are dealt out anew at "
-    "random: the soup stands elsewhere in 118 of 150 scenes, the cheese in 114 of 150, the dressing in 84 of "
-    "100. LIBERO's range of each place was widened by 2 cm on every side.",
-    "places_libero_goal_exchanged": "One or two pairs of objects are exchanged, and furniture in some "
-    "scenes: the bowl stands elsewhere in 65 of 100 scenes, the cheese in 64, the plate in 58, the bottle "
-    "in 55, the cabinet in 43, the stove in 35, the rack in 26.",
-}
-PLACES: Columns = {
-    "Known by": lambda row: row["learned"] or "not learned",
-    "Grasped in": "grasped",
-    "Found": lambda row: percent(row["found"]),
-    "Within 10 mm": lambda row: percent(row["within_10_mm"]),
-    "95 % interval": lambda row: interval(row["within_10_mm"]),
-    "Scenes": lambda row: row["found"]["n"],
-    "Median, mm": "position_mm_median",
-    "95th percentile, mm": "position_mm_p95",
-    "Median yaw, degrees": "yaw_deg_median",
-    "All of several": lambda row: f"{row['several']['all_within_10_mm']} of {row['several']['n']}",
-    "Reported where there is none": lambda row: f"{row['absent']['reported']} of {row['absent']['n']}",
-}
 
 
 def libero_sections() -> list[str]:
-    """The chapter, of what was measured."""
+    """The chapters, of what was measured."""
     few = sorted(
         (n for n in FIGURES if n.startswith("libero_few_shot_")), key=lambda n: int(n.rsplit("_", 1)[1])
     )
     new = [name for name in FIGURES if name.startswith("libero_new_task_")]
-    return chapter(
+    on_goal = chapter(
         INTRODUCTION,
         [
             section("Success from pixels", "libero_goal", _main),
@@ -106,37 +87,35 @@ def libero_sections() -> list[str]:
             section("How key poses are followed", "libero_ablations", _execution),
             section("Where key poses come from", "libero_ablations", _memory),
             section("Error of the object poses", "libero_accuracy", _accuracy),
-            section("Objects of libero_spatial, found by a first look", "places_libero_spatial", _places),
-            section("Objects of libero_object, found by a first look", "places_libero_object", _places),
-            section(
-                "Objects of libero_object where places are exchanged, found by a first look",
-                "places_libero_object_exchanged",
-                _places,
-            ),
-            section(
-                "Objects of LIBERO-GOAL where places are exchanged, found by a first look",
-                "places_libero_goal_exchanged",
-                _places,
-            ),
-            section(
-                "Kinds of objects, and how many demonstrations",
-                [n for n in FIGURES if n.startswith("places_libero_goal")],
-                _kinds,
-            ),
-            section(
-                "Cameras that are not where they should be", "wrong_calibration_libero", _wrong_calibration
-            ),
+            *places_sections(),
             section("Few demonstrations", [*few, "libero_goal"], _few_shot),
             section("A new task by memory alone", new, _new_tasks),
             section("Loss over epochs", "libero_losses", _losses),
             section("The harness against lerobot-eval", "libero_equality", _equality),
         ],
     )
+    return [*on_goal, *chapter(OTHERS, [section(f"On {suite}", suite, _suite) for suite in OTHER_SUITES])]
 
 
 def _variant(result: Quoted) -> str:
     per_task = grid({"all ten tasks": result, **result["per_task"]}, {**STEPS, **CONTACTS})
     return f"{per_task}\n\n{TOUCHED} {SEEN_BEFORE}\n\n{_sorted(result)}{looked_at(result)}"
+
+
+def _suite(result: Quoted) -> str:
+    return f"{_per_task(result)}\n\n{_taken(result)}\n\n{_sorted(result)}{looked_at(result)}"
+
+
+def _per_task(result: Quoted) -> str:
+    rows = {**result["per_task"], "**all**": result}
+    return f"{grid(rows, {**STEPS, **CONTACTS}, 'Task')}\n\n{TOUCHED}"
+
+
+def _taken(result: Quoted) -> str:
+    """How long it learned from how many demonstrations."""
+    seconds = result["mine_and_train_s"]
+    taken = "was interrupted" if seconds is None else f"took {seconds:.0f} s"
+    return f"Mining and training on {result['demonstrations']} demonstrations a task {taken}."
 
 
 def _sorted(result: Quoted) -> str:
@@ -150,12 +129,9 @@ def _main(result: Quoted) -> str:
     ours = [name, None, None, f"**{percent(result)}**"]
     rows = [[name, size, length, f"{rate} %"] for name, size, length, rate, _ in PUBLISHED]
     compared = table(["", "Parameters", "Chunk", "Success"], [*rows, ours])
-    seconds = result["mine_and_train_s"]
-    taken = "was interrupted" if seconds is None else f"took {seconds:.0f} s"
-    per_task = grid({**result["per_task"], "**all**": result}, {**STEPS, **CONTACTS}, "Task")
     return (
-        f"{compared}\n\nThe rows above ours are quoted from the paper.\n\n{per_task}\n\n{TOUCHED}\n\n"
-        f"Mining and training {taken}. {SEEN_BEFORE}"
+        f"{compared}\n\nThe rows above ours are quoted from the paper.\n\n{_per_task(result)}\n\n"
+        f"{_taken(result)} {SEEN_BEFORE}"
     )
 
 
@@ -244,78 +220,6 @@ def _accuracy(result: Quoted) -> str:
     tasks = zip(result["tasks"].items(), PAPER_MM, strict=True)
     rows = {task: {**row, "paper": mm} for (task, row), mm in tasks}
     return f"{objects}\n\n{grid(rows, {**columns, 'Paper, mm': 'paper'}, 'Task')}\n\n{note}"
-
-
-def _places(result: Quoted) -> str:
-    learned, found = result["learned"], result["found"]
-    rows = {name: {**told, **found[name]} for name, told in learned["objects"].items()}
-    sure, spent = result["sure"], result["first_look_cpu_ms"]
-    note = (
-        f"All that the hand touched in {learned['episodes']} demonstrations, and in how many it took hold of "
-        "it. Seeded scenes that none of them shows; the hand is somewhere else in each. Shares are of the "
-        "scenes that hold the object, whether it was learned or not; of several of a kind the one that the "
-        "instruction is about counts, as the policy tells it, and their column says in how many scenes each "
-        "of them is within 10 mm. A round object is where its axis is. "
-        f"{percent(sure)} ({interval(sure)}) of {sure['n']} estimates with a confidence above 0.95 are "
-        "within 10 mm and 10 degrees. "
-        f"Learning the objects took {learned['learn_objects_s']:.0f} s of the "
-        f"{learned['seconds']:.0f} s of mining. A first look at all of them takes {spent['median']:.0f} ms "
-        f"of a processor (95th percentile {spent['p95']:.0f}). {SCENES.get(result.name, '')}"
-    )
-    return f"{grid(rows, PLACES, 'Object')}\n\n{note.strip()}"
-
-
-def _kinds(results: list[Quoted]) -> str:
-    rows = {
-        f"{result['kinds']}, {'exchanged' if result['exchanged'] else 'as in LIBERO'}, "
-        f"{result['demonstrations']} a task": {
-            "learned": _count_learned(result), "sure": result["sure"],
-            "spent": result["first_look_cpu_ms"]["median"], **result["all"],
-        }
-        for result in results
-    }  # fmt: skip
-    columns: Columns = {
-        "Learned": "learned",
-        **{head: PLACES[head] for head in ("Found", "Within 10 mm", "95 % interval", "Median, mm")},
-        "Right of those above 0.95": lambda row: f"{percent(row['sure'])} of {row['sure']['n']}",
-        "Its 95 % interval": lambda row: interval(row["sure"]),
-        "First look, ms": "spent",
-    }
-    note = (
-        "The kinds that are asked to learn, where objects stand in the scenes, as LIBERO draws them or in "
-        "one another's places, and from how many demonstrations a task. All objects that the hand touched, "
-        "the same scenes for all. Boxes are learned from a segmenter's masks and are not compared. Where "
-        "all are asked, objects that begin at a few places are learned by their surface, and those that "
-        "are moved about by their shape: see [method.md](method.md)."
-    )
-    return f"{grid(rows, columns, 'Kinds')}\n\n{note}"
-
-
-def _count_learned(result: Quoted) -> str:
-    told = result["learned"]["objects"].values()
-    return f"{sum(one['learned'] is not None for one in told)} of {len(told)}"
-
-
-def _wrong_calibration(result: Quoted) -> str:
-    rows = {
-        f"{camera.rpartition('.')[2]}, {error}": row
-        for camera, by_error in result["cameras"].items()
-        for error, row in by_error.items()
-    }
-    columns: Columns = {
-        "Told": percent, "95 % interval": interval, "Named": lambda row: f"{row['named']} of {row['n']}",
-    }  # fmt: skip
-    right = result["right"]
-    note = (
-        "Seeded scenes of libero_goal in which one camera at a time is not where its calibration says. Axes "
-        "are the camera's own; it looks along its z. Told: at the first look, before anything moves, some "
-        "camera is not believed. Named: that which is off alone; of two cameras it cannot be told which is, "
-        "and both are named. An error along the line of sight, or about it, hardly moves what a camera looks "
-        "at. `image` stands in the room, `image2` goes with the hand. With both where they should be, one is "
-        "not believed in "
-        f"{percent(right)} of {right['n']} scenes."
-    )
-    return f"{grid(rows, columns, 'Camera and error')}\n\n{note}"
 
 
 def _few_shot(results: list[Quoted]) -> str:

@@ -7,15 +7,16 @@ from collections import Counter
 import numpy as np
 import pytest
 from benchmarks.libero.places import PlacesConfig
+from benchmarks.libero.places_tables import SCENES
 from benchmarks.libero.pro_objects import register_objects
-from benchmarks.libero.tables import SCENES
 from benchmarks.libero.variants import OTHER_OBJECTS, PRO_SUITES, exchanged, variant_file, variant_states
 from benchmarks.libero_pro import ProConfig
+from benchmarks.worlds import LiberoWorld
 
 from lerobot_openspm.envs.libero.experts import EXPERTS
 from lerobot_openspm.envs.libero.long_tasks import LONG
 from lerobot_openspm.envs.libero.picks import OBJECT, SPATIAL
-from lerobot_openspm.envs.libero.simulator import DO_NOTHING, SUITE, LiberoSimulator, task_file, tasks
+from lerobot_openspm.envs.libero.simulator import DO_NOTHING, OBJECTS, LiberoSimulator, task_file, tasks
 from lerobot_openspm.envs.suites import find_suite
 
 TASK = "put_the_bowl_on_the_plate"
@@ -37,12 +38,28 @@ def test_what_cannot_be_measured_is_refused_before_anything_is_learned(options, 
 
 
 def test_another_suite_is_refused_by_name():
-    with pytest.raises(ValueError, match="expected libero_goal or one of libero_goal_swap"):
+    with pytest.raises(ValueError, match=r"expected one of libero_goal, .*, libero_10, libero_goal_swap"):
         variant_file("libero_spatial_swap", TASK)
 
 
-def test_libero_goal_itself_is_no_variant():
-    assert variant_file(SUITE, TASK) is None
+@pytest.mark.parametrize("suite", OBJECTS)
+def test_liberos_own_suites_are_no_variants(suite):
+    assert variant_file(suite, TASK) is None
+
+
+@pytest.mark.libero
+@pytest.mark.parametrize("suite", OBJECTS)
+def test_a_suite_starts_from_its_own_states_for_as_many_steps_as_lerobot_gives(suite):
+    from lerobot.envs.libero import TASK_SUITE_MAX_STEPS
+
+    task = list(tasks(suite))[-1]
+    states, simulator = variant_states(suite, task), LiberoSimulator(task)
+    simulator.reset_to(1000, states[0])
+    size = simulator.sim.get_state().flatten().size
+    world = LiberoWorld(simulator)
+    simulator.close()
+    assert states.shape == (50, size)
+    assert world.max_steps == TASK_SUITE_MAX_STEPS[suite]
 
 
 @pytest.mark.libero
@@ -175,7 +192,7 @@ def test_all_small_things_of_another_suite_change_places():
 )  # fmt: skip
 def test_results_tell_in_how_many_scenes_an_object_stands_elsewhere(figure, config, names):
     moved = Counter[str]()
-    for task, seed in config.drawn(find_suite(config.simulator).tasks("all")):
+    for task, seed in config.drawn(find_suite("libero", config.suite).tasks("all")):
         usual, new = (_placed(file.read_text()) for file in (task_file(task), exchanged(task, seed)))
         moved.update(thing for thing, place in usual.items() if new[thing] != place)
     told = re.findall(r"the (\w+)(?: stands elsewhere)? in (\d+)", SCENES[figure])

@@ -85,11 +85,13 @@ def test_readme_has_a_row_for_what_was_measured_alone(results):
     put(results, "tabletop", **RATE, demonstrations=7, train_s=30.4)
     put(results, "libero_few_shot_3", **RATE, demonstrations=3, mine_and_train_s=None)
     put(results, "libero_goal_swap", **RATE, demonstrations=10)
+    put(results, "libero_10", **RATE, demonstrations=10, mine_and_train_s=250.0)
     page = tables.with_headlines(f"{tables.BEGIN}\n{tables.END}")
     rows = [line for line in page.splitlines() if "50.0 %" in line]
     assert [row.split(" <!--")[0] for row in rows] == [
         "| Tabletop | 7 | 50.0 % | 15.0 to 85.0 % | 4 | 30",
         "| LIBERO-GOAL | 3 | 50.0 % | 15.0 to 85.0 % | 4 | -",
+        "| LIBERO-10 | 10 | 50.0 % | 15.0 to 85.0 % | 4 | 250",
         "| LIBERO-PRO, objects exchanged | 10 | 50.0 % | 15.0 to 85.0 % | 4 | -",
     ]
     assert ("tabletop", "success") in MARK.findall(rows[0])
@@ -143,6 +145,17 @@ def test_contacts_that_no_task_asks_for_are_told_beside_success(results):
     assert "| put the bowl | 50.0 % | 15.0 to 85.0 % | 4 | 100.0 | 25.0 % | - |" in text
     assert "| Failed by | words | perception | reach | grasp | placing |" in text
     assert "| episodes | 0 | 1 | 0 | 1 | 0 |" in text
+
+
+def test_other_suites_have_a_chapter_of_their_own(results):
+    learned = {"demonstrations": 10, "mine_and_train_s": None}
+    put(results, "libero_object", **RATE, **learned, per_task={"milk": RATE}, failures=FAILURES)
+    text = tables.results_page().partition("# On LIBERO's other suites")[2]
+    assert "## On libero_object" in text
+    assert "| milk | 50.0 % | 15.0 to 85.0 % | 4 | 100.0 | 25.0 % | 0.0 % |" in text
+    assert "on 10 demonstrations a task was interrupted." in text
+    assert "| episodes | 0 | 1 | 0 | 1 | 0 |" in text
+    assert "- libero_10: `python -m benchmarks.libero.run --suite=libero_10 --demos=10" in text
 
 
 def test_what_films_show_is_told_of_the_commit_whose_episodes_they_are_of(results, tmp_path, monkeypatch):
