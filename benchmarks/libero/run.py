@@ -23,6 +23,7 @@ from benchmarks.stages import DEMOS, LIBERO, dataset, policy
 from lerobot_openspm.cli.pipeline import THREADS
 from lerobot_openspm.envs.libero.simulator import OBJECTS, SUITE, scene_kind, tasks
 from lerobot_openspm.envs.suites import find_suite
+from lerobot_openspm.errors import OpenSPMError
 
 logger = logging.getLogger(__name__)
 
@@ -70,16 +71,26 @@ class Part:
 
 
 def learned(suite: str, demos: int, selected: Sequence[str]) -> list[Part]:
-    """Record demonstrations of tasks and learn from them, where that was not done."""
+    """Record demonstrations of tasks and learn from them, where that was not done.
+
+    Raises:
+        OpenSPMError: No expert demonstrates one of them.
+    """
+    names, shown = list(tasks(suite)), find_suite(LIBERO, suite).tasks("all")
+    if unshown := [f"{names.index(task)} {task}" for task in selected if task not in shown]:
+        known = ",".join(str(names.index(task)) for task in shown)
+        raise OpenSPMError(
+            f"no expert demonstrates {', '.join(unshown)} of {suite}, expected some of TASKS={known}"
+        )
     by_kind: dict[str, list[str]] = {}
     for task in selected:
         by_kind.setdefault(scene_kind(task), []).append(task)
     parts: list[Part] = []
-    for names in by_kind.values():
-        logger.info("recording %d demonstrations of each of %d tasks of %s", demos, len(names), suite)
-        root = dataset(LIBERO, demos, ",".join(names))
+    for alike in by_kind.values():
+        logger.info("recording %d demonstrations of each of %d tasks of %s", demos, len(alike), suite)
+        root = dataset(LIBERO, demos, ",".join(alike))
         logger.info("mining and training")
-        parts.append(Part(names, root, *policy(LIBERO, root=root, selection=",".join(names))))
+        parts.append(Part(alike, root, *policy(LIBERO, root=root, selection=",".join(alike))))
     return parts
 
 
@@ -119,9 +130,9 @@ def select_tasks(selection: str, suite: str = SUITE) -> list[str]:
     """Tasks of a suite by their numbers: "0-9", or "0,3,5-6".
 
     Raises:
-        ValueError: There is no such task, or no expert that demonstrates it.
+        ValueError: There is no such task.
     """
-    names, shown = list(tasks(suite)), find_suite(LIBERO, suite).tasks("all")
+    names = list(tasks(suite))
     chosen: list[int] = []
     for part in selection.split(","):
         first, dash, last = part.strip().partition("-")
@@ -133,12 +144,6 @@ def select_tasks(selection: str, suite: str = SUITE) -> list[str]:
                 f"got {selection}; they stand for {', '.join(f'{i} {name}' for i, name in enumerate(names))}"
             )
         chosen += range(int(first), int(last) + 1)
-    if unshown := [str(i) for i in chosen if names[i] not in shown]:
-        known = ",".join(str(names.index(task)) for task in shown)
-        raise ValueError(
-            f"no expert demonstrates tasks {', '.join(unshown)} of {suite}: TASKS is {selection}, expected "
-            f"some of {known}"
-        )
     return [names[i] for i in dict.fromkeys(chosen)]
 
 

@@ -13,6 +13,7 @@ from benchmarks.libero import evaluate as harness
 from benchmarks.libero.evaluate import EvaluationConfig, evaluate, reason, summary
 
 from benchmarks import stages
+from lerobot_openspm.errors import OpenSPMError
 
 TASKS = {name: name.replace("_", " ") for name in ("push_the_plate", "put_the_bowl", "turn_on_the_stove")}
 
@@ -153,11 +154,9 @@ def test_tasks_are_selected_by_number(selection, expected):
 def test_tasks_that_no_expert_does_are_refused(monkeypatch: pytest.MonkeyPatch):
     shown = SimpleNamespace(tasks=lambda _: list(TASKS)[::2])
     monkeypatch.setattr(run, "find_suite", lambda *_: shown)
-    assert run.select_tasks("0,2", "libero_10") == shown.tasks("all")
-    with pytest.raises(
-        ValueError, match=r"no expert demonstrates tasks 1 of libero_10.*expected some of 0,2"
-    ):
-        run.select_tasks("0-2", "libero_10")
+    message = "no expert demonstrates 1 put_the_bowl of libero_10, expected some of TASKS=0,2"
+    with pytest.raises(OpenSPMError, match=message):
+        run.main(run.RunConfig("libero_10", tasks="0-2"))
 
 
 def test_another_suite_is_refused_by_name():
