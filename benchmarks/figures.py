@@ -182,7 +182,7 @@ FIGURES: dict[str, Figure] = {
             (*LIBERO, *_benchmarks("libero_pro", *ERRORS)),
             f"--suite={suite} --states=50",
         )
-        for suite in ("libero_goal_swap", "libero_goal_lan", "libero_goal_object")
+        for suite in ("libero_goal_swap", "libero_goal_lan", "libero_goal_task", "libero_goal_object")
     },
     **{
         f"places_{name}": _libero("places", "libero/place_errors", "truth", "calls", options=options)

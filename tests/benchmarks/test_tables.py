@@ -21,7 +21,15 @@ ORIGIN = {
 RATE = {"success": 0.5, "n": 4, "interval": [0.15, 0.85], "mean_steps": 100.0, "touched": 0.25, "moved": 0.0}
 FAILURES = {"words": 0, "perception": 1, "reach": 0, "grasp": 1, "placing": 0}
 # Headline figures, of whose failed episodes films are looked at.
-FILMED = ("tabletop", "anywhere", "libero_goal", "libero_goal_swap", "libero_goal_lan", "libero_goal_object")
+FILMED = (
+    "tabletop",
+    "anywhere",
+    "libero_goal",
+    "libero_goal_swap",
+    "libero_goal_lan",
+    "libero_goal_task",
+    "libero_goal_object",
+)
 A_NUMBER = re.compile(r"\d[\d.,]* ?(%|ms\b|s\b|min\b|mm\b|minutes?\b|hours?\b|seconds?\b)")
 
 

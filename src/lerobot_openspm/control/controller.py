@@ -129,7 +129,7 @@ class EpisodeController:
                 state.parts = plan_parts(self.instruction, asked, *rest)
             except InstructionError as error:
                 return self._refuse(error)
-            state.start_height = float(hand.T_world_ee[2, 3])
+            state.T_start = hand.T_world_ee
             scene.ground(state.parts[0])
         ahead = [one.entry for part in state.parts[state.part :] for one in part]
         names = dict.fromkeys([*context.objects_of_interest(ahead), *scene.grounding.landmarks])
@@ -172,7 +172,7 @@ class EpisodeController:
         """The key poses of the plan in the scene."""
         state = self.state
         targets = state.plan.targets(self._context, state.gone, state.repeated)
-        return targets if state.is_last_part else (*targets, *rise(targets[-1], state.start_height))
+        return targets if state.is_last_part else (*targets, *rise(targets[-1], state.T_start))
 
     # Following the plan.
 

@@ -9,6 +9,7 @@ from enum import StrEnum
 import numpy as np
 
 from lerobot_openspm.control.plan import NO_PLAN, Plan
+from lerobot_openspm.geometry.se3 import Array
 from lerobot_openspm.memory.compose import Candidate
 from lerobot_openspm.memory.entry import MemoryEntry, Outcome
 from lerobot_openspm.memory.retrieval import Scored
@@ -66,7 +67,7 @@ class EpisodeState:
         parts: For each part of the instruction, in order, what it can be carried out by; none before the
             first look.
         part: The part that is carried out now, counted from 0.
-        start_height: Height of the hand when the instruction was read, metres.
+        T_start: Where the hand was when the instruction was read, ``T_world_ee`` ``(4, 4)``.
         ranked: The entries of the last retrieval with their scores, best first.
         plan: What is acted by, and where.
         refused: The plan that was last found to be infeasible.
@@ -87,7 +88,7 @@ class EpisodeState:
     refusal: str = ""
     parts: tuple[tuple[Candidate, ...], ...] = ()
     part: int = 0
-    start_height: float = np.inf
+    T_start: Array = field(default_factory=lambda: np.eye(4))
     ranked: tuple[Scored, ...] = ()
     plan: Plan = NO_PLAN
     refused: Plan = NO_PLAN

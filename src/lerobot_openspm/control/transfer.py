@@ -19,6 +19,8 @@ from lerobot_openspm.types import Symmetry
 RETREAT_M = 0.06
 # A hand that is at most this much too low need not rise.
 LEVEL_M = 0.02
+# A hand that is turned by more than this at the end of a part is turned back before the next one, radians.
+TURNED_RAD = 0.8
 # Of the hand about its approach axis, the z axis of its frame.
 HALF_TURN = se3.from_yaw(np.zeros(3), np.pi)
 # How the hand is turned where it puts an object down: as where it grasped it, not at all, or so that it turns
@@ -199,16 +201,24 @@ def half_turned(targets: Sequence[Target]) -> tuple[Target, ...]:
     return tuple(replace(one, T_world_ee=one.T_world_ee @ HALF_TURN) for one in targets)
 
 
-def rise(last: Target, height: float) -> tuple[Target, ...]:
-    """Straight up from the last key pose to a height in metres, if that is higher.
+def rise(last: Target, T_start: Array) -> tuple[Target, ...]:
+    """Straight up from the last key pose to the height of where the episode began, if that is higher.
 
-    The next part of an instruction then begins as its demonstrations did: clear of what stands around, and
-    without the hand between the cameras and the objects.
+    A hand that is turned otherwise by now goes back there: not every turn can be made anywhere. The next part
+    of an instruction then begins as its demonstrations did: clear of what stands around, and without the hand
+    between the cameras and the objects.
+
+    Args:
+        last: The last key pose.
+        T_start: Where the hand was when the episode began, ``T_world_ee`` ``(4, 4)``.
     """
-    T_world_ee = last.T_world_ee.copy()
-    if height - T_world_ee[2, 3] < LEVEL_M:
+    T_world_ee, height = last.T_world_ee.copy(), T_start[2, 3]
+    if float(se3.distances(T_world_ee, T_start)[1]) > TURNED_RAD:
+        T_world_ee = T_start
+    elif height - T_world_ee[2, 3] < LEVEL_M:
         return ()
-    T_world_ee[2, 3] = height
+    else:
+        T_world_ee[2, 3] = height
     key_pose = replace(last.key_pose, phase="retreat", n_steps=1, dwell=False, axis=None, confidence=0.5)
     return (Target(T_world_ee, key_pose, precise=False),)
 
