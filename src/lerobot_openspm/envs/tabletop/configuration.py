@@ -25,7 +25,7 @@ OBJECT_POSES_SIZE = 7 * len(OBJECT_NAMES)
 class TabletopEnvConfig(EnvConfig):
     """The embedded tabletop: `task` is a task name, a comma list of them, or a selection.
 
-    The selections are "all" (the ten), "compound", "two_bowls" and "anywhere", see `envs.tasks`.
+    The selections are "all" (the ten), "compound", "two_bowls", "anywhere" and "combinations", see `tasks`.
     """
 
     task: str | None = "all"

@@ -68,9 +68,15 @@ def expert_actions(
         task: A name in `ANY_TASK`.
         rng: Source of the demonstration's imperfections.
         operator: Who leads the hand.
+
+    Raises:
+        ValueError: No expert does it, as none of `COMBINATION_TASKS`.
     """
+    parts = ANY_TASK[task].parts or (task,)
+    if unknown := [part for part in parts if part not in EXPERTS]:
+        raise ValueError(f"there is no expert for {', '.join(unknown)}, which is never demonstrated")
     hand = operator(simulator, rng, PACE)
-    for i, part in enumerate(ANY_TASK[task].parts or (task,)):
+    for i, part in enumerate(parts):
         if i > 0:
             # Back up to where every task begins, clear of all that stands on the table.
             hand.closing = False
