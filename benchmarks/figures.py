@@ -151,7 +151,16 @@ def _with(figure: Figure, *paths: str) -> Figure:
 ERRORS = ("libero/accuracy", "truth")
 # The other suites' scenes get a copy of it that stands elsewhere.
 ARM = "configs/arms/libero_panda.urdf"
-COMPARISONS = ("tabletop", "execution", "oracle", "conditioning", "compound", "two_bowls", "anywhere")
+COMPARISONS = (
+    "tabletop",
+    "execution",
+    "oracle",
+    "conditioning",
+    "compound",
+    "combinations",
+    "two_bowls",
+    "anywhere",
+)
 ON_LIBERO = "--env.type=libero"
 FIGURES: dict[str, Figure] = {
     **{

@@ -213,6 +213,15 @@ def failed_episodes(result: dict[str, Any]) -> list[tuple[str, int]]:
     return [(one["task"], one["state"]) if isinstance(one, dict) else (one[0], one[1]) for one in failed]
 
 
+def test_new_combinations_have_a_row_each(results):
+    run = {**RATE, "per_task": {"a": 0.5}}
+    put(results, "combinations", n=4, runs={"combinations": run}, instructions={"a": "put a on b"})
+    text = tables.results_page()
+    assert "New combinations of a thing and a place" in text
+    assert "| put a on b | 50.0 % | 15.0 to 85.0 % | 4 |" in text
+    assert tables.NOTES["combinations"] in text
+
+
 def test_first_looks_anywhere_are_told_beside_success_and_so_is_which_layouts_are_left_out(results):
     poses = {
         "poses": 70,

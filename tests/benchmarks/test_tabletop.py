@@ -15,6 +15,7 @@ from benchmarks.worlds import tabletop as tabletop_world
 from benchmarks import results, stages, tabletop
 from lerobot_openspm.cli.pipeline import THREADS, Episode
 from lerobot_openspm.envs.tabletop import scene
+from lerobot_openspm.envs.tabletop.tasks import SELECTIONS
 
 EPISODES = [Episode("a", 1000, 100, True, "done"), Episode("b", 1000, 300, False, "no_progress")]
 
@@ -56,6 +57,7 @@ def test_the_policy_as_it_is_keeps_its_figures():
         ("execution", ["closed_loop_trc", "closed_loop", "open_loop"], 1000),
         ("oracle", ["oracle"], 1000),
         ("conditioning", ["equivariant", "paper"], 1000),
+        ("combinations", ["combinations"], 17_000),
         ("two_bowls", ["two_bowls"], 11_000),
         ("anywhere", ["anywhere"], 14_000),
     ],
@@ -68,6 +70,15 @@ def test_a_comparison_keeps_all_its_runs(name: str, runs: list[str], seed: int, 
     assert (kept["n"], kept["seed"]) == (2, seed)
     assert kept["machine"]["threads"] == THREADS
     assert kept["runs"][runs[0]]["failed"] == [["b", 1000, "no_progress"]]
+
+
+def test_of_new_combinations_there_are_ten_scenes_each(monkeypatch: pytest.MonkeyPatch):
+    asked = []
+    monkeypatch.setattr(tabletop, "evaluate", lambda *a, **b: asked.append((*a[2:], b["tasks"])) or EPISODES)
+    told = main(TabletopConfig("combinations"))["instructions"]
+    assert asked == [(10, 17_000, SELECTIONS["combinations"])]
+    assert list(told) == list(SELECTIONS["combinations"])
+    assert len(set(told.values())) == 20
 
 
 def test_an_unknown_comparison_is_refused():
