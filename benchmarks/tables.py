@@ -46,8 +46,8 @@ NOTES = {
     "parts, one after another, with 300 steps for each part.",
     "combinations": "The ten tasks show how each of these things is grasped and how each of these places is "
     "used, but never these things in these places: a grasp of one demonstration and a place of another are "
-    "put together. The drawer is shut at first, also where the instruction does not say so. 300 steps for each "
-    "part, opening the drawer among them.",
+    "put together. The drawer is shut at first, also where the instruction does not say so. 300 steps for "
+    "each part, opening the drawer among them.",
     "two_bowls": "No demonstration shows two bowls; which one is meant is told from where the objects are.",
     "anywhere": "Every object stands within 25 cm of the table's middle at any yaw, beside two distractors "
     "of the colours of bowl and box and a second object of the kind, or a second bowl where the task is a "
