@@ -8,6 +8,7 @@ from lerobot_openspm.envs.seeds import TUNING_SEED_START
 from lerobot_openspm.envs.tabletop import scene, tasks
 from lerobot_openspm.envs.tabletop.combinations import COMBINATION_TASKS
 from lerobot_openspm.envs.tabletop.configuration import TabletopEnvConfig
+from lerobot_openspm.envs.tabletop.placement import plate_goal, sample_layout
 from lerobot_openspm.envs.tabletop.simulator import TabletopSimulator
 from lerobot_openspm.envs.tabletop.tasks import ANY_TASK, TASKS, select_tasks
 from lerobot_openspm.geometry.se3 import from_yaw
@@ -125,6 +126,19 @@ def test_nothing_is_done_at_first(make_env):
         assert not [name for name, task in COMBINATION_TASKS.items() if task.is_done(env.simulator)]
 
 
+def test_a_box_that_goes_into_a_drawer_stands_beside_it_and_the_plate_not_where_another_thing_goes():
+    both = COMBINATION_TASKS["box_in_shut_drawer_then_bottle_on_stove"]
+    assert COMBINATION_TASKS["box_on_plate"].has_room is None
+    for seed in range(TUNING_SEED_START, TUNING_SEED_START + 5):
+        layout = sample_layout(np.random.default_rng(seed), both.has_room)
+        box = layout["cabinet"].to_local(layout["box"].x, layout["box"].y)
+        assert box[0] > scene.HANDLE_X + scene.DRAWER_TRAVEL or abs(box[1]) > scene.CABINET_HALF[1]
+        layout = sample_layout(np.random.default_rng(seed), COMBINATION_TASKS["bowl_before_stove"].has_room)
+        x, y = plate_goal(layout["stove"])
+        apart = np.hypot(layout["plate"].x - x, layout["plate"].y - y)
+        assert apart > scene.PLATE_RADIUS + scene.BOWL_RADIUS
+
+
 @pytest.mark.parametrize("name", SINGLE)
 def test_a_thing_that_stands_in_its_place_is_in_it_and_one_in_the_air_is_not(make_env, name):
     env = make_env(name)
@@ -135,9 +149,6 @@ def test_a_thing_that_stands_in_its_place_is_in_it_and_one_in_the_air_is_not(mak
         simulator.data.qpos[simulator.model.joint("drawer_top").qposadr[0]] = 0.15
     support, at = place(name)
     T_world_support = simulator.object_poses()[support]
-    if support == "stove":
-        # Else the plate may be in the way.
-        simulator.put("plate", from_yaw(np.array([0.4, -0.4, 0.0]), 0.0))
     T_world_obj = T_world_support @ from_yaw(np.array(at), 0.0)
     put(simulator, moved(name), T_world_obj)
     assert is_done(simulator), simulator.touching(moved(name))

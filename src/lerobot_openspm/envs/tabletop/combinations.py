@@ -17,6 +17,7 @@ from lerobot_openspm.envs.tabletop.goals import (
     rests_near,
     rests_within,
 )
+from lerobot_openspm.envs.tabletop.placement import box_beside_drawers, room_before_stove
 
 _BOX_ON_PLATE = rests_near("box", "plate", 0.04)
 _BOX_ON_STOVE = rests_near("box", "stove", 0.05, scene.BURNER_X)
@@ -30,7 +31,12 @@ _BOWL_ON_RACK = rests_within("bowl", "rack", *RACK_RAILS)
 
 def _in_drawer(name: str, thing: str, instruction: str) -> Task:
     """A task for which the top drawer has to be opened first, whether the instruction says so or not."""
-    return Task(name, instruction, in_top_drawer(thing), n_parts=2)
+    has_room = box_beside_drawers if thing == "box" else None
+    return Task(name, instruction, in_top_drawer(thing), n_parts=2, has_room=has_room)
+
+
+def _before_stove(name: str, thing: str, instruction: str) -> Task:
+    return Task(name, instruction, before_stove(thing), has_room=room_before_stove(thing))
 
 
 _SINGLE = by_name(
@@ -42,9 +48,9 @@ _SINGLE = by_name(
     Task("bottle_on_stove", "put the wine bottle on the stove", _BOTTLE_ON_STOVE),
     Task("bottle_in_bowl", "put the wine bottle in the bowl", _BOTTLE_IN_BOWL),
     Task("bowl_on_rack", "put the bowl on the rack", _BOWL_ON_RACK),
-    Task("push_box", "push the box to the front of the stove", before_stove("box")),
-    Task("bowl_before_stove", "put the bowl to the front of the stove", before_stove("bowl")),
-    Task("bottle_before_stove", "put the bottle to the front of the stove", before_stove("bottle")),
+    _before_stove("push_box", "box", "push the box to the front of the stove"),
+    _before_stove("bowl_before_stove", "bowl", "put the bowl to the front of the stove"),
+    _before_stove("bottle_before_stove", "bottle", "put the bottle to the front of the stove"),
     _in_drawer("bowl_in_shut_drawer", "bowl", "put the bowl in the top drawer"),
     _in_drawer("box_in_top_drawer", "box", "open the top drawer and put the cream cheese box inside"),
     _in_drawer("box_in_shut_drawer", "box", "put the cream cheese box in the top drawer"),

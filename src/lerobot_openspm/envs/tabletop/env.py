@@ -136,7 +136,7 @@ class TabletopEnv(gym.Env):
     def _sample_layout(self) -> Layout:
         task, rng = ANY_TASK[self.task], self.np_random
         if task.setting is None:
-            return sample_layout(rng)
+            return sample_layout(rng, task.has_room)
         if not task.setting.is_anywhere:
             return sample_with_second(rng, task.setting.twin, task.setting.is_clear)
         # Which of two is meant is told by looking, and what stands in the way between two places by trying.

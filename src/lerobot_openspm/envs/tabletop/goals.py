@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from lerobot_openspm.envs.tabletop import scene
+from lerobot_openspm.envs.tabletop.placement import Layout
 from lerobot_openspm.envs.tabletop.settings import Setting
 
 if TYPE_CHECKING:
@@ -20,8 +21,8 @@ if TYPE_CHECKING:
 DRAWER_OPEN_M = 0.10
 KNOB_ON_RAD = math.radians(75)
 PLATE_TOLERANCE_M = 0.03
-# Of other things, from where the plate is pushed to: within this they find room beside a plate close by.
-BEFORE_STOVE_M = 0.06
+# Of other things, from where the plate is pushed to.
+BEFORE_STOVE_M = 0.05
 STEPS_PER_PART = 300
 UPRIGHT_COSINE = math.cos(math.radians(20))
 
@@ -37,6 +38,7 @@ class Task:
         parts: Names of the tasks that it is made of, in the order of the instruction; none for the ten.
         setting: What else stands there; None where nothing does.
         n_parts: How many parts its time is for, see `max_steps`.
+        has_room: Whether a layout leaves room for it; None where every one does.
     """
 
     name: str
@@ -45,6 +47,7 @@ class Task:
     parts: tuple[str, ...] = ()
     setting: Setting | None = None
     n_parts: int = 1
+    has_room: Callable[[Layout], bool] | None = None
 
     @property
     def max_steps(self) -> int:
@@ -63,7 +66,13 @@ def all_of(name: str, instruction: str, tasks: Mapping[str, Task], *parts: str) 
     def done(simulator: TabletopSimulator) -> bool:
         return all(tasks[part].is_done(simulator) for part in parts)
 
-    return Task(name, instruction, done, parts, n_parts=sum(tasks[part].n_parts for part in parts))
+    asked = [one for part in parts if (one := tasks[part].has_room) is not None]
+
+    def has_room(layout: Layout) -> bool:
+        return all(one(layout) for one in asked)
+
+    n_parts = sum(tasks[part].n_parts for part in parts)
+    return Task(name, instruction, done, parts, n_parts=n_parts, has_room=has_room if asked else None)
 
 
 def _local(simulator: TabletopSimulator, name: str, frame: str) -> np.ndarray:

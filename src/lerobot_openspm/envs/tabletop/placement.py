@@ -64,11 +64,12 @@ Layout = dict[str, Placement]
 Disc = tuple[float, float, float]
 
 
-def sample_layout(rng: np.random.Generator) -> Layout:
+def sample_layout(rng: np.random.Generator, has_room: Callable[[Layout], bool] | None = None) -> Layout:
     """Draw the placement of every object, uniform within its range, given that nothing is in another's way.
 
     Args:
         rng: Source of randomness.
+        has_room: Whether a layout leaves room for something more; not asked if not given.
 
     Returns:
         Placement per name in `scene.OBJECT_NAMES`.
@@ -78,7 +79,7 @@ def sample_layout(rng: np.random.Generator) -> Layout:
     """
     for _ in range(MAX_TRIES):
         layout = {name: _draw(name, rng) for name in scene.OBJECT_NAMES}
-        if is_admissible(layout):
+        if is_admissible(layout) and (has_room is None or has_room(layout)):
             return layout
     raise LayoutError(f"no layout without overlaps in {MAX_TRIES} tries; is the nominal layout too crowded?")
 
@@ -201,11 +202,9 @@ def plate_goal(stove: Placement) -> tuple[float, float]:
 
 def _ways_are_free(layout: Layout, discs: dict) -> bool:
     """Bottle and bowl stay out of the drawers' way, and nothing between plate and stove."""
-    cabinet, plate = layout["cabinet"], layout["plate"]
-    for name, (way_x, way_y) in DRAWERS_WAY.items():
-        local_x, local_y = cabinet.to_local(layout[name].x, layout[name].y)
-        if local_x < way_x and abs(local_y) < way_y:
-            return False
+    plate = layout["plate"]
+    if any(_in_drawers_way(layout, name, way) for name, way in DRAWERS_WAY.items()):
+        return False
     goal = plate_goal(layout["stove"])
     if math.hypot(goal[0] - plate.x, goal[1] - plate.y) < PLATE_MIN_WAY:
         return False
@@ -214,6 +213,27 @@ def _ways_are_free(layout: Layout, discs: dict) -> bool:
         segment_distance((plate.x, plate.y), goal, (x, y)) > scene.PLATE_RADIUS + r + HAND_GAP
         for x, y, r in others
     )
+
+
+def _in_drawers_way(layout: Layout, name: str, way: tuple[float, float]) -> bool:
+    local_x, local_y = layout["cabinet"].to_local(layout[name].x, layout[name].y)
+    return local_x < way[0] and abs(local_y) < way[1]
+
+
+def box_beside_drawers(layout: Layout) -> bool:
+    """Whether the box can be taken from above beside an open drawer, as the bowl always can."""
+    return not _in_drawers_way(layout, "box", DRAWERS_WAY["bowl"])
+
+
+def room_before_stove(name: str) -> Callable[[Layout], bool]:
+    """Whether a thing finds room where the plate is pushed to: the plate does not stand there already."""
+
+    def has_room(layout: Layout) -> bool:
+        x, y = plate_goal(layout["stove"])
+        (_, _, radius), *_ = footprint_discs(name, layout[name])
+        return not too_close([(x, y, radius)], footprint_discs("plate", layout["plate"]), GAP)
+
+    return has_room
 
 
 def segment_distance(a: tuple, b: tuple, p: tuple) -> float:
