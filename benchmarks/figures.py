@@ -101,7 +101,7 @@ NOISE = (*ALONG, *_benchmarks("measurement_noise"))
 # As `make libero` types it; libero_goal is not named.
 WHOLE_SUITE = "--demos=10 --states=50 --tasks=0-9"
 OTHER_SUITES = ("libero_spatial", "libero_object", "libero_10")
-# Scenes of each task: 50 of each of three, and 10 of each of ten. With other kinds than all, the same scenes.
+# 50 scenes of each of ten tasks, of libero_goal 10. With other kinds than all, the same scenes.
 PLACES = {
     "libero_spatial": "--suite=libero_spatial",
     "libero_object": "--suite=libero_object",

@@ -79,10 +79,11 @@ def test_a_variant_starts_from_its_own_states_with_its_own_words(suite):
     is_swapped = suite == "libero_goal_swap"
     assert (bowl[1] > 0.1) == is_swapped
     assert (plate[0] < -0.1) == is_swapped
-    is_reworded = suite == "libero_goal_lan"
-    assert instruction == (
-        "place the bowl on top of the plate" if is_reworded else "put the bowl on the plate"
-    )
+    words = {
+        "libero_goal_lan": "place the bowl on top of the plate",
+        "libero_goal_task": "put the wine bottle on the plate",
+    }
+    assert instruction == words.get(suite, "put the bowl on the plate")
 
 
 @pytest.mark.libero
