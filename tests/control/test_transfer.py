@@ -15,7 +15,16 @@ from lerobot_openspm.control.feasibility import (
     geometric_score,
     shape_deviation,
 )
-from lerobot_openspm.control.transfer import RETREAT_M, Turn, as_shown, transfer, transfer_pose, turn_about
+from lerobot_openspm.control.transfer import (
+    RETREAT_M,
+    Target,
+    Turn,
+    as_shown,
+    rise,
+    transfer,
+    transfer_pose,
+    turn_about,
+)
 from lerobot_openspm.geometry import se3
 from lerobot_openspm.memory.entry import WORLD
 from lerobot_openspm.types import Symmetry
@@ -298,3 +307,24 @@ def test_a_round_thing_is_grasped_and_put_as_it_was_shown_however_it_is_turned()
     # What is only put something on is turned as it is.
     poses = as_shown(memory, turned, {"plate": Symmetry(np.zeros(2), 0.0)})
     assert poses["plate"] is turned["plate"]
+
+
+@pytest.mark.parametrize(
+    ("turned", "height", "ends_at"),
+    [
+        (0.3, 0.5, [0.1, 0.2, 0.5]),  # straight up
+        (0.3, 0.21, None),  # as high already
+        (1.2, 0.5, [-0.3, 0.0, 0.5]),  # turned otherwise: back to where the episode began
+        (1.2, 0.21, [-0.3, 0.0, 0.21]),
+    ],
+)
+def test_a_part_ends_as_high_and_turned_as_the_episode_began(turned, height, ends_at):
+    last = Target(hand_pose(0.1, 0.2, 0.2), entry().key_poses[-1], precise=False)
+    T_start = hand_pose(-0.3, 0.0, height, turned)
+    ends = rise(last, T_start)
+    if ends_at is None:
+        assert ends == ()
+        return
+    assert np.allclose(ends[0].T_world_ee[:3, 3], ends_at)
+    R_end = (T_start if turned > 1 else last.T_world_ee)[:3, :3]
+    assert np.allclose(ends[0].T_world_ee[:3, :3], R_end)

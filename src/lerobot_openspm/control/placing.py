@@ -11,9 +11,7 @@ from collections.abc import Mapping
 
 from lerobot_openspm.geometry import se3
 from lerobot_openspm.geometry.se3 import Array
-from lerobot_openspm.memory.entry import WORLD, MemoryEntry, MemoryKeyPose, Outcome
-
-ARRIVING = ("pre-place", "place", "release")
+from lerobot_openspm.memory.entry import ARRIVING, WORLD, MemoryEntry, MemoryKeyPose, Outcome
 
 
 def carried_outcomes(entry: MemoryEntry) -> dict[int, Outcome]:

@@ -8,11 +8,11 @@ from typing import Literal
 
 import numpy as np
 
-from lerobot_openspm.control.placing import ARRIVING, carried_outcomes, placing_position
+from lerobot_openspm.control.placing import carried_outcomes, placing_position
 from lerobot_openspm.control.pushes import PushPath, push_paths, pushed
 from lerobot_openspm.geometry import se3
 from lerobot_openspm.geometry.se3 import Array
-from lerobot_openspm.memory.entry import CONTACT_PHASES, Axis, MemoryEntry, MemoryKeyPose
+from lerobot_openspm.memory.entry import ARRIVING, CONTACT_PHASES, Axis, MemoryEntry, MemoryKeyPose
 from lerobot_openspm.types import Symmetry
 
 # How far the hand backs off at the end.

@@ -16,13 +16,20 @@ from lerobot_openspm.errors import InstructionError
 from lerobot_openspm.geometry import se3
 from lerobot_openspm.geometry.se3 import Array
 from lerobot_openspm.language.descriptions import phrase
-from lerobot_openspm.memory.entry import WORLD, Anchor, MemoryEntry, MemoryKeyPose, Outcome, RetrievalKey
+from lerobot_openspm.memory.entry import (
+    ARRIVING,
+    WORLD,
+    Anchor,
+    MemoryEntry,
+    MemoryKeyPose,
+    Outcome,
+    RetrievalKey,
+)
 from lerobot_openspm.memory.looks import UNKNOWN_LOOKS, Looks
+from lerobot_openspm.memory.retrieval import MIN_SEMANTIC
 from lerobot_openspm.memory.rim_grasps import Part, Score, by_rim
 from lerobot_openspm.types import SubTask
 
-# Below this semantic score a demonstration grasps another thing, or puts things elsewhere.
-MIN_SEMANTIC = 0.75
 # Of the pairs of demonstrations so many are put together, the best grasps and places first.
 MAX_PAIRS = 12
 # Two things whose undersides are seen at heights that differ by less than this stood on the same surface.
@@ -33,7 +40,6 @@ LOWERED_M, RELEASED_M = 0.10, 0.003
 MOST_TILT_RAD = 0.35
 # In what is put together, a thing is somewhere by being put or by being pushed there.
 MOVING = ("put", "push")
-ARRIVING = ("pre-place", "place", "release")
 
 
 @dataclass(frozen=True)
@@ -140,7 +146,7 @@ def _is_place(part: MemoryEntry) -> bool:
 def _carries_level(part: MemoryEntry) -> bool:
     """Whether the hand puts down what it carries as it took it, but for a turn about the vertical."""
     T_grasp = _grasped(part)[1]
-    places = [_in_world(part, pose) for pose in part.key_poses if pose.phase == "place"]
+    places = [part.demonstrated(pose) for pose in part.key_poses if pose.phase == "place"]
     upright = [(T[:3, :3] @ T_grasp[:3, :3].T)[2, 2] for T in places]
     return bool(places) and min(upright) > np.cos(MOST_TILT_RAD)
 
@@ -212,15 +218,10 @@ def combined(
     )
 
 
-def _in_world(entry: MemoryEntry, pose: MemoryKeyPose) -> Array:
-    """``T_world_ee`` ``(4, 4)`` of a key pose in its demonstration."""
-    return pose.anchor.frame(entry.object_poses) @ pose.T_obj_ee
-
-
 def _grasped(entry: MemoryEntry) -> tuple[int, Array]:
     """Which key pose takes hold of the target, and where the hand is then, ``T_world_ee`` ``(4, 4)``."""
     index = next(i for i, pose in enumerate(entry.key_poses) if pose.phase == "grasp")
-    return index, _in_world(entry, entry.key_poses[index])
+    return index, entry.demonstrated(entry.key_poses[index])
 
 
 def _same_surface(grasp: MemoryEntry, place: MemoryEntry, looks: Looks) -> tuple[Array, Array]:
@@ -270,14 +271,14 @@ def _way(place: MemoryEntry, stood: Array) -> _Way:
     index, T_grasp = _grasped(place)
     T_ee_world = se3.inverse(T_grasp)
     arriving = tuple(pose for pose in place.key_poses[index + 1 :] if pose.phase in ARRIVING)
-    arrived = [_in_world(place, pose) for pose in arriving]
+    arrived = [place.demonstrated(pose) for pose in arriving]
     points = [se3.apply(T @ T_ee_world, stood[None])[0] for T in arrived]
     at_place = max(i for i, pose in enumerate(arriving) if pose.phase == "place")
     # While the fingers open, the hand leaves the thing behind.
     points = [
         points[at_place] if pose.phase == "release" else p for pose, p in zip(arriving, points, strict=True)
     ]
-    lifted = [_in_world(place, pose)[2, 3] for pose in place.key_poses[index + 1 :] if pose.phase == "lift"]
+    lifted = [place.demonstrated(pose)[2, 3] for pose in place.key_poses[index + 1 :] if pose.phase == "lift"]
     return _Way(arriving, tuple(points), max((float(z - T_grasp[2, 3]) for z in lifted), default=0.0))
 
 
@@ -301,7 +302,7 @@ def _taking(grasp: MemoryEntry, index: int, rise_m: float) -> Iterable[MemoryKey
     lifts = [pose for pose in own if pose.phase == "lift"]
     if not lifts:
         lifts = [replace(grasp.key_poses[index], phase="lift", dwell=False, n_steps=1)]
-    missing_m = max(rise_m - (_in_world(grasp, lifts[-1])[2, 3] - T_grasp[2, 3]), 0.0)
+    missing_m = max(rise_m - (grasp.demonstrated(lifts[-1])[2, 3] - T_grasp[2, 3]), 0.0)
     higher = se3.from_yaw(np.array([0.0, 0.0, missing_m]), 0.0)
     yield from lifts[:-1]
     # Frames are upright.

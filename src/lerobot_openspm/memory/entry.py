@@ -20,6 +20,8 @@ PHASES: tuple[str, ...] = get_args(Phase)
 CONSTRAINED_PHASES = ("push", "open", "turn")
 # The hand touches something: these key poses are met precisely, the others in passing.
 CONTACT_PHASES = ("grasp", "place", "release", *CONSTRAINED_PHASES)
+# The hand is on the way to where what it carries ends, or there.
+ARRIVING = ("pre-place", "place", "release")
 
 
 @dataclass(frozen=True)
@@ -232,6 +234,10 @@ class MemoryEntry:
         held = {pose.sub_task for pose in self.key_poses if pose.phase in AXIS_KINDS}
         grasps = (pose for pose in self.key_poses if pose.phase == "grasp" and pose.sub_task not in held)
         return {pose.sub_task: pose.anchor.place for pose in grasps}
+
+    def demonstrated(self, pose: MemoryKeyPose) -> Array:
+        """``T_world_ee`` ``(4, 4)`` of a key pose in the demonstration."""
+        return pose.anchor.frame(self.object_poses) @ pose.T_obj_ee
 
     def until(self, sub_task: int) -> MemoryEntry:
         """The entry without the sub-tasks after one."""

@@ -15,7 +15,6 @@ from lerobot_openspm.geometry.se3 import Array
 from lerobot_openspm.memory.entry import (
     Anchor,
     MemoryEntry,
-    MemoryKeyPose,
     RetrievalKey,
 )
 from lerobot_openspm.memory.looks import Looks, Rim
@@ -63,17 +62,12 @@ def _grasped_rim(part: MemoryEntry, looks: Looks) -> Rim | None:
     if rim is None or part.carried.get(0) != target or target not in part.object_poses:
         return None
     pose = next(one for one in part.key_poses if one.phase == "grasp")
-    T_rim_ee = se3.inverse(part.object_poses[target] @ rim.T_obj_rim) @ _in_world(part, pose)
+    T_rim_ee = se3.inverse(part.object_poses[target] @ rim.T_obj_rim) @ part.demonstrated(pose)
     out, across = T_rim_ee[:2, 3], T_rim_ee[:2, 1]
     distance = float(np.linalg.norm(out))
     is_near = abs(distance - rim.radius) < NEAR_RIM_M and T_rim_ee[2, 3] < 0
     is_across = pose.opening < THIN_M and abs(float(out @ across)) > ACROSS * distance
     return rim if is_near and is_across else None
-
-
-def _in_world(part: MemoryEntry, pose: MemoryKeyPose) -> Array:
-    """``T_world_ee`` ``(4, 4)`` of a key pose in its demonstration."""
-    return pose.anchor.frame(part.object_poses) @ pose.T_obj_ee
 
 
 def _at_other_rim(
@@ -92,11 +86,11 @@ def _at_other_rim(
     known, poses = part.key.sub_tasks[0], part.object_poses
     middle = (poses[known.target] @ own.T_obj_rim)[:3, 3]
     grasp = next(one for one in part.key_poses if one.phase == "grasp")
-    out = (_in_world(part, grasp)[:3, 3] - middle) * [1.0, 1.0, 0.0]
+    out = (part.demonstrated(grasp)[:3, 3] - middle) * [1.0, 1.0, 0.0]
     step = T_world_rim[:3, 3] - middle + (radius - own.radius) * out / np.linalg.norm(out)
     T_obj_moved = se3.inverse(T_world_obj) @ se3.from_yaw(step, 0.0)
     moved = tuple(
-        replace(one, anchor=Anchor(name, name), T_obj_ee=T_obj_moved @ _in_world(part, one))
+        replace(one, anchor=Anchor(name, name), T_obj_ee=T_obj_moved @ part.demonstrated(one))
         for one in part.key_poses
         if one.phase in ("approach", "grasp", "lift") and set(one.anchor.objects) == {known.target}
     )
