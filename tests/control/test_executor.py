@@ -8,10 +8,9 @@ from numpy.testing import assert_allclose
 from tests.memory.builders import OPEN_WIDTH, entry, hand_pose, key_pose, robot
 
 from lerobot_openspm.control import executor as executing
-from lerobot_openspm.control import strategies
 from lerobot_openspm.control.executor import Executor
 from lerobot_openspm.control.state import EpisodeState, Status
-from lerobot_openspm.control.strategies import PASSING_M, PASSING_RAD, RESIDUAL_M, RESIDUAL_RAD
+from lerobot_openspm.control.strategies import RESIDUAL_M, RESIDUAL_RAD
 from lerobot_openspm.control.transfer import transfer
 from lerobot_openspm.errors import OpenSPMError
 from lerobot_openspm.geometry import se3
@@ -93,7 +92,7 @@ def test_the_closed_loop_meets_every_key_pose_as_exactly_as_it_must():
         metres, radians = se3.distances(left[i], target.T_world_ee)
         if target.key_pose.dwell:
             continue
-        limits = (RESIDUAL_M, RESIDUAL_RAD) if target.precise else (PASSING_M, PASSING_RAD)
+        limits = (RESIDUAL_M, RESIDUAL_RAD) if target.precise else (target.passing_m, target.passing_rad)
         assert metres <= limits[0]
         assert radians <= limits[1]
 
@@ -106,13 +105,13 @@ def test_waiting_for_the_fingers_takes_the_demonstrated_steps():
             assert steps_at[i] == target.key_pose.n_steps
 
 
-def test_via_points_are_passed_without_stopping_short(monkeypatch):
-    monkeypatch.setattr(strategies, "PASSING_M", 0.05)
-    monkeypatch.setattr(strategies, "PASSING_RAD", 1.0)
+def test_via_points_are_passed_without_stopping_short():
     loose, world = make(), World()
+    wide = [replace(one, passing_m=0.05, passing_rad=1.0) for one in loose.targets]
+    loose.begin(wide, Hand(HOME, OPEN_WIDTH))
     loose_left, _, _ = run(loose, world)
     metres, _ = se3.distances(loose_left[0], loose.targets[0].T_world_ee)
-    assert PASSING_M < metres <= 0.05
+    assert make().targets[0].passing_m < metres <= 0.05
 
 
 @pytest.mark.parametrize("sign", [-1, 1])

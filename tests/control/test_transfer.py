@@ -328,3 +328,5 @@ def test_a_part_ends_as_high_and_turned_as_the_episode_began(turned, height, end
     assert np.allclose(ends[0].T_world_ee[:3, 3], ends_at)
     R_end = (T_start if turned > 1 else last.T_world_ee)[:3, :3]
     assert np.allclose(ends[0].T_world_ee[:3, :3], R_end)
+    # Back about there will do; straight up goes all the way.
+    assert (ends[0].passing_m > last.passing_m) == (turned > 1)

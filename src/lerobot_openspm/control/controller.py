@@ -171,7 +171,7 @@ class EpisodeController:
     def _targets(self) -> tuple[Target, ...]:
         """The key poses of the plan in the scene."""
         state = self.state
-        targets = state.plan.targets(self._context, state.gone, state.repeated)
+        targets = state.plan.targets(self._context, state.gone)
         return targets if state.is_last_part else (*targets, *rise(targets[-1], state.T_start))
 
     # Following the plan.
@@ -324,15 +324,12 @@ class EpisodeController:
         return self._mend(missed[0], hand) if missed else self._end_part(hand)
 
     def _mend(self, missed: Outcome, hand: Hand) -> None:
-        """Do one sub-task again, from where its target is now, if an attempt is left.
-
-        Those after it are not done again: their handles are not where they were.
-        """
+        """Go back to a sub-task, and to where its target is now, if an attempt is left."""
         state = self.state
         state.looks_left = 0
         if not self.executor.try_again(f"the {missed.target} is not where it should be"):
             return
-        state.looks_left, state.verdict, state.repeated = LOOKS_AT_OUTCOME, None, missed.sub_task
+        state.looks_left, state.verdict = LOOKS_AT_OUTCOME, None
         poses = state.plan.entry.key_poses
         index = next(i for i, pose in enumerate(poses) if pose.sub_task == missed.sub_task)
         self._follow_objects(state.plan.objects(index, self.scene.altered), hand)

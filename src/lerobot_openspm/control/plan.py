@@ -84,13 +84,10 @@ class Plan:
     not_meant: Mapping[str, Sequence[Array]] = field(default_factory=dict[str, Sequence[Array]])
 
     def targets(
-        self,
-        context: PlanningContext,
-        gone: Mapping[int, float] | None = None,
-        last: int | None = None,
+        self, context: PlanningContext, gone: Mapping[int, float] | None = None
     ) -> tuple[Target, ...]:
-        """The key poses in the scene; see :func:`transfer`. Those after sub-task `last` are left out."""
-        entry = self.entry if last is None else self.entry.until(last)
+        """The key poses in the scene; see :func:`transfer`."""
+        entry = self.entry
         object_poses = as_shown(entry, self.object_poses, context.symmetries)
         turns = {
             sub_task: Turn(name, object_poses[name], context.symmetries[name].middle, self.turned, self.put)

@@ -81,7 +81,6 @@ class EpisodeState:
         verdict: Whether the present part is seen to be done; None where that is not known.
         gone: How far drawers and knobs of the present part have moved, by sub-task, metres or radians.
         followed: Sub-tasks of the present part whose drawer or knob went all the way.
-        repeated: The sub-task of the present part that is done again, if one is.
     """
 
     status: Status = Status.WAITING
@@ -101,7 +100,6 @@ class EpisodeState:
     verdict: bool | None = None
     gone: dict[int, float] = field(default_factory=dict[int, float])
     followed: set[int] = field(default_factory=set[int])
-    repeated: int | None = None
 
     def __deepcopy__(self, memo: dict[int, object]) -> EpisodeState:
         """A copy that goes on by itself. Entries and plans never change, so both share them."""
@@ -149,7 +147,7 @@ class EpisodeState:
         self.verdicts = (*self.verdicts, self.verdict)
         self.part += 1
         self.attempts, self.looks_left, self.verdict = 0, LOOKS_AT_OUTCOME, None
-        self.gone, self.followed, self.repeated = {}, set(), None
+        self.gone, self.followed = {}, set()
 
     def judge(self, missed: Sequence[Outcome]) -> None:
         """Take in which outcomes are missed. The others, and handles that went all the way, are done."""

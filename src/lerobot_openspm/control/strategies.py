@@ -13,10 +13,8 @@ from lerobot_openspm.memory.robot import RobotModel
 from lerobot_openspm.types import Execution, Hand
 
 # The numbers here were set by hand on the tabletop, and serve LIBERO as well.
-# The paper's epsilon_r: a precise key pose is met within this distance and angle ...
+# The paper's epsilon_r: a precise key pose is met within this distance and angle.
 RESIDUAL_M, RESIDUAL_RAD = 0.004, 0.06
-# ... and one that is only passed by within these.
-PASSING_M, PASSING_RAD = 0.015, 0.15
 # Where a correction leaves more than this share of the residual, something solid is in the hand's way.
 STUCK_SHARE = 0.9
 # A blocked key pose is met within this multiple of the tolerance, because what is touched is in the way.
@@ -94,7 +92,7 @@ class ClosedLoop:
         if target.precise:
             share = max(float(metres) / RESIDUAL_M, float(radians) / RESIDUAL_RAD)
             return share <= 1 or (approach.is_blocked and share <= BLOCKED_SHARE)
-        return bool(metres <= PASSING_M and radians <= PASSING_RAD)
+        return bool(metres <= target.passing_m and radians <= target.passing_rad)
 
 
 class OpenLoop(ClosedLoop):

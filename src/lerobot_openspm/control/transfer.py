@@ -21,6 +21,10 @@ RETREAT_M = 0.06
 LEVEL_M = 0.02
 # A hand that is turned by more than this at the end of a part is turned back before the next one, radians.
 TURNED_RAD = 0.8
+# A target that is only passed by is met within this distance and angle, metres and radians ...
+PASSING_M, PASSING_RAD = 0.015, 0.15
+# ... and the way back between two parts ends within these.
+BACK_M, BACK_RAD = 0.1, 0.3
 # Of the hand about its approach axis, the z axis of its frame.
 HALF_TURN = se3.from_yaw(np.zeros(3), np.pi)
 # How the hand is turned where it puts an object down: as where it grasped it, not at all, or so that it turns
@@ -58,6 +62,8 @@ class Target:
         axis: The constraint that the way here follows, its direction in the world; None in free space.
         push: The path of what is pushed on the way here; None where nothing is pushed, or the path is not
             known or turns.
+        passing_m: Distance within which it is met where it is only passed by, metres.
+        passing_rad: Angle within which it is, radians.
     """
 
     T_world_ee: Array
@@ -65,6 +71,8 @@ class Target:
     precise: bool
     axis: Axis | None = None
     push: PushPath | None = None
+    passing_m: float = PASSING_M
+    passing_rad: float = PASSING_RAD
 
 
 def transfer_pose(T_world_obj: Array, T_obj_ee: Array) -> Array:
@@ -204,22 +212,22 @@ def half_turned(targets: Sequence[Target]) -> tuple[Target, ...]:
 def rise(last: Target, T_start: Array) -> tuple[Target, ...]:
     """Straight up from the last key pose to the height of where the episode began, if that is higher.
 
-    A hand that is turned otherwise by now goes back there: not every turn can be made anywhere. The next part
-    of an instruction then begins as its demonstrations did: clear of what stands around, and without the hand
-    between the cameras and the objects.
+    A hand that is turned otherwise by now goes back about there: not every turn can be made anywhere. The
+    next part of an instruction then begins as its demonstrations did: clear of what stands around, and
+    without the hand between the cameras and the objects.
 
     Args:
         last: The last key pose.
         T_start: Where the hand was when the episode began, ``T_world_ee`` ``(4, 4)``.
     """
-    T_world_ee, height = last.T_world_ee.copy(), T_start[2, 3]
-    if float(se3.distances(T_world_ee, T_start)[1]) > TURNED_RAD:
-        T_world_ee = T_start
-    elif height - T_world_ee[2, 3] < LEVEL_M:
-        return ()
-    else:
-        T_world_ee[2, 3] = height
     key_pose = replace(last.key_pose, phase="retreat", n_steps=1, dwell=False, axis=None, confidence=0.5)
+    if float(se3.distances(last.T_world_ee, T_start)[1]) > TURNED_RAD:
+        back = Target(T_start, key_pose, precise=False, passing_m=BACK_M, passing_rad=BACK_RAD)
+        return (back,)
+    if T_start[2, 3] - last.T_world_ee[2, 3] < LEVEL_M:
+        return ()
+    T_world_ee = last.T_world_ee.copy()
+    T_world_ee[2, 3] = T_start[2, 3]
     return (Target(T_world_ee, key_pose, precise=False),)
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Literal, get_args
 
 import numpy as np
@@ -238,11 +238,6 @@ class MemoryEntry:
     def demonstrated(self, pose: MemoryKeyPose) -> Array:
         """``T_world_ee`` ``(4, 4)`` of a key pose in the demonstration."""
         return pose.anchor.frame(self.object_poses) @ pose.T_obj_ee
-
-    def until(self, sub_task: int) -> MemoryEntry:
-        """The entry without the sub-tasks after one."""
-        key = replace(self.key, sub_tasks=self.key.sub_tasks[: sub_task + 1])
-        return replace(self, key=key, key_poses=tuple(p for p in self.key_poses if p.sub_task <= sub_task))
 
     @property
     def served_outcomes(self) -> list[Outcome]:
