@@ -20,6 +20,7 @@ from lerobot_openspm.geometry.camera import check_sizes
 from lerobot_openspm.memory.io import MEMORY_JSON, arrays_file, read_memory
 from lerobot_openspm.memory.memory import Memory, check_layouts
 from lerobot_openspm.memory.stored_entries import anchored_objects
+from lerobot_openspm.workplaces import FOLDER, folders
 
 MAX_CONFIG_BYTES = 1_000_000
 # Options that name programs and addresses on the user's machine.
@@ -45,7 +46,7 @@ def checkpoint_folder(name: str | Path, revision: str | None = None, **options: 
         _check_config(directory / CONFIG_NAME)
         return directory
     download = partial(snapshot_download, str(name), **options)
-    files = [CONFIG_NAME, SAFETENSORS_SINGLE_FILE, MEMORY_JSON]
+    files = [CONFIG_NAME, SAFETENSORS_SINGLE_FILE, MEMORY_JSON, f"{FOLDER}/*/{MEMORY_JSON}"]
     try:
         directory = Path(download(allow_patterns=files, revision=revision))
     except HFValidationError as error:
@@ -53,8 +54,9 @@ def checkpoint_folder(name: str | Path, revision: str | None = None, **options: 
             f"no checkpoint folder at {name}, and no name on the Hub (user/name)"
         ) from error
     _check_config(directory / CONFIG_NAME)
-    # The file of arrays is named there. Pushes before may have left others of this kind.
-    download(allow_patterns=[arrays_file(directory)], revision=directory.name)
+    # The files of arrays are named there. Pushes before may have left others of this kind.
+    arrays = [(one / arrays_file(one)).relative_to(directory).as_posix() for one in folders(directory)]
+    download(allow_patterns=arrays, revision=directory.name)
     return directory
 
 

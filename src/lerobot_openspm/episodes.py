@@ -28,11 +28,13 @@ class RunningEpisode:
         controller: Decides what to do.
         perception: Finds the objects.
         is_reported: Whether its success or failure was reported.
+        workplace: Whose memory it acts by, counted from 0.
     """
 
     controller: EpisodeController
     perception: Perception
     is_reported: bool = False
+    workplace: int = 0
 
 
 def new_episode(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import defaultdict
 from collections.abc import Sequence
 from copy import deepcopy
 from dataclasses import replace
@@ -31,6 +32,7 @@ from lerobot_openspm.memory.io import write_memory
 from lerobot_openspm.memory.memory import Memory
 from lerobot_openspm.perception.observation import Observation, split_batch
 from lerobot_openspm.types import Hand, Segmenter
+from lerobot_openspm.workplaces import choose, folder, folders
 
 if TYPE_CHECKING:
     from lerobot_openspm.teaching import Lesson
@@ -63,8 +65,9 @@ class OpenSPMPolicy(PreTrainedPolicy):
         self.config: OpenSPMConfig = config
         self.flow = VelocityField(CONDITION_DIM[config.conditioning], config.chunk_size, 7)
         self.memory: Memory | None = None
+        self.elsewhere: tuple[Memory, ...] = ()  # those of other workplaces
         self._training_set: TrainingSet | None = None
-        self._entries: tuple[Sequence[MemoryEntry], Sequence[MemoryEntry]] | None = None
+        self._entries: dict[int, tuple[Sequence[MemoryEntry], Sequence[MemoryEntry]]] = {}
         if dataset_meta is not None:
             _ = self.names  # what cannot be used is an error now, not at the first observation
             config.control_hz = config.control_hz or float(dataset_meta.fps)
@@ -141,12 +144,15 @@ class OpenSPMPolicy(PreTrainedPolicy):
                 self.episodes[i] = self._new_episode(observation)
 
     def _new_episode(self, observation: Observation) -> RunningEpisode:
-        memory = self.require_memory()
+        memories = self.require_memory(), *self.elsewhere
         # Episodes share the index, which is made anew when the memory was replaced.
-        if self._entries is None or self._entries[0] is not memory.entries:
-            self._entries = memory.entries, indexed(memory.entries)
-        entries = self._entries[1]
-        return new_episode(observation, memory, entries, self.config, self.names, self.segmenter)
+        for i, memory in enumerate(memories):
+            if i not in self._entries or self._entries[i][0] is not memory.entries:
+                self._entries[i] = memory.entries, indexed(memory.entries)
+        entries = [self._entries[i][1] for i in range(len(memories))]
+        i = choose(observation, memories, entries, self.names)
+        episode = new_episode(observation, memories[i], entries[i], self.config, self.names, self.segmenter)
+        return replace(episode, workplace=i)
 
     def _chunk(self, controller: EpisodeController, hand: Hand) -> np.ndarray:
         """Generate a chunk ``(chunk_size, 7)`` in the world. Episodes go one by one, so batches act alike."""
@@ -203,13 +209,16 @@ class OpenSPMPolicy(PreTrainedPolicy):
                 f"got {len(successes)} successes, but {len(self.episodes)} episodes are running; report one "
                 "for every environment, after acting and before reset()"
             )
-        counted = []
+        counted = defaultdict[int, list[tuple[MemoryEntry, bool]]](list)
         for episode, success in zip(self.episodes, successes, strict=True):
             if success is not None and not episode.is_reported:
                 episode.is_reported = True
-                counted += episode.controller.state.entry_successes(success)
-        if counted:
-            self.memory = self.require_memory().with_successes(counted)
+                counted[episode.workplace] += episode.controller.state.entry_successes(success)
+        memories = [self.require_memory(), *self.elsewhere]
+        for i, fared in counted.items():
+            memories[i] = memories[i].with_successes(fared)
+        self.memory, *elsewhere = memories
+        self.elsewhere = tuple(elsewhere)
 
     def _learn(self, dataset_meta: Any) -> TrainingSet:
         """Mine a dataset: the memory begins or goes on with it, and the flow model learns from it."""
@@ -261,7 +270,8 @@ class OpenSPMPolicy(PreTrainedPolicy):
         # The calibration travels with the memory, the user's own words in the configuration.
         saved = replace(self.config.without_places(), lexicon=self.names.lexicon.added or None)
         saved._save_pretrained(Path(save_directory))
-        write_memory(memory, Path(save_directory))
+        for i, one in enumerate((memory, *self.elsewhere)):
+            write_memory(one, folder(Path(save_directory), i))
 
     @classmethod
     def from_pretrained(
@@ -289,6 +299,9 @@ class OpenSPMPolicy(PreTrainedPolicy):
         policy = super().from_pretrained(directory, config=config, strict=strict, **kwargs)
         is_kept = policy.config.memory_update == "keep" or dataset_meta is None
         policy.memory = load_memory(directory, policy.config, is_kept)
+        # The options' calibration and arm are those of the first workplace.
+        own = replace(policy.config, cameras=None, arm=None)
+        policy.elsewhere = tuple(load_memory(other, own, True) for other in folders(directory)[1:])
         # What cannot be used is an error now, not at the first observation.
         _ = policy.segmenter, policy.names
         if dataset_meta is not None:

@@ -122,6 +122,20 @@ def test_a_handle_that_does_not_move_on_in_the_fingers_is_taken_again_where_it_i
     assert_allclose(one.executor.targets[2].T_world_ee, way.follow(shown[2]), atol=1e-9)
 
 
+def test_a_drawer_that_does_not_open_is_named_with_the_hand_at_rest():
+    perception, one = Perception(CABINET), controller(handle(KINDS["slide"]), instruction=OPEN)
+    observe(one, HAND, perception)
+    for _ in range(1000):
+        target = one.executor.present  # the hand goes wherever it should but along with the handle
+        is_pulling = target.axis is not None
+        T = one.executor.approach.start if is_pulling else target.T_world_ee
+        watch(one, perception, Hand(T, max(target.key_pose.opening, 0.03)), 1)
+        if one.state.status is Status.NO_PROGRESS:
+            break
+    assert one.state.refusal.startswith("the cabinet does not open: it stays ")
+    assert one.executor.next_action(HAND)[:6].tolist() == [0.0] * 6
+
+
 def stuck(one, perception, hand, index):
     """The hand, held up short of a key pose until it is given up."""
     one.executor.begin(one.executor.targets, hand, index)

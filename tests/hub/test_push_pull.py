@@ -14,6 +14,7 @@ import pytest
 from tests.hub.loopback_hub import LoopbackHub
 from tests.memory.memory_files import names
 
+from lerobot_openspm.cli.join import main as join
 from lerobot_openspm.memory.io import read_memory, write_memory
 
 REPO = "tester/openspm-tabletop"
@@ -140,3 +141,19 @@ def test_a_changed_memory_is_pushed_again_and_what_it_was_before_is_not_pulled(
     # A cache that holds the one before gets the new one.
     answer(run(ACT + PUSH, checkpoint, tiny_dataset, REPO, home="home_a"))
     assert answer(run(ACT + PULL, tiny_dataset, REPO, home="home_b")) == [first, 6]
+
+
+@pytest.mark.slow
+def test_the_memory_of_every_workplace_is_pulled(
+    run: Run, loopback_hub: LoopbackHub, checkpoint: Path, tiny_dataset: Path, tmp_path: Path
+):
+    far = Path(shutil.copytree(checkpoint, tmp_path / "far"))
+    memory = read_memory(far)
+    robot = replace(memory.robot, workspace=memory.robot.workspace + 5)
+    write_memory(replace(memory, entries=memory.entries[:5], robot=robot), far)
+    join([f"--policy.paths=[{far},{checkpoint}]", f"--output_dir={tmp_path / 'joined'}"])
+    here = answer(run(ACT + PUSH, tmp_path / "joined", tiny_dataset, REPO, home="home_a"))
+    assert {f"workplaces/1/{name}" for name in names(checkpoint)} <= set(loopback_hub.files(REPO))
+    # The hand is not where the first memory has it, whose entries are counted.
+    assert answer(run(ACT + PULL, tiny_dataset, REPO, home="home_b")) == [here, 5]
+    assert here == answer(run(ACT + PUSH, checkpoint, tiny_dataset, f"{REPO}-alone", home="home_a"))

@@ -17,6 +17,7 @@ COMMANDS = {
     "calibrate": (f"{CLI}.calibrate", "main", "estimate a camera's pose from a dataset's own episodes"),
     "mine": (f"{CLI}.mine", "main", "mine a dataset's key poses into a memory"),
     "teach": (f"{CLI}.teach", "main", "teach a checkpoint a task from a few demonstrations"),
+    "join": (f"{CLI}.join", "main", "put the checkpoints of several workplaces into one"),
     "inspect": (f"{CLI}.memory_show", "show", "show the memory of a checkpoint"),
     "memory": (f"{CLI}.memory", "main", "list, show and change the entries of a memory"),
     "bench": (f"{CLI}.bench", "main", "measure a checkpoint on this machine"),

@@ -9,6 +9,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from lerobot_openspm.control.reasons import why_given_up
 from lerobot_openspm.control.state import EpisodeState, Status
 from lerobot_openspm.control.strategies import STRATEGIES, Approach
 from lerobot_openspm.control.transfer import Target
@@ -278,7 +279,8 @@ class Executor:
         phase = self.present.key_pose.phase
         if self.state.attempts > MAX_ATTEMPTS:
             self.stop(Status.NO_PROGRESS)
-            logger.info("giving up at key pose %d (%s): %s", self.state.index, phase, why)
+            self.state.refusal = why_given_up(phase, self.present.key_pose.anchor.place, why)
+            logger.info("giving up at key pose %d: %s", self.state.index, self.state.refusal)
             return False
         logger.info("trying key pose %d (%s) again: %s", self.state.index, phase, why)
         return True

@@ -17,6 +17,7 @@ from lerobot_openspm.control.feasibility import (
 )
 from lerobot_openspm.control.finger_room import finger_room
 from lerobot_openspm.control.joint_room import ways_out
+from lerobot_openspm.control.placing import taken
 from lerobot_openspm.control.plan import Plan
 from lerobot_openspm.control.pushes import pushed_by_landmark
 from lerobot_openspm.control.transfer import as_shown, half_turned
@@ -188,6 +189,8 @@ class PlanningContext:
         plan, inside = next(iter(self._beside(*best, points)), best)
         if sum(inside.values()) <= FEW_POINTS:
             return plan, []
+        if problems := taken(plan.entry, plan.object_poses, points):
+            return plan, problems
         logger.warning("%r: hand or load may touch the %s where it takes hold or lets go",
                        plan.entry.language, " and the ".join(inside))  # fmt: skip
         return plan, []

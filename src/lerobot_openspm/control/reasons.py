@@ -10,6 +10,17 @@ from lerobot_openspm.types import Hand, PoseEstimate
 
 # Fingers that are open by such a share are around something, as far as can be felt.
 FINGERS_AROUND = (0.03, 0.9)
+# What does not succeed in a phase, with the object that it is about.
+FAILS = {
+    "approach": "the hand does not get to the {}",
+    "grasp": "the fingers do not hold the {}",
+    "lift": "the {} does not stay in the hand",
+    "pre-place": "the hand does not get to the {}",
+    "place": "nothing can be put at the {}",
+    "push": "the {} cannot be pushed",
+    "open": "the {} does not open",
+    "turn": "the {} does not turn",
+}
 
 
 def why_missing(
@@ -42,6 +53,17 @@ def why_missing(
     if is_something_held:
         reasons.append("the fingers are around something, which may be it")
     return "; ".join(reasons)
+
+
+def why_given_up(phase: str, place: str, why: str) -> str:
+    """What did not succeed although it was tried again.
+
+    Args:
+        phase: In which phase.
+        place: The object that the key pose is relative to.
+        why: What was wrong at last.
+    """
+    return f"{FAILS[phase].format(place)}: {why}" if phase in FAILS else why
 
 
 def are_around_something(hand: Hand, robot: RobotModel) -> bool:

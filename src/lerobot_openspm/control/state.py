@@ -63,7 +63,8 @@ class EpisodeState:
     Attributes:
         status: What the episode is up to; changed by :meth:`go` alone.
         refusal: Why the instruction is not acted on, with the object or the camera that it is about; ""
-            unless the status is OBJECT_NOT_FOUND, OBJECT_LOST, INFEASIBLE, NOT_UNDERSTOOD or CAMERA_FAULT.
+            unless the status is OBJECT_NOT_FOUND, OBJECT_LOST, INFEASIBLE, NO_PROGRESS, NOT_UNDERSTOOD or
+            CAMERA_FAULT.
         parts: For each part of the instruction, in order, what it can be carried out by; none before the
             first look.
         part: The part that is carried out now, counted from 0.

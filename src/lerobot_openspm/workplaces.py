@@ -1,0 +1,81 @@
+"""Several workplaces in one policy: their memories lie beside one another, and an episode acts by one.
+
+At a workplace the cameras and the robot's base keep their places, and a name means the same object. A
+checkpoint holds the first one's memory as any other does, and those of others in `workplaces/1`,
+`workplaces/2` and so on. The flow model works relative to its target, so all share the first one's.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from lerobot_openspm.errors import InstructionError
+from lerobot_openspm.language.names import NameSimilarity
+from lerobot_openspm.memory.compose import plan_parts
+from lerobot_openspm.memory.entry import MemoryEntry
+from lerobot_openspm.memory.io import MEMORY_JSON
+from lerobot_openspm.memory.memory import Memory
+from lerobot_openspm.memory.retrieval import read_instruction
+from lerobot_openspm.perception.observation import Observation
+
+FOLDER = "workplaces"
+
+
+def folder(checkpoint: Path, number: int) -> Path:
+    """Where a checkpoint keeps the memory of a workplace; that of the first, 0, is the checkpoint's own."""
+    return checkpoint / FOLDER / str(number) if number else checkpoint
+
+
+def folders(checkpoint: Path) -> list[Path]:
+    """The folders with the memories of a checkpoint's workplaces, the first one's first."""
+    found = [checkpoint]
+    while (one := folder(checkpoint, len(found)) / MEMORY_JSON).is_file():
+        found.append(one.parent)
+    return found
+
+
+def choose(
+    observation: Observation,
+    memories: Sequence[Memory],
+    entries: Sequence[Sequence[MemoryEntry]],
+    names: NameSimilarity,
+) -> int:
+    """At which workplace an episode begins, counted from 0.
+
+    The hand tells: it is where the demonstrations of that workplace had it. Among several the instruction
+    does: it is the one that knows it best.
+
+    Args:
+        observation: The first one.
+        memories: One of each workplace.
+        entries: Theirs, with their index.
+        names: Tells which names mean the same thing.
+    """
+    if len(memories) == 1:
+        return 0
+    outside = [_outside(memory, observation.hand.T_world_ee[:3, 3]) for memory in memories]
+    near = [i for i, metres in enumerate(outside) if metres <= min(outside)]
+    return max(near, key=lambda i: _knows(observation.instruction, entries[i], names))
+
+
+def _outside(memory: Memory, position: np.ndarray) -> float:
+    """How far a position ``(3,)`` is from where the demonstrations' hand has been, metres; 0 inside."""
+    low, high = memory.robot.workspace
+    return float(np.linalg.norm(np.maximum(np.maximum(low - position, position - high), 0.0)))
+
+
+def _knows(
+    instruction: str, entries: Sequence[MemoryEntry], names: NameSimilarity
+) -> tuple[bool, int, float]:
+    """How well a memory knows an instruction: as it was shown, by how few entries, how near in meaning."""
+    try:
+        parts = plan_parts(instruction, read_instruction(instruction, entries, names), entries, names)
+    except InstructionError:
+        return False, -len(instruction), 0.0
+    best = [max(part, key=lambda one: one.semantic) for part in parts]
+    sources = {id(source): source for one in best for source in one.sources}
+    is_shown = any(source.language == instruction for source in sources.values())
+    return is_shown, -len(sources), min(one.semantic for one in best)

@@ -1,0 +1,107 @@
+"""Several workplaces in one policy: an episode acts by the memory of the one where the hand is."""
+
+import json
+import shutil
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+from tests.policy.conftest import Frame, act, batch_of
+
+from lerobot_openspm.cli.join import main as join
+from lerobot_openspm.errors import OpenSPMError
+from lerobot_openspm.memory.io import read_memory, write_memory
+from lerobot_openspm.memory.memory import Memory
+from lerobot_openspm.modeling_openspm import OpenSPMPolicy
+
+FAR_M = 5.0
+
+
+@pytest.fixture
+def changed(checkpoint: Path, tmp_path: Path) -> Callable[[str, Memory], Path]:
+    """A copy of the checkpoint with another memory."""
+
+    def change(name: str, memory: Memory) -> Path:
+        shutil.copytree(checkpoint, tmp_path / name)
+        write_memory(memory, tmp_path / name)
+        return tmp_path / name
+
+    return change
+
+
+def elsewhere(memory: Memory) -> Memory:
+    """The memory of a robot whose hand is metres away."""
+    return replace(memory, robot=replace(memory.robot, workspace=memory.robot.workspace + FAR_M))
+
+
+def joined(*paths: Path) -> Path:
+    output = paths[0].parent / "joined"
+    join([f"--policy.paths=[{','.join(map(str, paths))}]", f"--output_dir={output}"])
+    return output
+
+
+def test_the_hand_tells_the_workplace_and_its_memory_alone_learns(
+    policy: OpenSPMPolicy,
+    checkpoint: Path,
+    changed: Callable[[str, Memory], Path],
+    recorded: list[list[Frame]],
+    tmp_path: Path,
+):
+    far = changed("far", elsewhere(read_memory(checkpoint)))
+    both = OpenSPMPolicy.from_pretrained(joined(far, checkpoint))
+    here = [recorded[0], recorded[3]]
+    assert torch.equal(act(both, here), act(policy, here))
+    assert [one.workplace for one in both.episodes] == [1, 1]
+    both.report_successes([True, False])
+    assert not any(entry.trials for entry in both.require_memory().entries)
+    both.save_pretrained(tmp_path / "saved")
+    again = OpenSPMPolicy.from_pretrained(tmp_path / "saved")
+    assert sorted(e.trials for e in again.elsewhere[0].entries) == [0, 0, 0, 0, 1, 1]
+    assert torch.equal(act(again, here[:1]), act(policy, here[:1]))
+
+
+def test_where_the_hand_does_not_tell_the_instruction_does(
+    checkpoint: Path, changed: Callable[[str, Memory], Path], recorded: list[list[Frame]]
+):
+    memory = read_memory(checkpoint)
+    tasks = sorted({entry.language for entry in memory.entries})
+    paths = [
+        changed(f"only_{i}", replace(memory, entries=tuple(e for e in memory.entries if e.language == task)))
+        for i, task in enumerate(tasks)
+    ]
+    both = OpenSPMPolicy.from_pretrained(joined(*paths))
+    batch = batch_of([recorded[0][0], recorded[3][0]])
+    both.select_action(batch)
+    assert [one.workplace for one in both.episodes] == [tasks.index(task) for task in batch["task"]]
+
+
+def test_workplaces_of_joined_policies_are_joined_too(
+    checkpoint: Path, changed: Callable[[str, Memory], Path], capsys: pytest.CaptureFixture[str]
+):
+    far = changed("far", elsewhere(read_memory(checkpoint)))
+    both = joined(far, checkpoint)
+    output = both.with_name("three")
+    capsys.readouterr()
+    join([f"--policy.paths=[{checkpoint},{both}]", f"--output_dir={output}"])
+    told = json.loads(capsys.readouterr().out)
+    assert told == {"output": str(output), "workplaces": 3, "entries": [6, 6, 6]}
+    assert len(OpenSPMPolicy.from_pretrained(output).elsewhere) == 2
+
+
+def test_what_cannot_be_joined_is_named_and_nothing_is_written(checkpoint: Path, tmp_path: Path):
+    other = tmp_path / "other"
+    shutil.copytree(checkpoint, other)
+    config = json.loads((other / "config.json").read_text())
+    (other / "config.json").write_text(json.dumps({**config, "control_hz": 7.0}))
+    for paths, words in (
+        ([checkpoint], "names 1 checkpoints, expected at least two"),
+        ([checkpoint, other], "its control_hz is 7.0"),
+    ):
+        options = [f"--policy.paths=[{','.join(map(str, paths))}]", f"--output_dir={tmp_path / 'joined'}"]
+        with pytest.raises(OpenSPMError, match=words):
+            join(options)
+        assert not (tmp_path / "joined").exists()
+    with pytest.raises(OpenSPMError, match="exists already"):
+        join([f"--policy.paths=[{checkpoint},{checkpoint}]", f"--output_dir={other}"])
