@@ -288,7 +288,7 @@ def test_what_was_put_aside_is_where_it_should_be_until_its_place_moves():
 def test_a_place_where_something_stands_already_is_refused_by_name(beside, is_taken):
     context, poses, home = scene(None, 0.0)
     shown = replace(context.entries[0], outcomes=(ON_PLATE,))
-    mug = np.concatenate([disc() + [0.0, 0.0, z] for z in np.linspace(0.0, 0.1, 11)])
+    mug = np.concatenate([disc() + np.array([0.0, 0.0, z]) for z in np.linspace(0.0, 0.1, 11)])
     points = {"bowl": disc(), "mug": mug}
     context = replace(context, entries=(shown,), points=points, hand_radius_m=RADIUS, symmetries={})
     found = poses | {"mug": poses["plate"] @ se3.from_yaw([*beside], 0.0)}
