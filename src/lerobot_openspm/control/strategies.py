@@ -89,6 +89,8 @@ class ClosedLoop:
 
     def _is_near(self, target: Target, approach: Approach, hand: Hand) -> bool:
         metres, radians = se3.distances(hand.T_world_ee, target.T_world_ee)
+        if target.until_stopped and approach.is_blocked:
+            return True
         if target.precise:
             share = max(float(metres) / RESIDUAL_M, float(radians) / RESIDUAL_RAD)
             return share <= 1 or (approach.is_blocked and share <= BLOCKED_SHARE)

@@ -25,6 +25,8 @@ TURNED_RAD = 0.8
 PASSING_M, PASSING_RAD = 0.015, 0.15
 # ... and the way back between two parts ends within these.
 BACK_M, BACK_RAD = 0.1, 0.3
+# A door or a drawer is pushed so much further than was shown, metres, until it stops the hand.
+SHUT_M = 0.02
 # Of the hand about its approach axis, the z axis of its frame.
 HALF_TURN = se3.from_yaw(np.zeros(3), np.pi)
 # How the hand is turned where it puts an object down: as where it grasped it, not at all, or so that it turns
@@ -62,6 +64,7 @@ class Target:
         axis: The constraint that the way here follows, its direction in the world; None in free space.
         push: The path of what is pushed on the way here; None where nothing is pushed, or the path is not
             known or turns.
+        until_stopped: Whether it is met too where the hand goes no further, because what it pushes is shut.
         passing_m: Distance within which it is met where it is only passed by, metres.
         passing_rad: Angle within which it is, radians.
     """
@@ -71,6 +74,7 @@ class Target:
     precise: bool
     axis: Axis | None = None
     push: PushPath | None = None
+    until_stopped: bool = False
     passing_m: float = PASSING_M
     passing_rad: float = PASSING_RAD
 
@@ -151,6 +155,7 @@ def transfer(
         is_straight = sum(p.phase == "push" and p.sub_task == pose.sub_task for p in entry.key_poses) == 1
         push = path if pose.phase == "push" and is_straight else None
         targets.append(Target(before, pose, _is_precise(entry, i), axis, push))
+    targets = _shut(targets, entry)
     for sub_task, turn in (turns or {}).items():
         targets = _turned(targets, sub_task, turn, entry.object_poses)
     for sub_task, amount in (gone or {}).items():
@@ -229,6 +234,23 @@ def rise(last: Target, T_start: Array) -> tuple[Target, ...]:
     T_world_ee = last.T_world_ee.copy()
     T_world_ee[2, 3] = T_start[2, 3]
     return (Target(T_world_ee, key_pose, precise=False),)
+
+
+def _shut(targets: Sequence[Target], entry: MemoryEntry) -> list[Target]:
+    """Key poses of which the last of a push that closes something goes on until that stops the hand."""
+    after = [*targets[1:], None]
+    shut = list(targets)
+    for i, (target, following) in enumerate(zip(targets, after, strict=True)):
+        pose = target.key_pose
+        is_last = following is None or following.key_pose.phase != "push"
+        is_closing = pose.phase == "push" and entry.key.sub_tasks[pose.sub_task].operation == "close"
+        if not is_closing or not is_last or i == 0:
+            continue
+        way = target.T_world_ee[:3, 3] - targets[i - 1].T_world_ee[:3, 3]
+        T = target.T_world_ee.copy()
+        T[:3, 3] += SHUT_M * way / max(float(np.linalg.norm(way)), 1e-9)
+        shut[i] = replace(target, T_world_ee=T, until_stopped=True)
+    return shut
 
 
 def _is_precise(entry: MemoryEntry, i: int) -> bool:

@@ -115,8 +115,8 @@ def consensus(
 ) -> dict[Role, Anchor]:
     """Choose an anchor for every role of one task; none for a contact whose object is not known.
 
-    Only objects that the instruction names are candidates, because nothing looks for others when acting. A
-    contact belongs to the object that the instruction suggests. If that was found in few demonstrations, the
+    Only objects that the sub-task names are candidates, because nothing looks for others when acting, and
+    each sub-task is a part that can be done alone. A contact belongs to the object that the instruction suggests. If that was found in few demonstrations, the
     contact is anchored to another one only where the demonstrations show that it goes along with that. If it
     was found in half of them or more, the others say nothing against it.
 
@@ -126,8 +126,6 @@ def consensus(
         surfaces: Names of what things stand on everywhere, such as the table: what is put there is put
             relative to whatever the demonstrations agree about.
     """
-    names = list(dict.fromkeys(name for sub_task in sub_tasks for name in sub_task.objects))
-    candidates = [Anchor(place, axes) for place in names for axes in (place, WORLD, *names)]
     gathered: dict[Role, list[tuple[KeyPose, Demonstration]]] = defaultdict(list)
     for demonstration in demonstrations:
         for role, pose in zip(roles(demonstration.key_poses), demonstration.key_poses, strict=True):
@@ -135,7 +133,8 @@ def consensus(
     touching = frozenset[Role]().union(*(contact_roles(one.key_poses) for one in demonstrations))
     anchors: dict[Role, Anchor] = {}
     for role, members in gathered.items():
-        suggested = suggested_anchor(members[0][0], sub_tasks)
+        suggested, names = suggested_anchor(members[0][0], sub_tasks), _names(members[0][0], sub_tasks)
+        candidates = [Anchor(place, axes) for place in names for axes in (place, WORLD, *names)]
         n_found = sum(suggested in demonstration.object_poses for _, demonstration in members)
         in_half = 2 * n_found >= len(members)
         is_free = role not in touching or suggested in surfaces or in_half
@@ -149,6 +148,14 @@ def consensus(
         if np.isfinite(costs[best]):
             anchors[role] = best
     return anchors
+
+
+def _names(pose: KeyPose, sub_tasks: Sequence[SubTask]) -> tuple[str, ...]:
+    """The objects that a key pose can be relative to: those of its sub-task, or of all where only words are
+    known."""
+    own = [sub_task_of(pose, sub_tasks)]
+    named = sub_tasks if sub_tasks[0].words else own
+    return tuple(dict.fromkeys(name for sub_task in named for name in sub_task.objects))
 
 
 def _cost(

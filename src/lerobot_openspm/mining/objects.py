@@ -301,16 +301,22 @@ def contact_cues(item: MinedEpisode) -> tuple[ContactCue, ...]:
     def add(name: str, pose: KeyPose, kind: Literal["grasp", "release", "contact"]) -> None:
         found.append(ContactCue(name, pose.T_world_ee[:3, 3], kind, f"{item.episode.task}: {len(found)}"))
 
+    opened = {(one.target, one.part) for one in item.sub_tasks if one.operation == "open"}
     for pose in item.key_poses:
         sub_task = sub_task_of(pose, item.sub_tasks)
         if pose.phase == "grasp":
             add(sub_task.target, pose, "grasp")
-        elif pose.phase == "release" and sub_task.relation in UPON and not sub_task.part:
-            # With a part, the release is inside a drawer that was shut in the first frame.
-            add(sub_task.landmark, pose, "release")
+        elif pose.phase == "release" and sub_task.relation in UPON:
+            # What is opened first was shut in the first frame, so that the release is inside it.
+            if (sub_task.landmark, sub_task.part) not in opened:
+                add(sub_task.landmark, pose, "release")
     for before, pose in pairwise(item.key_poses):
-        if pose.phase == "push" != before.phase:
-            add(sub_task_of(pose, item.sub_tasks).target, before, "contact")
+        pushing, pushed = (sub_task_of(one, item.sub_tasks) for one in (pose, before))
+        if pose.phase == "push" != before.phase and pushing.operation != "close":
+            add(pushing.target, before, "contact")
+        elif before.phase == "push" != pose.phase and pushed.operation == "close":
+            # The hand sets out before a door or a drawer, and ends where that belongs.
+            add(pushed.target, before, "contact")
     return tuple(found)
 
 
