@@ -13,6 +13,7 @@ from tqdm import tqdm
 
 from lerobot_openspm.cli.pipeline import digest, discard_unless
 from lerobot_openspm.errors import OpenSPMError
+from lerobot_openspm.workplaces import folders
 
 # What is kept of an episode or another job.
 type Row = dict[str, Any]
@@ -44,8 +45,9 @@ def measured_folder(folder: Path, files: Sequence[Path], options: Sequence[str],
 
 def checkpoint_files(checkpoint: Path) -> list[Path]:
     """What a checkpoint acts by."""
-    names = ("model.safetensors", "memory.json", "cameras.json", "config.json")
-    return [path for name in names if (path := checkpoint / name).is_file()]
+    memories = [folder / "memory.json" for folder in folders(checkpoint)]
+    names = ("model.safetensors", "cameras.json", "config.json")
+    return [path for path in (*memories, *(checkpoint / name for name in names)) if path.is_file()]
 
 
 def resume(

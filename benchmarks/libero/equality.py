@@ -14,7 +14,7 @@ from benchmarks.episodes import load, run_episode
 from benchmarks.libero.evaluate import SEED
 from benchmarks.libero.run import learned
 from benchmarks.results import run, write
-from benchmarks.stages import DEMOS, LIBERO
+from benchmarks.stages import LIBERO
 from benchmarks.worlds import LIBERO_IMAGE_SIZE, LiberoWorld, initial_states
 from lerobot.envs.configs import LiberoEnv
 from lerobot.envs.factory import make_env, make_env_pre_post_processors
@@ -41,11 +41,11 @@ class EqualityConfig:
 
 def main(config: EqualityConfig) -> dict[str, Any]:
     """Run every episode twice, compare, write and return the result."""
-    parts = learned(config.suite, DEMOS, find_suite(LIBERO, config.suite).tasks("all"))
-    policies = {task: part.checkpoint for part in parts for task in part.tasks}
+    names = find_suite(LIBERO, config.suite).tasks("all")
+    checkpoint, _ = learned({config.suite: names})
+    acting = load(str(checkpoint))
     plain, lazy = [], []
-    for task, checkpoint in tqdm(policies.items(), unit="task"):
-        acting = load(str(checkpoint))
+    for task in tqdm(names, unit="task"):
         plain += _plain(acting, checkpoint, task, config)
         simulator = LiberoSimulator(task, LIBERO_IMAGE_SIZE)
         for state in range(config.states):

@@ -1,31 +1,36 @@
 """`make libero`: collect, train and evaluate on one of LIBERO's suites; prints one JSON object last.
 
 python -m benchmarks.libero.run --suite=libero_spatial --demos=10 --states=50 --tasks=0-9
+python -m benchmarks.libero.run --suite=all
 
-Where cameras and robot stand elsewhere in some tasks, as in libero_10, each kind of scene gets a policy of
-its own.
+What is called the same looks otherwise in other scenes, as libero_10 has several. Each scene is learned by
+itself, and what is evaluated is one policy, joined of all.
 """
 
 from __future__ import annotations
 
 import logging
-from collections.abc import Sequence
+import re
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from benchmarks.harness import Row
+from benchmarks.harness import Row, checkpoint_files
 from benchmarks.libero.accuracy import accuracy, found_errors
 from benchmarks.libero.evaluate import SEED, STATES, evaluate_states, summary
 from benchmarks.results import run, write
-from benchmarks.stages import DEMOS, LIBERO, dataset, policy
+from benchmarks.stages import DEMOS, LIBERO, RUNS, dataset, demonstrations_of, policy, run_folder
 
-from lerobot_openspm.cli.pipeline import THREADS
+from lerobot_openspm.cli.pipeline import THREADS, digest, discard_unless
 from lerobot_openspm.envs.libero.simulator import OBJECTS, SUITE, scene_kind, tasks
 from lerobot_openspm.envs.suites import find_suite
 from lerobot_openspm.errors import OpenSPMError
+from lerobot_openspm.workplaces import join
 
 logger = logging.getLogger(__name__)
+
+ALL = "all"
 
 
 @dataclass
@@ -33,10 +38,10 @@ class RunConfig:
     """What `make libero` does. Finished stages are kept and not done again.
 
     Args:
-        suite: One of LIBERO's.
+        suite: One of LIBERO's, or "all" for one policy of all.
         demos: Demonstrations a task.
         states: Initial states a task to evaluate, from the first on.
-        tasks: Numbers of the tasks, such as 0-9 or 0,3,5.
+        tasks: Numbers of the tasks of each suite, such as 0-9 or 0,3,5.
     """
 
     suite: str = SUITE
@@ -45,22 +50,28 @@ class RunConfig:
     tasks: str = "0-9"
 
     def __post_init__(self) -> None:
-        if self.suite not in OBJECTS:
-            raise ValueError(f"SUITE is {self.suite!r}, expected one of {', '.join(OBJECTS)}")
-        select_tasks(self.tasks, self.suite)
+        if self.suite not in (*OBJECTS, ALL):
+            raise ValueError(f"SUITE is {self.suite!r}, expected one of {', '.join((*OBJECTS, ALL))}")
+        self.selected()
         if not 1 <= self.states <= STATES or self.demos < 1:
             raise ValueError(
                 f"STATES must be 1 to {STATES} and DEMOS at least 1, got {self.states}, {self.demos}"
             )
 
+    def selected(self) -> dict[str, list[str]]:
+        """The tasks by suite."""
+        suites = list(OBJECTS) if self.suite == ALL else [self.suite]
+        return {suite: select_tasks(self.tasks, suite) for suite in suites}
+
 
 @dataclass(frozen=True)
 class Part:
-    """What was made of the tasks of one kind of scene.
+    """What was made of the tasks of one scene.
 
     Attributes:
-        root: Their demonstrations.
-        checkpoint: The policy.
+        tasks: The tasks.
+        root: The dataset that their demonstrations are in.
+        checkpoint: The policy of these tasks alone.
         seconds: That mining and training took; None if it was interrupted.
     """
 
@@ -70,60 +81,121 @@ class Part:
     seconds: float | None
 
 
-def learned(suite: str, demos: int, selected: Sequence[str]) -> list[Part]:
+def learned(selected: Mapping[str, Sequence[str]], demos: int = DEMOS) -> tuple[Path, list[Part]]:
     """Record demonstrations of tasks and learn from them, where that was not done.
 
+    Args:
+        selected: The tasks by suite.
+        demos: Demonstrations a task.
+
+    Returns:
+        The checkpoint of all tasks, and the parts that it was joined of.
+
     Raises:
-        OpenSPMError: No expert demonstrates one of them.
+        OpenSPMError: No expert demonstrates one of the tasks.
     """
+    parts = [part for suite, some in selected.items() for part in _parts(suite, demos, some)]
+    if len(parts) == 1:
+        return parts[0].checkpoint, parts
+    if len(selected) == 1:
+        folder = run_folder(LIBERO, demos, ",".join(*selected.values()))
+    else:
+        folder = RUNS[LIBERO] / ALL / f"demos_{demos}"
+    output = folder / "joined"
+    paths = [part.checkpoint for part in parts]
+    discard_unless(output, digest([file for path in paths for file in checkpoint_files(path)], []))
+    if not output.exists():
+        join(paths, output)
+    return output, parts
+
+
+def _parts(suite: str, demos: int, selected: Sequence[str]) -> list[Part]:
+    """What is learned of each scene. Scenes in which cameras and robot stand alike share a dataset."""
     names, shown = list(tasks(suite)), find_suite(LIBERO, suite).tasks("all")
     if unshown := [f"{names.index(task)} {task}" for task in selected if task not in shown]:
         known = ",".join(str(names.index(task)) for task in shown)
         raise OpenSPMError(
             f"no expert demonstrates {', '.join(unshown)} of {suite}, expected some of TASKS={known}"
         )
-    by_kind: dict[str, list[str]] = {}
-    for task in selected:
-        by_kind.setdefault(scene_kind(task), []).append(task)
     parts: list[Part] = []
-    for alike in by_kind.values():
+    for alike in _grouped(selected, scene_kind):
         logger.info("recording %d demonstrations of each of %d tasks of %s", demos, len(alike), suite)
-        root = dataset(LIBERO, demos, ",".join(alike))
-        logger.info("mining and training")
-        parts.append(Part(alike, root, *policy(LIBERO, root=root, selection=",".join(alike))))
+        selection = ",".join(alike)
+        root = dataset(LIBERO, demos, selection)
+        recorded = demonstrations_of(root)
+        scenes = _grouped(alike, scene)
+        for own in scenes:
+            logger.info("mining and training: %s", ", ".join(own))
+            some = {} if len(scenes) == 1 else {"episodes": [n for task in own for n in recorded[task]]}
+            variant = "train" if len(scenes) == 1 else f"train_{scene(own[0])}"
+            parts.append(Part(own, root, *policy(LIBERO, variant, root=root, selection=selection, **some)))
     return parts
+
+
+def _grouped(names: Sequence[str], key: Callable[[str], str]) -> list[list[str]]:
+    """Tasks with the same key together, in the order of the first of each."""
+    groups: dict[str, list[str]] = {}
+    for task in names:
+        groups.setdefault(key(task), []).append(task)
+    return list(groups.values())
+
+
+def scene(task: str) -> str:
+    """Which scene a task of libero_10 is of, such as KITCHEN_SCENE4; "" where a suite has one."""
+    found = re.match(r"[A-Z_]+SCENE\d+", task)
+    return found[0] if found else ""
 
 
 def main(config: RunConfig) -> dict[str, Any]:
     """Do what is missing. The whole suite from 50 states is written down as a published result."""
-    selected = select_tasks(config.tasks, config.suite)
-    episodes: list[Row] = []
+    checkpoint, parts = learned(config.selected(), config.demos)
+    told = {suite: _evaluated(config, suite, checkpoint, parts) for suite in config.selected()}
+    timing = _timing(parts)
+    if config.suite != ALL:
+        return {**told[config.suite], **timing, "checkpoint": str(checkpoint)}
+    if config.demos == DEMOS and config.selected() == {suite: list(tasks(suite)) for suite in OBJECTS}:
+        about = {"seed": SEED, "demonstrations": DEMOS, "states": config.states}
+        kept = ("success", "n", "interval", "mean_steps")
+        rates = {suite: {key: one[key] for key in kept} for suite, one in told.items()}
+        write("libero_all", {**about, **timing, "suites": rates}, THREADS)
+    return {**told, **timing, "checkpoint": str(checkpoint)}
+
+
+def _evaluated(config: RunConfig, suite: str, checkpoint: Path, parts: Sequence[Part]) -> dict[str, Any]:
+    """What the policy does in one suite."""
+    selected = config.selected()[suite]
+    logger.info("evaluating %d tasks of %s from %d initial states", len(selected), suite, config.states)
+    single = len(parts) == 1
+    folder = parts[0].root.with_name("evaluation") if single else checkpoint.with_name(f"evaluation_{suite}")
+    episodes = evaluate_states(checkpoint, folder, config.states, selected, suite=suite)
     errors: list[dict[str, Any]] = []
-    parts = learned(config.suite, config.demos, selected)
+    rows: list[Row] = []
     for part in parts:
-        logger.info("evaluating %d tasks from %d initial states", len(part.tasks), config.states)
-        folder = part.root.with_name("evaluation")
-        rows = evaluate_states(part.checkpoint, folder, config.states, part.tasks, suite=config.suite)
-        episodes += rows
-        errors += found_errors(part.checkpoint, part.root, rows)
-    found = accuracy(episodes, errors)
-    figures = summary(episodes, found.pop("found_off_mm"))
-    worst = {(e["task"], e["state"]): off for e, off in zip(episodes, found.pop("off_mm"), strict=True)}
+        own = [row for row in episodes if row["task"] in part.tasks]
+        rows += own
+        errors += found_errors(part.checkpoint, part.root, own)
+    found = accuracy(rows, errors)
+    figures = summary(rows, found.pop("found_off_mm"))
+    worst = {(e["task"], e["state"]): off for e, off in zip(rows, found.pop("off_mm"), strict=True)}
     for failed in figures["failed"]:
         failed["off_mm"] = worst[failed["task"], failed["state"]]
-    seconds = [part.seconds for part in parts if part.seconds is not None]
-    timing = {"mine_and_train_s": round(sum(seconds), 1) if len(seconds) == len(parts) else None}
-    if config.demos == DEMOS and config.states == STATES and selected == list(tasks(config.suite)):
+    is_whole = config.demos == DEMOS and config.states == STATES and selected == list(tasks(suite))
+    if is_whole and config.suite == suite:
         about = {"seed": SEED, "demonstrations": DEMOS}
-        write(config.suite, {**about, **timing, **figures}, THREADS)
+        write(suite, {**about, **_timing(parts), **figures}, THREADS)
         # Which way round the other suites' things look alike is not known, so their yaw is not judged.
-        if config.suite == SUITE:
+        if suite == SUITE:
             write("libero_accuracy", {**about, "n": figures["n"], **found}, THREADS)
-    told = {key: figures[key] for key in ("success", "n", "mean_steps")}
+    told = {key: figures[key] for key in ("success", "n", "interval", "mean_steps")}
     per_task = {task: row["success"] for task, row in figures["per_task"].items()}
     places = {key: found[key] for key in ("position_mm_mean", "position_mm_p95")}
-    checkpoints = ", ".join(str(part.checkpoint) for part in parts)
-    return {**told, "per_task": per_task, **timing, **places, "checkpoint": checkpoints}
+    return {**told, "per_task": per_task, **places}
+
+
+def _timing(parts: Sequence[Part]) -> dict[str, float | None]:
+    """How long mining and training of all parts took; None where one was interrupted."""
+    seconds = [part.seconds for part in parts if part.seconds is not None]
+    return {"mine_and_train_s": round(sum(seconds), 1) if len(seconds) == len(parts) else None}
 
 
 def select_tasks(selection: str, suite: str = SUITE) -> list[str]:

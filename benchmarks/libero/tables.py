@@ -26,9 +26,9 @@ instruction alone. Evaluation: the benchmark's own initial states, which no demo
 300 steps, images of 360 pixels as lerobot-eval renders them. "Paper" is what the paper reports of itself."""
 OTHERS = """# On LIBERO's other suites
 
-The same with at most 280 steps in libero_spatial and libero_object, and at most 520 in libero_10. Cameras and
-robot of libero_10 stand elsewhere in the living room, in the kitchen and in the study: a policy is learned
-for each room, and the figures are of all rooms together."""
+The same with at most 280 steps in libero_spatial and libero_object, and at most 520 in libero_10. What is
+called the same looks otherwise in each of the nine scenes of libero_10, and cameras and robot stand elsewhere
+in some: each scene is learned by itself, and one policy is joined of them."""
 # As the paper's table quotes them: parameters, chunk length, success in percent, frequency in Hz.
 PUBLISHED = (
     ("Diffusion Policy", "260 M", 8, 68.3, 14.2),

@@ -7,21 +7,29 @@ checkpoint holds the first one's memory as any other does, and those of others i
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
+from lerobot.configs import PreTrainedConfig
 
-from lerobot_openspm.errors import InstructionError
+from lerobot_openspm.configuration_openspm import OpenSPMConfig
+from lerobot_openspm.errors import InstructionError, OpenSPMError
 from lerobot_openspm.language.names import NameSimilarity
 from lerobot_openspm.memory.compose import plan_parts
 from lerobot_openspm.memory.entry import MemoryEntry
-from lerobot_openspm.memory.io import MEMORY_JSON
+from lerobot_openspm.memory.io import MEMORY_JSON, read_memory, write_memory
 from lerobot_openspm.memory.memory import Memory
 from lerobot_openspm.memory.retrieval import read_instruction
 from lerobot_openspm.perception.observation import Observation
 
 FOLDER = "workplaces"
+# What a policy has once, whatever the workplace.
+COMMON = (
+    "input_features", "output_features", "state_layout", "action_layout", "rotation", "control_hz",
+    "perception", "segmenter", "conditioning", "chunk_size",
+)  # fmt: skip
 
 
 def folder(checkpoint: Path, number: int) -> Path:
@@ -79,3 +87,47 @@ def _knows(
     sources = {id(source): source for one in best for source in one.sources}
     is_shown = any(source.language == instruction for source in sources.values())
     return is_shown, -len(sources), min(one.semantic for one in best)
+
+
+def join(paths: Sequence[Path], output: Path) -> list[Memory]:
+    """Write the checkpoint of several workplaces, as a whole or not at all; the memories in it.
+
+    Args:
+        paths: Folders of their checkpoints.
+        output: Folder of the new one.
+
+    Raises:
+        OpenSPMError: There is one only, they do not see and act alike, or there is something at `output`.
+    """
+    if len(paths) < 2:
+        raise OpenSPMError(
+            f"got {len(paths)} checkpoints to join, expected at least two: --policy.paths=[A,B]"
+        )
+    if output.exists():
+        raise OpenSPMError(f"{output} exists already; choose another --output_dir, or remove it")
+    _check_alike(paths)
+    beside = output.with_name(f".{output.name}.partial")
+    if beside.exists():  # of a run that was interrupted
+        shutil.rmtree(beside)
+    shutil.copytree(paths[0], beside, ignore=shutil.ignore_patterns(FOLDER))
+    memories = [read_memory(one) for path in paths for one in folders(path)]
+    for i, memory in enumerate(memories):
+        write_memory(memory, folder(beside, i))
+    beside.rename(output)
+    return memories
+
+
+def _check_alike(paths: Sequence[Path]) -> None:
+    """Refuse policies that do not see and act alike. Raises OpenSPMError that names what differs."""
+    first, *others = (PreTrainedConfig.from_pretrained(path) for path in paths)
+    for path, other in zip(paths[1:], others, strict=True):
+        for one, name in ((first, paths[0]), (other, path)):
+            if not isinstance(one, OpenSPMConfig):
+                raise OpenSPMError(f"{name} is a policy of type {one.type}, expected openspm")
+        for name in COMMON:
+            ours, theirs = getattr(first, name), getattr(other, name)
+            if ours != theirs:
+                raise OpenSPMError(
+                    f"{path}: its {name} is {str(theirs)[:300]}, that of {paths[0]} {str(ours)[:300]}; one "
+                    "policy has one, so train both alike"
+                )

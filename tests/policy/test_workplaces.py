@@ -96,7 +96,7 @@ def test_what_cannot_be_joined_is_named_and_nothing_is_written(checkpoint: Path,
     config = json.loads((other / "config.json").read_text())
     (other / "config.json").write_text(json.dumps({**config, "control_hz": 7.0}))
     for paths, words in (
-        ([checkpoint], "names 1 checkpoints, expected at least two"),
+        ([checkpoint], "got 1 checkpoints to join, expected at least two"),
         ([checkpoint, other], "its control_hz is 7.0"),
     ):
         options = [f"--policy.paths=[{','.join(map(str, paths))}]", f"--output_dir={tmp_path / 'joined'}"]

@@ -116,9 +116,10 @@ def consensus(
     """Choose an anchor for every role of one task; none for a contact whose object is not known.
 
     Only objects that the sub-task names are candidates, because nothing looks for others when acting, and
-    each sub-task is a part that can be done alone. A contact belongs to the object that the instruction suggests. If that was found in few demonstrations, the
-    contact is anchored to another one only where the demonstrations show that it goes along with that. If it
-    was found in half of them or more, the others say nothing against it.
+    each sub-task is a part that can be done alone. A contact belongs to the object that the instruction
+    suggests. If that was found in few demonstrations, the contact is anchored to another one only where the
+    demonstrations show that it goes along with that. If it was found in half of them or more, the others say
+    nothing against it.
 
     Args:
         demonstrations: The demonstrations of the task.
@@ -151,8 +152,7 @@ def consensus(
 
 
 def _names(pose: KeyPose, sub_tasks: Sequence[SubTask]) -> tuple[str, ...]:
-    """The objects that a key pose can be relative to: those of its sub-task, or of all where only words are
-    known."""
+    """The objects that a key pose can be relative to: its sub-task's; all, where only words are known."""
     own = [sub_task_of(pose, sub_tasks)]
     named = sub_tasks if sub_tasks[0].words else own
     return tuple(dict.fromkeys(name for sub_task in named for name in sub_task.objects))

@@ -306,10 +306,10 @@ def contact_cues(item: MinedEpisode) -> tuple[ContactCue, ...]:
         sub_task = sub_task_of(pose, item.sub_tasks)
         if pose.phase == "grasp":
             add(sub_task.target, pose, "grasp")
-        elif pose.phase == "release" and sub_task.relation in UPON:
-            # What is opened first was shut in the first frame, so that the release is inside it.
-            if (sub_task.landmark, sub_task.part) not in opened:
-                add(sub_task.landmark, pose, "release")
+        # What is opened first was shut in the first frame, so that the release is inside it.
+        is_seen = sub_task.relation in UPON and (sub_task.landmark, sub_task.part) not in opened
+        if pose.phase == "release" and is_seen:
+            add(sub_task.landmark, pose, "release")
     for before, pose in pairwise(item.key_poses):
         pushing, pushed = (sub_task_of(one, item.sub_tasks) for one in (pose, before))
         if pose.phase == "push" != before.phase and pushing.operation != "close":
