@@ -196,9 +196,19 @@ def made_up(calls: list[Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -
         calls.append((demos, selection))
         return tmp_path / selection / "dataset"
 
+    def policy(
+        _: str, variant: str, root: Path, selection: str, episodes: list[int] | None = None
+    ) -> tuple[Path, float]:
+        calls.append((variant, episodes))
+        return root.with_name(variant), 20.0
+
     monkeypatch.setattr(run, "scene_kind", lambda task: "kitchen" if "stove" in task else "living room")
     monkeypatch.setattr(run, "dataset", recorded)
-    monkeypatch.setattr(run, "policy", lambda _, root, selection: (tmp_path / selection, 20.0))
+    monkeypatch.setattr(run, "scene", lambda task: "SCENE1" if "bowl" in task else "SCENE2")
+    monkeypatch.setattr(run, "demonstrations_of", lambda _: {task: [i] for i, task in enumerate(TASKS)})
+    monkeypatch.setattr(run, "policy", policy)
+    monkeypatch.setattr(run, "discard_unless", lambda *_: None)
+    monkeypatch.setattr(run, "join", lambda paths, _: calls.append([path.name for path in paths]))
     monkeypatch.setattr(run, "found_errors", lambda _, __, rows: [{"plate": (0.03, None)} for _ in rows])
     monkeypatch.setattr(
         run,
@@ -213,13 +223,17 @@ def made_up(calls: list[Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -
     monkeypatch.setattr(accuracy, "tasks", lambda _: TASKS)
 
 
-def test_tasks_whose_cameras_stand_elsewhere_get_a_policy_of_their_own(tmp_path, monkeypatch):
+def test_each_scene_is_learned_by_itself_and_one_policy_is_joined_and_evaluated(tmp_path, monkeypatch):
     calls, written = list[Any](), dict[str, Any]()
     made_up(calls, tmp_path, monkeypatch)
     monkeypatch.setattr(run, "write", lambda name, content, _: written.update({name: content}))
     told = run.main(run.RunConfig("libero_10", tasks="0-2"))
-    assert calls == [(10, "push_the_plate,put_the_bowl"), (10, "turn_on_the_stove")]
-    assert (told["n"], told["mine_and_train_s"], told["position_mm_mean"]) == (150, 40.0, 30.0)
+    assert calls == [
+        (10, "push_the_plate,put_the_bowl"), ("train_SCENE2", [0]), ("train_SCENE1", [1]),
+        (10, "turn_on_the_stove"), ("train", None), ["train_SCENE2", "train_SCENE1", "train"],
+    ]  # fmt: skip
+    assert told["checkpoint"].endswith("joined")
+    assert (told["n"], told["mine_and_train_s"], told["position_mm_mean"]) == (150, 60.0, 30.0)
     assert list(written) == ["libero_10"]
     assert [(one["task"], one["state"], one["off_mm"]) for one in written["libero_10"]["failed"]] == [
         (task, 0, 30.0) for task in TASKS
