@@ -130,8 +130,8 @@ def memory_of(mined: MinedDataset, config: OpenSPMConfig) -> Memory:
     entries = build_entries(mined)
     episodes = len(mined.episodes) + len(mined.skipped)
     logger.info(
-        "mined %d entries from %d episodes (%d skipped); objects: %s",
-        len(entries), episodes, episodes - len(entries), ", ".join(sorted(mined.objects)),
+        "mined %d entries from %d of %d episodes; objects: %s",
+        len(entries), len({entry.source for entry in entries}), episodes, ", ".join(sorted(mined.objects)),
     )  # fmt: skip
     not_learned = list_not_learned(mined)
     for one in not_learned:

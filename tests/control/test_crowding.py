@@ -291,7 +291,36 @@ def test_a_place_where_something_stands_already_is_refused_by_name(beside, is_ta
     mug = np.concatenate([disc() + np.array([0.0, 0.0, z]) for z in np.linspace(0.0, 0.1, 11)])
     points = {"bowl": disc(), "mug": mug}
     context = replace(context, entries=(shown,), points=points, hand_radius_m=RADIUS, symmetries={})
-    found = poses | {"mug": poses["plate"] @ se3.from_yaw([*beside], 0.0)}
+    targets = Plan(shown, poses, home).targets(context)
+    (grasp,), (release,) = (
+        [t for t in targets if t.key_pose.phase == phase] for phase in ("grasp", "release")
+    )
+    T_end = release.T_world_ee @ se3.inverse(grasp.T_world_ee) @ poses["bowl"]
+    found = poses | {"mug": se3.from_yaw(T_end[:3, 3] + [*beside], 0.0)}
     plan, problems = chosen(context, found, home)
     assert problems == (["the plate is taken: the mug stands where the bowl would"] if is_taken else [])
     assert plan.entry is shown
+
+
+def test_a_place_where_another_of_the_kind_stands_is_taken_and_the_next_entry_puts_it_elsewhere():
+    context, poses, home = scene(None, 0.0)
+    shown = context.entries[0]
+    key_poses = tuple(
+        replace(pose, T_obj_ee=se3.from_yaw([0.0, 0.08, 0.0], 0.0) @ pose.T_obj_ee)
+        if pose.anchor.place == "plate"
+        else pose
+        for pose in shown.key_poses
+    )
+    other = replace(shown, key_poses=key_poses, source="aside")
+    context = replace(context, entries=(shown, other))
+    both = [Candidate(one, 1.0 - i / 10, (one,), one.key.sub_tasks) for i, one in enumerate((shown, other))]
+    ranked = context.rank(both, poses, home)
+    targets = Plan(shown, poses, home).targets(context)
+    (grasp,), (release,) = (
+        [t for t in targets if t.key_pose.phase == phase] for phase in ("grasp", "release")
+    )
+    there = {"bowl": (release.T_world_ee @ se3.inverse(grasp.T_world_ee) @ poses["bowl"],)}
+    assert context.choose(ranked, poses, home)[0].entry is shown
+    assert context.choose(ranked, poses, home, there)[0].entry is other
+    plan, problems = context.choose(ranked[:1], poses, home, there)
+    assert (plan.entry, problems) == (shown, ["the plate is taken: another bowl stands there"])

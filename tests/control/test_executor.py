@@ -11,7 +11,7 @@ from lerobot_openspm.control import executor as executing
 from lerobot_openspm.control.executor import Executor
 from lerobot_openspm.control.state import EpisodeState, Status
 from lerobot_openspm.control.strategies import RESIDUAL_M, RESIDUAL_RAD
-from lerobot_openspm.control.transfer import transfer
+from lerobot_openspm.control.transfer import SHUT_M, transfer
 from lerobot_openspm.errors import OpenSPMError
 from lerobot_openspm.geometry import se3
 from lerobot_openspm.types import Hand
@@ -312,3 +312,27 @@ def test_a_correction_that_gets_nowhere_pushes_harder():
     assert len(values) >= 4
     assert values == sorted(values)
     assert values[3] > 2 * values[0] or values[3] == pytest.approx(1.0)
+
+
+def closing():
+    """A drawer of the box that is pushed shut by 15 cm along x; the hand, where it begins to push."""
+    poses = [
+        key_pose("cabinet", hand_pose(-0.1, 0.0, 0.1), "approach", closed=True),
+        key_pose("cabinet", hand_pose(0.05, 0.0, 0.1), "push", closed=True),
+        key_pose("cabinet", hand_pose(0.0, 0.0, 0.2), "retreat", closed=True),
+    ]
+    memory = entry("close the top drawer of the cabinet", poses, {"cabinet": np.eye(4)})
+    return transfer(memory, memory.object_poses, {}, HOME)
+
+
+def test_what_is_closed_is_pushed_until_it_stops_the_hand_a_little_further_than_was_shown():
+    targets = closing()
+    assert_allclose(targets[1].T_world_ee[:3, 3], [0.05 + SHUT_M, 0.0, 0.1], atol=1e-9)
+    assert [target.until_stopped for target in targets[:3]] == [False, True, False]
+    executor = Executor("closed_loop_trc", ROBOT, EpisodeState())
+    executor.begin(targets, Hand(HOME, OPEN_WIDTH))
+    shut = 0.05 - 0.012  # short of where it was shown
+    left, retries, _ = run(executor, World(held=0.0, stuck=lambda T: bool(T[0, 3] > shut and T[2, 3] < 0.12)))
+    assert executor.state.status is Status.DONE
+    assert retries == 0
+    assert left[1][0, 3] > shut - 0.01

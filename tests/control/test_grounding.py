@@ -358,3 +358,19 @@ def test_an_episode_says_that_the_words_do_not_tell_like_objects_apart():
     one.take_in(look, Detections(estimates, {}), HAND)
     assert one.state.status is Status.OBJECT_NOT_FOUND
     assert one.state.refusal.startswith("cannot tell which bowl is meant")
+
+
+def test_of_several_that_are_asked_for_each_is_taken_once():
+    grounding = Grounding(several=frozenset({"bowl"}))
+    first = look(grounding, seen(NEAR, FAR))
+    assert (first.status, first.others) == ("found", ())
+    np.testing.assert_array_equal(first.T_world_obj, NEAR)
+    np.testing.assert_array_equal(look(grounding, seen(FAR, NEAR)).T_world_obj, NEAR)
+    put = at(-0.3, 0.0)
+    grounding.next_of("bowl", put)
+    np.testing.assert_array_equal(look(grounding, seen(put, FAR)).T_world_obj, FAR)
+    np.testing.assert_array_equal(grounding.not_meant["bowl"], [put])
+    # The last one is done too: there is no other.
+    grounding.next_of("bowl", at(-0.3, 0.2))
+    assert look(grounding, seen(at(-0.3, 0.2), put)).status == "not_found"
+    assert grounding.elsewhere == {"bowl": "has been seen to already"}

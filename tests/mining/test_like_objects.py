@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.testing import assert_array_equal
 from tests.memory.builders import robot
-from tests.mining.episodes import pick_and_place
+from tests.mining.episodes import pick_and_place, push
 from tests.perception.builders import model, patch_model
 
 from lerobot_openspm.geometry import se3
@@ -104,6 +104,36 @@ def test_what_is_put_beside_a_thing_does_not_touch_it(relation, touched):
     episode = pick_and_place()[0].episode(0, task)
     item = MinedEpisode(episode, tuple(find_key_poses(episode, robot())), parse_instruction(task))
     assert [cue.name for cue in contact_cues(item)] == touched
+
+
+@pytest.mark.parametrize(
+    ("task", "touched"),
+    [
+        # It was shut at first, so that the hand lets go inside of it.
+        ("open the drawer of the cabinet and put the bowl inside", ["cabinet", "bowl"]),
+        ("put the bowl in the drawer of the cabinet", ["bowl", "cabinet"]),
+    ],
+)
+def test_a_drawer_is_touched_where_it_stood_open_at_first(task, touched):
+    episode = pick_and_place()[0].episode(0, task)
+    sub_tasks = parse_instruction(task)
+    own = find_key_poses(episode, robot())
+    key_poses = [replace(pose, contact=pose.contact + 2 * i) for i in range(len(sub_tasks)) for pose in own]
+    item = MinedEpisode(episode, tuple(key_poses), sub_tasks)
+    kinds = [(cue.name, cue.kind) for cue in contact_cues(item)]
+    assert [name for name, _ in kinds] == touched
+    assert (("cabinet", "release") in kinds) == (len(sub_tasks) == 1)
+
+
+@pytest.mark.parametrize(("task", "end"), [("close the drawer of the cabinet", 1), ("push the cabinet", 0)])
+def test_what_is_closed_is_touched_where_it_is_shut(task, end):
+    drawer, at = push()
+    episode = drawer.episode(0, task)
+    item = MinedEpisode(episode, tuple(find_key_poses(episode, robot())), parse_instruction(task))
+    (cue,) = contact_cues(item)
+    frame = at["push"] if end else at["approach"]
+    assert (cue.name, cue.kind) == ("cabinet", "contact")
+    assert np.linalg.norm(cue.point_world - episode.T_world_ee[frame - 1][:3, 3]) < 0.02
 
 
 @pytest.mark.parametrize(

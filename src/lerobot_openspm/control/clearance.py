@@ -20,7 +20,7 @@ from scipy.spatial import KDTree  # pyright: ignore[reportMissingTypeStubs]
 from lerobot_openspm.control.transfer import Target
 from lerobot_openspm.geometry import se3
 from lerobot_openspm.geometry.se3 import Array
-from lerobot_openspm.memory.entry import MemoryEntry, MemoryKeyPose
+from lerobot_openspm.memory.entry import MAX_FALL_M, MemoryEntry, MemoryKeyPose
 
 # Phases that cross free space.
 CROSSING = ("approach", "pre-place")
@@ -49,6 +49,10 @@ PARTS = ((0.45, 1.35, -0.16, -0.05), (0.2, 0.75, -0.05, -0.01))
 # Fewer points of an object than this inside the hand are noise, and what is this near to what is grasped,
 # metres, is the same thing by another name.
 NOISE_POINTS, SAME_THING_M = 5, 0.02
+# A place is taken where the middle of something else is at most this far beside it, metres.
+TAKEN_M = 0.03
+# Two things of a kind cannot stand closer together than this, as far as is known, metres.
+ALIKE_M = 0.05
 
 
 @dataclass(frozen=True)
@@ -222,6 +226,54 @@ def crowding(
                 found[name] = found.get(name, 0) + inside
         standing.pass_by(pose, T, entry)
     return {name: found[name] for name in points if found.get(name, 0) >= NOISE_POINTS}
+
+
+def taken(
+    targets: Sequence[Target],
+    now: Mapping[str, Array],
+    points: Mapping[str, Array],
+    alike: Mapping[str, Sequence[Array]] | None = None,
+) -> list[str]:
+    """Places of some key poses where something else stands already, in words.
+
+    Args:
+        targets: The key poses in the scene.
+        now: Poses ``T_world_obj`` ``(4, 4)`` of the objects that were found.
+        points: Points ``(n, 3)`` in the world of those whose shape is known, by name.
+        alike: By name, poses ``T_world_obj`` ``(4, 4)`` of others of a kind.
+    """
+    needed = {name for target in targets for name in target.key_pose.anchor.objects}
+    own = [points[name].mean(0) for name in needed & points.keys()]
+    others = {
+        name: points[name]
+        for name in sorted(points.keys() - needed)
+        if all(np.linalg.norm(points[name].mean(0) - one) > SAME_THING_M for one in own)
+    }
+    found: list[str] = []
+    grasp: Target | None = None
+    for target in targets:
+        phase, place = target.key_pose.phase, target.key_pose.anchor.place
+        grasp = target if phase == "grasp" else grasp
+        load = "" if grasp is None else grasp.key_pose.anchor.place
+        if phase != "release" or grasp is None or load == place or load not in now:
+            continue
+        T_moved = target.T_world_ee @ se3.inverse(grasp.T_world_ee)
+        T_end = T_moved @ now[load]
+        for T in (alike or {}).get(load, ()):
+            if _is_at(T_end[:3, 3], T[:3, 3], ALIKE_M):
+                found.append(f"the {place} is taken: another {load} stands there")
+        if load in points:
+            end = se3.apply(T_moved, points[load]).mean(0)
+            for name, other in others.items():
+                if _is_at(end, other.mean(0), TAKEN_M):
+                    found.append(f"the {place} is taken: the {name} stands where the {load} would")
+    return found
+
+
+def _is_at(point: Array, other: Array, metres: float) -> bool:
+    """Whether a point ``(3,)`` is so near to another one, seen from above, and about as high."""
+    off = point - other
+    return bool(np.hypot(*off[:2]) <= metres and abs(off[2]) <= MAX_FALL_M)
 
 
 def _inside(points: Array, radius: float) -> NDArray[np.bool_]:

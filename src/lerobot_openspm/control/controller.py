@@ -20,7 +20,7 @@ from lerobot_openspm.control.state import LOOKS_AT_OUTCOME, EpisodeState, Status
 from lerobot_openspm.control.transfer import Target, rise
 from lerobot_openspm.errors import InstructionError
 from lerobot_openspm.geometry.se3 import Array
-from lerobot_openspm.memory.compose import plan_parts
+from lerobot_openspm.memory.compose import Candidate, plan_parts
 from lerobot_openspm.memory.entry import Outcome
 from lerobot_openspm.memory.retrieval import read_instruction
 from lerobot_openspm.perception.tracking.tracker import TrackStatus
@@ -130,10 +130,14 @@ class EpisodeController:
             except InstructionError as error:
                 return self._refuse(error)
             state.T_start = hand.T_world_ee
-            scene.ground(state.parts[0])
+            scene.ground(state.parts[0], self._ahead())
         ahead = [one.entry for part in state.parts[state.part :] for one in part]
         names = dict.fromkeys([*context.objects_of_interest(ahead), *scene.grounding.landmarks])
         return scene.look([name for name in names if name not in scene.altered], hand)
+
+    def _ahead(self) -> list[Candidate]:
+        """What the parts after the present one can be carried out by."""
+        return [one for part in self.state.parts[self.state.part + 1 :] for one in part]
 
     def _plan(self, hand: Hand) -> None:
         """Plan the present part, once its objects are found."""
@@ -343,6 +347,6 @@ class EpisodeController:
             return None
         self.executor.stop(Status.WAITING)
         state.begin_next_part()
-        self.scene.ground(state.parts[state.part])
+        self.scene.ground(state.parts[state.part], self._ahead(), hand)
         logger.info("%r: part %d of %d", self.instruction, state.part + 1, len(state.parts))
         return self._look_for_plan(hand)

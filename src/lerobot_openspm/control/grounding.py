@@ -79,6 +79,8 @@ class Grounding:
             origin where it is not named.
         elsewhere: By name, in words, how the only one that the last look brought is not where it should be.
         not_meant: By name, poses ``T_world_obj`` ``(4, 4)`` of the others of its kind.
+        several: Names of which the instruction is about several: any of them will do, each once.
+        done: By such a name, poses ``T_world_obj`` ``(4, 4)`` of those that were seen to already.
     """
 
     said: Mapping[str, Reference] = field(default_factory=dict[str, Reference])
@@ -89,6 +91,8 @@ class Grounding:
     feet: Mapping[str, Array] = field(default_factory=dict[str, Array])
     elsewhere: dict[str, str] = field(default_factory=dict[str, str])
     not_meant: dict[str, tuple[Array, ...]] = field(default_factory=dict[str, tuple[Array, ...]])
+    several: frozenset[str] = frozenset()
+    done: dict[str, list[Array]] = field(default_factory=dict[str, list[Array]])
     _told: set[str] = field(default_factory=set[str])
 
     @property
@@ -114,6 +118,11 @@ class Grounding:
         self._told -= changed
         return changed
 
+    def next_of(self, name: str, T_world_obj: Array) -> None:
+        """One of several has been seen to and is where it was left ``(4, 4)``; another one is meant now."""
+        self.done.setdefault(name, []).append(T_world_obj)
+        self.not_meant.pop(name, None)
+
     def sort_out(
         self,
         estimates: Mapping[str, PoseEstimate],
@@ -138,6 +147,8 @@ class Grounding:
     ) -> PoseEstimate:
         if name in self.not_meant:
             return self._unless_another(name, estimate)
+        if name in self.several:
+            return self._any(name, estimate)
         if estimate.status == "not_found" or not estimate.others:
             return self._unless_elsewhere(name, estimate, known, still)
         candidates = (estimate.T_world_obj, *estimate.others)
@@ -149,6 +160,19 @@ class Grounding:
             return replace(estimate, status="ambiguous")
         self.not_meant[name] = candidates[:index] + candidates[index + 1 :]
         return replace(estimate, status="found", T_world_obj=candidates[index], others=())
+
+    def _any(self, name: str, estimate: PoseEstimate) -> PoseEstimate:
+        """The first of several that was not seen to already, whose place tells it from now on."""
+        if estimate.status == "not_found":
+            return estimate
+        done = self.done.get(name, [])
+        places = (estimate.T_world_obj, *estimate.others)
+        left = [T for T in places if not any(_is_same_place(T, other) for other in done)]
+        if not left:
+            self.elsewhere[name] = "has been seen to already"
+            return replace(estimate, status="not_found")
+        self.not_meant[name] = (*done, *left[1:])
+        return replace(estimate, status="found", T_world_obj=left[0], others=())
 
     def _told_from(
         self, name: str, candidates: Sequence[Array], known: Mapping[str, Array], still: Mapping[str, Array]
@@ -206,5 +230,8 @@ class Grounding:
         return {name: self._foot(name, T) for name, T in object_poses.items()}
 
     def _is_another(self, name: str, T_world_obj: Array) -> bool:
-        apart = [float(np.linalg.norm(T[:2, 3] - T_world_obj[:2, 3])) for T in self.not_meant[name]]
-        return min(apart) < SAME_PLACE_M
+        return any(_is_same_place(T, T_world_obj) for T in self.not_meant[name])
+
+
+def _is_same_place(T: Array, other: Array) -> bool:
+    return float(np.linalg.norm(T[:2, 3] - other[:2, 3])) < SAME_PLACE_M

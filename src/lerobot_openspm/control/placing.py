@@ -9,14 +9,9 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-import numpy as np
-
 from lerobot_openspm.geometry import se3
 from lerobot_openspm.geometry.se3 import Array
-from lerobot_openspm.memory.entry import ARRIVING, MAX_FALL_M, WORLD, MemoryEntry, MemoryKeyPose, Outcome
-
-# A place is taken where the middle of something else is at most this far beside it, metres.
-TAKEN_M = 0.03
+from lerobot_openspm.memory.entry import ARRIVING, WORLD, MemoryEntry, MemoryKeyPose, Outcome
 
 
 def carried_outcomes(entry: MemoryEntry) -> dict[int, Outcome]:
@@ -50,25 +45,3 @@ def placing_position(
     if pose.anchor.axes == outcome.target:
         beside = now[outcome.target][:3, :3] @ shown[outcome.target][:3, :3].T @ beside
     return se3.apply(outcome.anchor.frame(now), outcome.shown[None])[0] + beside
-
-
-def taken(entry: MemoryEntry, now: Mapping[str, Array], points: Mapping[str, Array]) -> list[str]:
-    """Places of an entry where something else stands already, in words.
-
-    Args:
-        entry: What is to be executed.
-        now: Poses ``T_world_obj`` ``(4, 4)`` of the objects that were found.
-        points: Points ``(n, 3)`` in the world of those whose shape is known, by name.
-    """
-    found: list[str] = []
-    for outcome in carried_outcomes(entry).values():
-        if any(name not in now for name in outcome.objects):
-            continue
-        place = outcome.place(now)
-        for name in sorted(points.keys() - set(entry.objects)):
-            beside, above = (points[name].mean(0) - place)[:2], points[name][:, 2].min() - place[2]
-            if np.hypot(*beside) <= TAKEN_M and abs(above) <= MAX_FALL_M:
-                found.append(
-                    f"the {outcome.anchor.place} is taken: the {name} stands where the {outcome.target} would"
-                )
-    return found

@@ -9,7 +9,7 @@ from functools import cached_property
 
 import numpy as np
 
-from lerobot_openspm.control.clearance import crowding, lifted
+from lerobot_openspm.control.clearance import crowding, lifted, taken
 from lerobot_openspm.control.feasibility import (
     TransferLimits,
     find_stance,
@@ -17,7 +17,6 @@ from lerobot_openspm.control.feasibility import (
 )
 from lerobot_openspm.control.finger_room import finger_room
 from lerobot_openspm.control.joint_room import ways_out
-from lerobot_openspm.control.placing import taken
 from lerobot_openspm.control.plan import Plan
 from lerobot_openspm.control.pushes import pushed_by_landmark
 from lerobot_openspm.control.transfer import as_shown, half_turned
@@ -167,6 +166,7 @@ class PlanningContext:
             return first, []
         first = replace(first, stance=find_stance(self.robot, T_world_ee))
         points, crowded = self._points(first), list[tuple[Plan, dict[str, int]]]()
+        occupied: tuple[Plan, list[str]] | None = None
         sought = set(self.points) if len(self.points) <= MOST_IN_A_SCENE else set[str]()
         if unseen := sorted(sought - set(points)):
             logger.info(
@@ -177,6 +177,10 @@ class PlanningContext:
                 continue
             if not self._mean_the_same(entry, first.entry):
                 continue
+            targets = replace(first, entry=entry).targets(self)
+            if problems := taken(targets, object_poses, points, not_meant):
+                occupied = occupied or (replace(first, entry=entry), problems)
+                continue
             for is_half_turned in (False, True):
                 plan = replace(first, entry=entry, is_half_turned=is_half_turned)
                 found = self._clearest(plan.turns(self), points)
@@ -184,13 +188,11 @@ class PlanningContext:
                     return found[0], []
                 crowded += [found] if found is not None else []
         if not crowded:
-            return first.followed(self)
+            return occupied or first.followed(self)
         best = _clearest_first(crowded)[0]
         plan, inside = next(iter(self._beside(*best, points)), best)
         if sum(inside.values()) <= FEW_POINTS:
             return plan, []
-        if problems := taken(plan.entry, plan.object_poses, points):
-            return plan, problems
         logger.warning("%r: hand or load may touch the %s where it takes hold or lets go",
                        plan.entry.language, " and the ".join(inside))  # fmt: skip
         return plan, []

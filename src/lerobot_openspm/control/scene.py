@@ -79,8 +79,30 @@ class SceneState:
         self._step += 1
         self.tracker.predict(self._context.step_s)
 
-    def ground(self, candidates: Sequence[Candidate]) -> None:
-        """Take in which of several like objects a part of the instruction is about."""
+    def ground(
+        self, candidates: Sequence[Candidate], ahead: Sequence[Candidate] = (), hand: Hand | None = None
+    ) -> None:
+        """Take in which of several like objects a part of the instruction is about.
+
+        Args:
+            candidates: What the part can be carried out by.
+            ahead: What the parts after it can be.
+            hand: Where the hand is, at the end of the part before; None where there is none.
+        """
+        targets = {one.entry.key.sub_tasks[0].target for one in candidates}
+        if hand is not None:
+            poses = self.tracker.poses(hand.T_world_ee)
+            for name in targets & self.grounding.several & poses.keys():
+                self.grounding.next_of(name, poses[name])
+                self.tracker.forget(frozenset({name}))
+        alike = {
+            known.target
+            for one in candidates
+            for other in ahead
+            for asked, known in zip(one.asked, one.entry.key.sub_tasks, strict=False)
+            if asked in other.asked and not asked.words
+        }
+        self.grounding.several |= alike
         meant = self._context.object_meant
         said = {k: where for one in candidates for k, where in references(one, meant).items()}
         known = set(self._context.yaw_periods) - set(self._context.surfaces)
@@ -92,7 +114,7 @@ class SceneState:
         """A look for some objects, now."""
         expected = self.tracker.poses(hand.T_world_ee)
         held = self.tracker.held & frozenset(names)
-        told_apart = frozenset(self.grounding.said) & frozenset(names)
+        told_apart = (frozenset(self.grounding.said) | self.grounding.several) & frozenset(names)
         time_s = self._step * self._context.step_s
         displaced = frozenset(self.tracker.displaced)
         is_unknown = not self.tracker.held and not expected.keys() >= frozenset(names)

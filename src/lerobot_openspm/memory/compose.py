@@ -11,7 +11,6 @@ from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
-from itertools import pairwise
 
 from lerobot_openspm.errors import InstructionError
 from lerobot_openspm.language.descriptions import phrase
@@ -65,31 +64,28 @@ def parts(entry: MemoryEntry) -> tuple[MemoryEntry, ...]:
     sub_tasks = entry.key.sub_tasks
     if len(sub_tasks) == 1 or sub_tasks[0].words:
         return (entry,)  # no words say what each part of an instruction is that cannot be read
-    found = (_part(entry, i, i + 1) for i in range(len(sub_tasks)))
+    found = (_part(entry, i) for i in range(len(sub_tasks)))
     return tuple(part for part in found if part is not None)
 
 
-def _part(entry: MemoryEntry, first: int, end: int) -> MemoryEntry | None:
-    """The sub-tasks of an entry from one to before another; None where they are no part."""
-    sub_tasks = entry.key.sub_tasks[first:end]
-    named = {name for one in sub_tasks for name in one.objects}
+def _part(entry: MemoryEntry, number: int) -> MemoryEntry | None:
+    sub_task = entry.key.sub_tasks[number]
     kept = tuple(
-        replace(pose, sub_task=pose.sub_task - first)
+        replace(pose, sub_task=0)
         for pose in entry.key_poses
-        if first <= pose.sub_task < end
-        and (set(pose.anchor.objects) <= named or pose.phase in CONTACT_PHASES)
+        if pose.sub_task == number
+        and (set(pose.anchor.objects) <= set(sub_task.objects) or pose.phase in CONTACT_PHASES)
     )
     contacts = [pose for pose in kept if pose.phase in CONTACT_PHASES]
-    if not contacts or any(not set(pose.anchor.objects) <= named for pose in contacts):
+    if not contacts or any(not set(pose.anchor.objects) <= set(sub_task.objects) for pose in contacts):
         return None
-    own = (one for one in entry.outcomes if first <= one.sub_task < end)
     return replace(
         entry,
-        key=RetrievalKey(sub_tasks, tuple(pose.phase for pose in kept)),
-        language=" and ".join(map(phrase, sub_tasks)),
+        key=RetrievalKey((sub_task,), tuple(pose.phase for pose in kept)),
+        language=phrase(sub_task),
         key_poses=kept,
-        object_poses={name: T for name, T in entry.object_poses.items() if name in named},
-        outcomes=tuple(replace(one, sub_task=one.sub_task - first) for one in own),
+        object_poses={name: T for name, T in entry.object_poses.items() if name in sub_task.objects},
+        outcomes=tuple(replace(one, sub_task=0) for one in entry.outcomes if one.sub_task == number),
     )
 
 
@@ -102,9 +98,8 @@ def plan_parts(
 ) -> tuple[tuple[Candidate, ...], ...]:
     """What an instruction can be carried out by: for each part, in order, the entries that are about it.
 
-    An entry that was demonstrated as a whole wins. Else the parts are the longest runs of sub-tasks that were
-    demonstrated together, a single one also as a part of something else. Either is cut where something was
-    put, because that can be seen, and mended before the rest is done.
+    An entry that was demonstrated as a whole wins; then it is one part. Else the parts are the longest runs
+    of sub-tasks that were demonstrated together, a single one also as a part of something else.
 
     Args:
         instruction: What is asked.
@@ -136,27 +131,9 @@ def plan_parts(
         needed = _condition(found, done, names.lexicon)
         if needed is not None:
             chain.append(_longest_run((needed,), phrase(needed), entries, names, looks))
-        chain += _cut(found)
+        chain.append(found)
         left = left[len(found[0].asked) :]
     return tuple(chain)
-
-
-def _cut(found: tuple[Candidate, ...]) -> list[tuple[Candidate, ...]]:
-    """Candidates for a run of sub-tasks, cut after each of which the outcome is known in all of them."""
-    count = len(found[0].asked)
-    seen = (
-        {one.sub_task + 1 for one in candidate.entry.outcomes if one.sub_task + 1 < count}
-        for candidate in found
-    )
-    bounds = [0, *sorted(set[int].intersection(*seen)), count]
-    runs: list[tuple[Candidate, ...]] = []
-    for first, end in pairwise(bounds):
-        cut = [(one, _part(one.entry, first, end)) for one in found]
-        run = [replace(one, entry=part, asked=one.asked[first:end]) for one, part in cut if part is not None]
-        if len(run) < len(found):
-            return [found]
-        runs.append(tuple(run))
-    return runs if len(runs) > 1 else [found]
 
 
 def _condition(found: Sequence[Candidate], done: Sequence[SubTask], lexicon: Lexicon) -> SubTask | None:

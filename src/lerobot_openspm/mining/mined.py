@@ -83,8 +83,9 @@ class MinedDataset(MinedKeyPoses):
     Attributes:
         cameras: The calibration of the images.
         objects: Models of the objects by name.
-        object_poses: Per episode, ``T_world_obj`` ``(4, 4)`` of the objects found in its first frame.
-        tasks: The episodes by instruction, with their anchors.
+        object_poses: Per demonstration, of which an episode may be several, ``T_world_obj`` ``(4, 4)`` of the
+            objects found in its first frame.
+        tasks: The demonstrations by instruction, with their anchors.
         unlearned: By name, why objects that the hand touched could not be learned.
         surfaces: Names of what things stand on everywhere; nobody learns it.
         simulator_objects: Objects in the order of the simulator's pose vector (oracle ablation only).

@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from itertools import pairwise
 from typing import Literal
@@ -22,6 +22,7 @@ from lerobot_openspm.mining.dataset import Demonstrations
 from lerobot_openspm.mining.key_poses import KeyPose
 from lerobot_openspm.mining.mined import MinedEpisode
 from lerobot_openspm.mining.outcomes import carried_to, pushed_to
+from lerobot_openspm.mining.parts import divided
 from lerobot_openspm.perception.objects.base import KnownObject, ShapeBackend
 from lerobot_openspm.perception.objects.kinds import learn_objects
 from lerobot_openspm.perception.oracle import name_simulator_poses
@@ -111,16 +112,18 @@ def moved_from(item: MinedEpisode) -> dict[str, int]:
 
 @dataclass(frozen=True)
 class FoundObjects:
-    """Object models by name, and poses ``T_world_obj`` ``(4, 4)`` of the objects found in each episode.
+    """Object models by name, and poses ``T_world_obj`` ``(4, 4)`` of the objects that each part is about.
 
     Attributes:
         models: The models.
-        poses: Per episode, the poses in its first frame.
-        ends: Per episode, the final poses of the objects that it moved.
+        parts: The parts of all episodes, in their order, see :func:`divided`.
+        poses: Per part, the poses in the first frame of its episode.
+        ends: Per part, the final poses of the objects that it moved.
         unlearned: By name, why objects that the hand touched could not be learned.
     """
 
     models: dict[str, KnownObject]
+    parts: list[MinedEpisode]
     poses: list[dict[str, Array]]
     ends: list[dict[str, Array]]
     unlearned: dict[str, str]
@@ -135,7 +138,7 @@ def find_objects(
     shape: Shape = "demonstrations",
     shapes: ShapeBackend | None = None,
 ) -> FoundObjects:
-    """Learn the objects that are not known yet, and find those that each episode's instruction names.
+    """Learn the objects that are not known yet, and find those that each part of an episode is about.
 
     Args:
         scenes: One per episode.
@@ -155,15 +158,21 @@ def find_objects(
         told_apart |= {one.landmark for one in sub_tasks if one.landmark_where is not None}
         learned, unlearned = learn_objects(scenes, rng, known.values(), segmenter, shape, shapes, told_apart)
         models |= learned
+    # What several parts call the same is for each what the hand touched in it.
+    whole = zip(scenes, mined, strict=True)
+    divisions = [
+        (replace(scene, cues=contact_cues(part)), part) for scene, item in whole for part in divided(item)
+    ]
     found: list[dict[str, Array]] = []
-    for scene, item in tqdm(zip(scenes, mined, strict=True), "Finding objects", len(scenes), unit="episode"):
+    for scene, item in tqdm(divisions, "Finding objects", unit="demonstration"):
         wanted = dict.fromkeys(name for sub_task in item.sub_tasks for name in sub_task.objects)
         sought = {name: models[name] for name in wanted if name in models}
         estimates = detect_touched(scene, sought, segmenter)
         places = {name: place_touched(models[name], one, scene.cues) for name, one in estimates.items()}
         found.append({name: T for name, T in places.items() if T is not None})
-    ends = _ends(scenes, mined, found, models, segmenter)
-    return FoundObjects(models, found, ends, unlearned)
+    own_scenes, parts = [scene for scene, _ in divisions], [part for _, part in divisions]
+    ends = _ends(own_scenes, parts, found, models, segmenter)
+    return FoundObjects(models, parts, found, ends, unlearned)
 
 
 def detect_touched(

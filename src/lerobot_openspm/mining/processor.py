@@ -5,6 +5,7 @@
     dataset.py                 columns -> episodes (signals.py), and the robot that they show
     key_poses.py               episode -> key poses, by gripper.py and corners.py
     phase_labels/              optionally, what a judge says about their phases
+    parts.py                   a demonstration of several things -> one for each
     objects.py                 where the hand touched what -> object models, and object poses per episode
     anchors, axes, outcomes    the demonstrations of a task compared with each other
 
@@ -144,13 +145,13 @@ class DatasetProcessor:
         poses, ends, simulator_objects = objects.poses, objects.ends, ()
         if self._options.is_oracle:
             poses, ends, simulator_objects = simulator_poses(
-                self.demonstrations, found.episodes, objects.models
+                self.demonstrations, objects.parts, objects.models
             )
         yaw_periods = {name: model.yaw_period for name, model in objects.models.items()}
         surfaces = self._options.lexicon.surfaces
         known = {} if self._options.is_oracle else objects.models
         symmetries = {name: one for name, model in known.items() if (one := model.symmetry) is not None}
-        tasks = compare(found.episodes, poses, ends, yaw_periods, surfaces, symmetries)
+        tasks = compare(objects.parts, poses, ends, yaw_periods, surfaces, symmetries)
         return MinedDataset(
             **vars(found), cameras=cameras, objects=objects.models, object_poses=tuple(poses), tasks=tasks,
             unlearned=objects.unlearned, surfaces=surfaces, simulator_objects=simulator_objects,
