@@ -259,10 +259,9 @@ def taken(
             continue
         T_moved = target.T_world_ee @ se3.inverse(grasp.T_world_ee)
         T_end = T_moved @ now[load]
-        for T in (alike or {}).get(load, ()):
-            if _is_at(T_end[:3, 3], T[:3, 3], ALIKE_M):
-                found.append(f"the {place} is taken: another {load} stands there")
-        if load in points:
+        if any(_is_at(T_end[:3, 3], T[:3, 3], ALIKE_M) for T in (alike or {}).get(load, ())):
+            found.append(f"the {place} is taken: another {load} stands there")
+        elif load in points:
             end = se3.apply(T_moved, points[load]).mean(0)
             for name, other in others.items():
                 if _is_at(end, other.mean(0), TAKEN_M):

@@ -166,20 +166,16 @@ class PlanningContext:
             return first, []
         first = replace(first, stance=find_stance(self.robot, T_world_ee))
         points, crowded = self._points(first), list[tuple[Plan, dict[str, int]]]()
-        occupied: tuple[Plan, list[str]] | None = None
         sought = set(self.points) if len(self.points) <= MOST_IN_A_SCENE else set[str]()
         if unseen := sorted(sought - set(points)):
             logger.info(
                 "%r: does not keep clear of what is not found: %s", first.entry.language, ", ".join(unseen)
             )
-        for entry in (one.entry for one in ranked[:MAX_TRIED]):
+        tried, occupied = self._tried(first, ranked, points)
+        for entry in tried:
             if any(name not in object_poses for name in entry.objects):
                 continue
             if not self._mean_the_same(entry, first.entry):
-                continue
-            targets = replace(first, entry=entry).targets(self)
-            if problems := taken(targets, object_poses, points, not_meant):
-                occupied = occupied or (replace(first, entry=entry), problems)
                 continue
             for is_half_turned in (False, True):
                 plan = replace(first, entry=entry, is_half_turned=is_half_turned)
@@ -188,7 +184,7 @@ class PlanningContext:
                     return found[0], []
                 crowded += [found] if found is not None else []
         if not crowded:
-            return occupied or first.followed(self)
+            return (first, occupied) if occupied else first.followed(self)
         best = _clearest_first(crowded)[0]
         plan, inside = next(iter(self._beside(*best, points)), best)
         if sum(inside.values()) <= FEW_POINTS:
@@ -196,6 +192,22 @@ class PlanningContext:
         logger.warning("%r: hand or load may touch the %s where it takes hold or lets go",
                        plan.entry.language, " and the ".join(inside))  # fmt: skip
         return plan, []
+
+    def _tried(
+        self, first: Plan, ranked: Sequence[Scored], points: Mapping[str, Array]
+    ) -> tuple[list[MemoryEntry], list[str]]:
+        """The first entries of which no place is taken, and what stands at the places of those before."""
+        tried, occupied = list[MemoryEntry](), list[str]()
+        for entry in (one.entry for one in ranked):
+            if len(tried) == MAX_TRIED:
+                break
+            is_found = all(name in first.object_poses for name in entry.objects)
+            targets = replace(first, entry=entry).targets(self) if is_found else ()
+            if problems := taken(targets, first.object_poses, points, first.not_meant):
+                occupied = occupied or problems
+            else:
+                tried.append(entry)
+        return tried, occupied
 
     def _mean_the_same(self, entry: MemoryEntry, other: MemoryEntry) -> bool:
         return means_the_same(entry.key.sub_tasks, other.key.sub_tasks, self.names.lexicon)
