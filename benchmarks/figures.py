@@ -100,6 +100,8 @@ CALIBRATION = (
 NOISE = (*ALONG, *_benchmarks("measurement_noise"))
 # As `make libero` types it; libero_goal is not named.
 WHOLE_SUITE = "--demos=10 --states=50 --tasks=0-9"
+# One policy for all four, from fewer states.
+ALL_SUITES = "--demos=10 --states=10 --tasks=0-9"
 OTHER_SUITES = ("libero_spatial", "libero_object", "libero_10")
 # 50 scenes of each of ten tasks, of libero_goal 10. With other kinds than all, the same scenes.
 PLACES = {
@@ -185,6 +187,7 @@ FIGURES: dict[str, Figure] = {
         suite: _with(_libero("run", *ERRORS, options=f"--suite={suite} {WHOLE_SUITE}"), ARM)
         for suite in OTHER_SUITES
     },
+    "libero_all": _with(_libero("run", *ERRORS, options=f"--suite=all {ALL_SUITES}"), ARM),
     **{
         suite: _figure(
             "libero_pro",

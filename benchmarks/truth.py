@@ -17,6 +17,7 @@ import numpy as np
 from benchmarks.episodes import load
 from lerobot_openspm.geometry import se3
 from lerobot_openspm.geometry.se3 import Array
+from lerobot_openspm.memory.entry import episode_of
 from lerobot_openspm.memory.memory import Memory
 from lerobot_openspm.mining.dataset import Demonstrations, dataset_metadata
 from lerobot_openspm.perception.objects.base import KnownObject
@@ -55,7 +56,7 @@ def _offset(memory: Memory, name: str, demonstrations: Demonstrations) -> Array:
     period, found = memory.objects[name].yaw_period, []
     for entry in memory.entries:
         if name in entry.object_poses:
-            episode = demonstrations.episodes([int(entry.source.rsplit("#", 1)[1])])[0]
+            episode = demonstrations.episodes([episode_of(entry.source)])[0]
             poses = demonstrations.simulator_poses(episode, 0)
             truth = upright(name_simulator_poses(poses, [name], memory.objects)[name])
             equivalents = [

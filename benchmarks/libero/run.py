@@ -69,12 +69,14 @@ class Part:
     """What was made of the tasks of one scene.
 
     Attributes:
+        suite: The suite that they are of.
         tasks: The tasks.
         root: The dataset that their demonstrations are in.
         checkpoint: The policy of these tasks alone.
         seconds: That mining and training took; None if it was interrupted.
     """
 
+    suite: str
     tasks: Sequence[str]
     root: Path
     checkpoint: Path
@@ -126,9 +128,11 @@ def _parts(suite: str, demos: int, selected: Sequence[str]) -> list[Part]:
         scenes = _grouped(alike, scene)
         for own in scenes:
             logger.info("mining and training: %s", ", ".join(own))
-            some = {} if len(scenes) == 1 else {"episodes": [n for task in own for n in recorded[task]]}
-            variant = "train" if len(scenes) == 1 else f"train_{scene(own[0])}"
-            parts.append(Part(own, root, *policy(LIBERO, variant, root=root, selection=selection, **some)))
+            is_all = len(scenes) == 1
+            variant = "train" if is_all else f"train_{scene(own[0])}"
+            episodes = None if is_all else [n for task in own for n in recorded[task]]
+            made = policy(LIBERO, variant, root=root, selection=selection, episodes=episodes)
+            parts.append(Part(suite, own, root, *made))
     return parts
 
 
@@ -153,11 +157,11 @@ def main(config: RunConfig) -> dict[str, Any]:
     timing = _timing(parts)
     if config.suite != ALL:
         return {**told[config.suite], **timing, "checkpoint": str(checkpoint)}
-    if config.demos == DEMOS and config.selected() == {suite: list(tasks(suite)) for suite in OBJECTS}:
-        about = {"seed": SEED, "demonstrations": DEMOS, "states": config.states}
+    if config.demos == DEMOS and all(some == list(tasks(suite)) for suite, some in config.selected().items()):
+        about = {"seed": SEED, "demonstrations": DEMOS, "n": sum(one["n"] for one in told.values())}
         kept = ("success", "n", "interval", "mean_steps")
         rates = {suite: {key: one[key] for key in kept} for suite, one in told.items()}
-        write("libero_all", {**about, **timing, "suites": rates}, THREADS)
+        write("libero_all", {**about, **timing, "per_suite": rates}, THREADS)
     return {**told, **timing, "checkpoint": str(checkpoint)}
 
 
@@ -170,7 +174,7 @@ def _evaluated(config: RunConfig, suite: str, checkpoint: Path, parts: Sequence[
     episodes = evaluate_states(checkpoint, folder, config.states, selected, suite=suite)
     errors: list[dict[str, Any]] = []
     rows: list[Row] = []
-    for part in parts:
+    for part in (part for part in parts if part.suite == suite):
         own = [row for row in episodes if row["task"] in part.tasks]
         rows += own
         errors += found_errors(part.checkpoint, part.root, own)

@@ -95,7 +95,11 @@ def libero_sections() -> list[str]:
             section("The harness against lerobot-eval", "libero_equality", _equality),
         ],
     )
-    return [*on_goal, *chapter(OTHERS, [section(f"On {suite}", suite, _suite) for suite in OTHER_SUITES])]
+    others = [section(f"On {suite}", suite, _suite) for suite in OTHER_SUITES]
+    return [
+        *on_goal,
+        *chapter(OTHERS, [*others, section("One policy for all four", "libero_all", _all_suites)]),
+    ]
 
 
 def _variant(result: Quoted) -> str:
@@ -105,6 +109,10 @@ def _variant(result: Quoted) -> str:
 
 def _suite(result: Quoted) -> str:
     return f"{_per_task(result)}\n\n{_taken(result)}\n\n{_sorted(result)}{looked_at(result)}"
+
+
+def _all_suites(result: Quoted) -> str:
+    return f"{grid(result['per_suite'], STEPS, 'Suite')}\n\n{_taken(result)}"
 
 
 def _per_task(result: Quoted) -> str:

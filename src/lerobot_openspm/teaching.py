@@ -15,7 +15,7 @@ from lerobot_openspm.geometry.camera import Camera, load_cameras
 from lerobot_openspm.language.instruction import read_tasks
 from lerobot_openspm.language.lexicon import read_lexicon
 from lerobot_openspm.language.own_words import normal_words
-from lerobot_openspm.memory.entry import MemoryEntry
+from lerobot_openspm.memory.entry import MemoryEntry, episode_of
 from lerobot_openspm.memory.indexed_entries import known_names
 from lerobot_openspm.memory.memory import Memory
 from lerobot_openspm.training import dataset_processor, memory_of
@@ -90,19 +90,27 @@ def teach(
     mined = memory_of(processor.mine(), settings)
     # With few demonstrations nothing shows that an anchor is wrong, so all its objects have to be found.
     added = tuple(entry for entry in mined.entries if not _unseen(entry))
-    taught = {entry.language for entry in added}
-    task = next((task for task in tasks.values() if task not in taught), None)
-    if task is not None:
+    for task in dict.fromkeys(tasks.values()):
         read = read_tasks([task], known_names(memory.entries), read_lexicon(config.lexicon))[task]
-        raise DatasetError(_nothing_learned(dataset_meta.repo_id, task, tasks, mined, read))
+        if not _is_shown([i for i, told in tasks.items() if told == task], added, read):
+            raise DatasetError(_nothing_learned(dataset_meta.repo_id, task, tasks, mined, read))
     named = dict.fromkeys(name for entry in added for name in entry.object_poses)
     objects = {name: mined.objects[name] for name in named if name in mined.objects}
     learned = replace(mined, entries=added, objects=objects)
     result = memory.appended(learned)
     check_labels(result, config.segmenter.labels, f"the checkpoint of {config.type}")
-    used = {entry.source for entry in added}
-    skipped = tuple(i for i in wanted if f"{dataset_meta.repo_id}#{i}" not in used)
+    used = {episode_of(entry.source) for entry in added}
+    skipped = tuple(i for i in wanted if i not in used)
     return result, _lesson(memory, learned, skipped)
+
+
+def _is_shown(episodes: Sequence[int], entries: Sequence[MemoryEntry], read: Sequence[SubTask]) -> bool:
+    """Whether an episode has entries of all sub-tasks of its instruction; of any, where it is only words."""
+    shown = Counter[int]()
+    for entry in entries:
+        shown[episode_of(entry.source)] += len(entry.key.sub_tasks)
+    needed = 1 if read[0].words else len(read)
+    return any(shown[i] >= needed for i in episodes)
 
 
 def _lesson(memory: Memory, learned: Memory, skipped: tuple[int, ...]) -> Lesson:
@@ -189,7 +197,7 @@ def _nothing_learned(
 ) -> str:
     """Why an instruction has no entry."""
     episodes = [index for index, told in tasks.items() if told == task]
-    own = [entry for entry in mined.entries if entry.language == task]
+    own = [entry for entry in mined.entries if episode_of(entry.source) in episodes]
     unseen = sorted({name for entry in own for name in _unseen(entry)})
     if not unseen:
         named = (one for sub_task in read for one in sub_task.objects)

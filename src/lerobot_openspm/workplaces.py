@@ -21,10 +21,13 @@ from lerobot_openspm.memory.compose import plan_parts
 from lerobot_openspm.memory.entry import MemoryEntry
 from lerobot_openspm.memory.io import MEMORY_JSON, read_memory, write_memory
 from lerobot_openspm.memory.memory import Memory
+from lerobot_openspm.memory.merging import SOURCES
 from lerobot_openspm.memory.retrieval import read_instruction
 from lerobot_openspm.perception.observation import Observation
 
 FOLDER = "workplaces"
+# Where demonstrations begin, the hand is at the edge of what they covered: so far outside it is still there.
+NEAR_M = 0.05
 # What a policy has once, whatever the workplace.
 COMMON = (
     "input_features", "output_features", "state_layout", "action_layout", "rotation", "control_hz",
@@ -53,8 +56,8 @@ def choose(
 ) -> int:
     """At which workplace an episode begins, counted from 0.
 
-    The hand tells: it is where the demonstrations of that workplace had it. Among several the instruction
-    does: it is the one that knows it best.
+    The hand tells: it is where the demonstrations of that workplace had it, or nearly. Among several the
+    instruction does: it is the one that knows it best.
 
     Args:
         observation: The first one.
@@ -65,7 +68,7 @@ def choose(
     if len(memories) == 1:
         return 0
     outside = [_outside(memory, observation.hand.T_world_ee[:3, 3]) for memory in memories]
-    near = [i for i, metres in enumerate(outside) if metres <= min(outside)]
+    near = [i for i, metres in enumerate(outside) if metres <= min(outside) + NEAR_M]
     return max(near, key=lambda i: _knows(observation.instruction, entries[i], names))
 
 
@@ -77,16 +80,29 @@ def _outside(memory: Memory, position: np.ndarray) -> float:
 
 def _knows(
     instruction: str, entries: Sequence[MemoryEntry], names: NameSimilarity
-) -> tuple[bool, int, float]:
-    """How well a memory knows an instruction: as it was shown, by how few entries, how near in meaning."""
+) -> tuple[bool, bool, float]:
+    """How well a memory knows an instruction.
+
+    Returns:
+        Whether one demonstration shows all of it, whether in these words, and how near it is in meaning; -1
+        where it cannot be carried out.
+    """
     try:
         parts = plan_parts(instruction, read_instruction(instruction, entries, names), entries, names)
     except InstructionError:
-        return False, -len(instruction), 0.0
-    best = [max(part, key=lambda one: one.semantic) for part in parts]
-    sources = {id(source): source for one in best for source in one.sources}
-    is_shown = any(source.language == instruction for source in sources.values())
-    return is_shown, -len(sources), min(one.semantic for one in best)
+        return False, False, -1.0
+    shown = [{one.sources[0].source for one in part if len(one.sources) == 1} for part in parts]
+    is_worded = any(
+        source.language == instruction for part in parts for one in part for source in one.sources
+    )
+    meaning = min(max(one.semantic for one in part) for part in parts)
+    return bool(set.intersection(*map(_episodes, shown))), is_worded, meaning
+
+
+def _episodes(sources: set[str]) -> set[str]:
+    """The demonstrations of some sources; what is done a second time in one is of the same."""
+    each = (one.rpartition("#") for source in sources for one in source.split(SOURCES))
+    return {f"{name}#{number.partition('.')[0]}" for name, _, number in each}
 
 
 def join(paths: Sequence[Path], output: Path) -> list[Memory]:

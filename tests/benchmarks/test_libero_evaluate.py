@@ -243,6 +243,23 @@ def test_each_scene_is_learned_by_itself_and_one_policy_is_joined_and_evaluated(
     assert len(written) == 1
 
 
+def test_of_all_suites_one_policy_is_published_with_the_rate_of_each(tmp_path, monkeypatch):
+    calls, written = list[Any](), dict[str, Any]()
+    made_up(calls, tmp_path, monkeypatch)
+    monkeypatch.setattr(run, "OBJECTS", ("libero", "libero_10"))
+    monkeypatch.setattr(run, "write", lambda name, content, _: written.update({name: content}))
+    told = run.main(run.RunConfig("all", states=10, tasks="0-2"))
+    assert Path(told["checkpoint"]).parts[-3:] == ("all", "demos_10", "joined")
+    assert list(written) == ["libero_all"]
+    assert (written["libero_all"]["n"], written["libero_all"]["seed"]) == (60, harness.SEED)
+    assert {name: one["n"] for name, one in written["libero_all"]["per_suite"].items()} == {
+        "libero": 30,
+        "libero_10": 30,
+    }
+    run.main(run.RunConfig("all", states=10, tasks="0"))
+    assert len(written) == 1
+
+
 def test_poses_of_two_that_a_task_is_about_are_not_compared():
     poses = dict.fromkeys(("bowl", "bowl_2", "moka_pot", "moka_pot_2"), np.eye(4))
     assert list(harness.without_several(poses, {"moka_pot", "moka_pot_2", "bowl"})) == ["bowl", "bowl_2"]

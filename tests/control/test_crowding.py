@@ -11,7 +11,7 @@ from tests.control.test_going_back import KINDS, ON_PLATE, handle
 from tests.control.test_reach import chosen, scene
 from tests.memory.builders import entry
 
-from lerobot_openspm.control.clearance import crowding
+from lerobot_openspm.control.clearance import crowding, taken
 from lerobot_openspm.control.plan import Plan
 from lerobot_openspm.control.planning import FEW_POINTS
 from lerobot_openspm.control.transfer import transfer
@@ -124,13 +124,13 @@ def test_where_another_entry_grasps_from_elsewhere_it_is_taken_if_it_means_the_s
     other = replace(
         turned, key=replace(turned.key, sub_tasks=(replace(turned.key.sub_tasks[0], target="cup"),))
     )
-    for second, taken in ((turned, "turned"), (other, shown.source)):
+    for second, source in ((turned, "turned"), (other, shown.source)):
         both = [
             Candidate(one, 1.0 - i / 10, (one,), one.key.sub_tasks) for i, one in enumerate((shown, second))
         ]
         found = poses | {"post": place}
         plan, problems = context.choose(context.rank(both, found, home), found, home)
-        assert (plan.entry.source, problems) == (taken, [])
+        assert (plan.entry.source, problems) == (source, [])
 
 
 def test_what_is_out_of_reach_is_not_exchanged_for_another_thing():
@@ -324,3 +324,16 @@ def test_a_place_where_another_of_the_kind_stands_is_taken_and_the_next_entry_pu
     assert context.choose(ranked, poses, home, there)[0].entry is other
     plan, problems = context.choose(ranked[:1], poses, home, there)
     assert (plan.entry, problems) == (shown, ["the plate is taken: another bowl stands there"])
+
+
+def test_what_lies_in_a_basket_takes_no_place():
+    context, poses, home = scene(None, 0.0)
+    shown = context.entries[0]
+    put_in = tuple(replace(one, relation="in") for one in shown.key.sub_tasks)
+    targets = Plan(shown, poses, home).targets(context)
+    (grasp,), (release,) = (
+        [t for t in targets if t.key_pose.phase == phase] for phase in ("grasp", "release")
+    )
+    there = {"bowl": (release.T_world_ee @ se3.inverse(grasp.T_world_ee) @ poses["bowl"],)}
+    assert taken(shown, targets, poses, {}, there)
+    assert not taken(replace(shown, key=replace(shown.key, sub_tasks=put_in)), targets, poses, {}, there)

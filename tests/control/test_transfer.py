@@ -9,6 +9,7 @@ from tests.geometry.strategies import transforms
 from tests.memory.builders import entry, hand_pose, key_pose, robot
 
 from lerobot_openspm.control import feasibility
+from lerobot_openspm.control.between_parts import rise
 from lerobot_openspm.control.feasibility import (
     TransferLimits,
     check_transfer,
@@ -20,7 +21,6 @@ from lerobot_openspm.control.transfer import (
     Target,
     Turn,
     as_shown,
-    rise,
     transfer,
     transfer_pose,
     turn_about,

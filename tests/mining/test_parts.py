@@ -2,14 +2,19 @@
 
 from dataclasses import replace
 
+import numpy as np
 import pytest
 from tests.memory.builders import robot
 from tests.mining.episodes import pick_and_place
 
+from lerobot_openspm.geometry import se3
 from lerobot_openspm.language.instruction import parse_instruction
+from lerobot_openspm.memory.entry import episode_of
+from lerobot_openspm.mining.entries import task_entries
 from lerobot_openspm.mining.key_poses import find_key_poses
 from lerobot_openspm.mining.mined import MinedEpisode
 from lerobot_openspm.mining.parts import divided
+from lerobot_openspm.mining.processor import compare
 
 
 @pytest.mark.parametrize(
@@ -50,3 +55,17 @@ def test_what_stands_by_itself_is_a_demonstration_of_its_own(instruction, parts)
     assert [one.sub_tasks for one in found] == [(sub_task,) for sub_task in sub_tasks]
     assert all(one.key_poses == tuple(once) for one in found)
     assert all(one.episode.index == episode.index for one in found)
+
+
+def test_what_an_episode_does_a_second_time_has_a_source_of_its_own():
+    instruction = "put both moka pots on the stove"
+    episode = pick_and_place()[0].episode(7, instruction)
+    once = find_key_poses(episode, robot())
+    key_poses = tuple(replace(pose, contact=pose.contact + 2 * i) for i in range(2) for pose in once)
+    parts = divided(MinedEpisode(episode, key_poses, parse_instruction(instruction)))
+    poses = [{"moka pot": np.eye(4), "stove": se3.from_yaw([0.1, 0.1, 0.0], 0.0)}] * 2
+    (task,) = compare(parts, poses, [{}, {}], {})
+    entries = task_entries(task, "a/b")
+    assert [one.source for one in entries] == ["a/b#7", "a/b#7.2"]
+    assert [episode_of(one.source) for one in entries] == [7, 7]
+    assert {one.language for one in entries} == {"put the moka pot on the stove"}

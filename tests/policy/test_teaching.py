@@ -10,12 +10,15 @@ import pytest
 import torch
 from lerobot.datasets import LeRobotDataset, LeRobotDatasetMetadata
 from lerobot.datasets.dataset_tools import modify_tasks
+from tests.memory.builders import entry
 from tests.policy.conftest import NAME, Frame, batch_of
 
 from lerobot_openspm import teaching
 from lerobot_openspm.errors import DatasetError, MemoryFormatError
+from lerobot_openspm.language.instruction import parse_instruction
 from lerobot_openspm.memory.memory import Memory
 from lerobot_openspm.modeling_openspm import OpenSPMPolicy
+from lerobot_openspm.teaching import _is_shown
 
 PUSH = "push the plate to the front of the stove"
 
@@ -136,3 +139,20 @@ def test_any_wording_is_taught_and_acted_on(
             told,
             frame["task"],
         ]
+
+
+@pytest.mark.parametrize(
+    ("sources", "is_shown"),
+    [
+        (["a/b#4", "a/b#4"], True),
+        (["a/b#4", "a/b#4.2"], True),
+        (["a/b#4", "a/b#5"], False),  # of neither episode all was found
+        (["a/b#4"], False),
+        (["a/b#6", "a/b#6"], False),  # of another instruction
+        ([], False),
+    ],
+)
+def test_an_episode_of_several_things_is_learned_where_all_of_them_are(sources, is_shown):
+    read = parse_instruction("put both moka pots on the stove")
+    entries = [entry("put the moka pot on the stove", source=source) for source in sources]
+    assert _is_shown([4, 5], entries, read) == is_shown

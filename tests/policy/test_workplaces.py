@@ -8,13 +8,17 @@ from pathlib import Path
 
 import pytest
 import torch
+from tests.memory.builders import entry
 from tests.policy.conftest import Frame, act, batch_of
 
 from lerobot_openspm.cli.join import main as join
 from lerobot_openspm.errors import OpenSPMError
+from lerobot_openspm.language.names import TABLE_NAMES
 from lerobot_openspm.memory.io import read_memory, write_memory
 from lerobot_openspm.memory.memory import Memory
 from lerobot_openspm.modeling_openspm import OpenSPMPolicy
+from lerobot_openspm.perception.observation import split_batch
+from lerobot_openspm.workplaces import _knows
 
 FAR_M = 5.0
 
@@ -75,6 +79,38 @@ def test_where_the_hand_does_not_tell_the_instruction_does(
     batch = batch_of([recorded[0][0], recorded[3][0]])
     both.select_action(batch)
     assert [one.workplace for one in both.episodes] == [tasks.index(task) for task in batch["task"]]
+
+
+def test_a_hand_at_the_edge_of_what_was_covered_is_still_there(
+    policy: OpenSPMPolicy,
+    checkpoint: Path,
+    changed: Callable[[str, Memory], Path],
+    recorded: list[list[Frame]],
+):
+    memory, batch = read_memory(checkpoint), batch_of([recorded[0][0]])
+    stove, bowl = (
+        replace(memory, entries=tuple(e for e in memory.entries if e.language == recorded[i][0]["task"]))
+        for i in (3, 0)
+    )
+    # By millimetres the hand begins outside of where the demonstrations of the bowl had it.
+    (observation,) = split_batch(batch, policy.config.layouts()[0])
+    edge = memory.robot.workspace.copy()
+    edge[0, 0] = observation.hand.T_world_ee[0, 3] + 0.004
+    bowl = replace(bowl, robot=replace(memory.robot, workspace=edge))
+    both = OpenSPMPolicy.from_pretrained(joined(changed("stove", stove), changed("bowl", bowl)))
+    both.select_action(batch)
+    assert both.episodes[0].workplace == 1
+
+
+def test_where_one_demonstration_shows_all_is_better_than_where_several_do():
+    each = [
+        entry("put the bowl on the plate", source="a/b#1"),
+        entry("put the cup on the plate", source="a/b#2"),
+    ]
+    both = [replace(one, source=f"a/b#{i}") for one, i in zip(each, ("3", "3.2"), strict=True)]
+    instruction = "put the bowl on the plate and put the cup on the plate"
+    assert _knows(instruction, both, TABLE_NAMES) > _knows(instruction, each, TABLE_NAMES)
+    assert _knows(instruction, each, TABLE_NAMES) > _knows(instruction, each[:1], TABLE_NAMES)
 
 
 def test_workplaces_of_joined_policies_are_joined_too(

@@ -16,7 +16,7 @@ from lerobot_openspm.cli.drawing import draw_key_poses, save_png
 from lerobot_openspm.cli.pipeline import REPO_ID, Episode, mean_steps, rate
 from lerobot_openspm.configuration_openspm import OpenSPMConfig
 from lerobot_openspm.envs.tabletop.tasks import TASKS
-from lerobot_openspm.memory.entry import MemoryEntry
+from lerobot_openspm.memory.entry import MemoryEntry, episode_of
 from lerobot_openspm.memory.io import read_memory
 from lerobot_openspm.memory.memory import Memory
 from lerobot_openspm.training import open_demonstrations
@@ -67,7 +67,7 @@ def _key_pose_picture(entry: MemoryEntry, memory: Memory, dataset: LeRobotDatase
     """The entry's key poses in the first frame of the demonstration it was mined from."""
     config = OpenSPMConfig(device="cpu", push_to_hub=False)
     demonstrations = open_demonstrations(dataset.meta, config)
-    episode = demonstrations.episodes([int(entry.source.rsplit("#", 1)[1])])[0]
+    episode = demonstrations.episodes([episode_of(entry.source)])[0]
     key, camera = next((k, c) for k, c in memory.cameras.items() if c.mount == "world")
     view = demonstrations.views(episode, 0, {key: camera})[key]
     poses = [pose.anchor.frame(entry.object_poses) @ pose.T_obj_ee for pose in entry.key_poses]

@@ -229,15 +229,19 @@ def crowding(
 
 
 def taken(
+    entry: MemoryEntry,
     targets: Sequence[Target],
     now: Mapping[str, Array],
     points: Mapping[str, Array],
     alike: Mapping[str, Sequence[Array]] | None = None,
 ) -> list[str]:
-    """Places of some key poses where something else stands already, in words.
+    """Places that something is put on where something else stands already, in words.
+
+    In a basket or a drawer things may lie upon one another.
 
     Args:
-        targets: The key poses in the scene.
+        entry: What is to be executed.
+        targets: Its key poses in the scene.
         now: Poses ``T_world_obj`` ``(4, 4)`` of the objects that were found.
         points: Points ``(n, 3)`` in the world of those whose shape is known, by name.
         alike: By name, poses ``T_world_obj`` ``(4, 4)`` of others of a kind.
@@ -257,19 +261,21 @@ def taken(
         load = "" if grasp is None else grasp.key_pose.anchor.place
         if phase != "release" or grasp is None or load == place or load not in now:
             continue
+        if entry.key.sub_tasks[target.key_pose.sub_task].relation == "in":
+            continue
         T_moved = target.T_world_ee @ se3.inverse(grasp.T_world_ee)
         T_end = T_moved @ now[load]
-        if any(_is_at(T_end[:3, 3], T[:3, 3], ALIKE_M) for T in (alike or {}).get(load, ())):
+        if any(_stands_at(T_end[:3, 3], T[:3, 3], ALIKE_M) for T in (alike or {}).get(load, ())):
             found.append(f"the {place} is taken: another {load} stands there")
         elif load in points:
             end = se3.apply(T_moved, points[load]).mean(0)
             for name, other in others.items():
-                if _is_at(end, other.mean(0), TAKEN_M):
+                if _stands_at(end, other.mean(0), TAKEN_M):
                     found.append(f"the {place} is taken: the {name} stands where the {load} would")
     return found
 
 
-def _is_at(point: Array, other: Array, metres: float) -> bool:
+def _stands_at(point: Array, other: Array, metres: float) -> bool:
     """Whether a point ``(3,)`` is so near to another one, seen from above, and about as high."""
     off = point - other
     return bool(np.hypot(*off[:2]) <= metres and abs(off[2]) <= MAX_FALL_M)

@@ -13,14 +13,15 @@ from dataclasses import replace
 
 import numpy as np
 
+from lerobot_openspm.control.between_parts import rise
 from lerobot_openspm.control.executor import Executor
 from lerobot_openspm.control.planning import PlanningContext
 from lerobot_openspm.control.scene import GIVE_UP_S, LOOK_AGAIN_S, SECOND_LOOK_S, LookRequest, SceneState
 from lerobot_openspm.control.state import LOOKS_AT_OUTCOME, EpisodeState, Status
-from lerobot_openspm.control.transfer import Target, rise
+from lerobot_openspm.control.transfer import Target
 from lerobot_openspm.errors import InstructionError
 from lerobot_openspm.geometry.se3 import Array
-from lerobot_openspm.memory.compose import Candidate, plan_parts
+from lerobot_openspm.memory.compose import plan_parts
 from lerobot_openspm.memory.entry import Outcome
 from lerobot_openspm.memory.retrieval import read_instruction
 from lerobot_openspm.perception.tracking.tracker import TrackStatus
@@ -130,14 +131,10 @@ class EpisodeController:
             except InstructionError as error:
                 return self._refuse(error)
             state.T_start = hand.T_world_ee
-            scene.ground(state.parts[0], self._ahead())
+            scene.ground(state.parts[0], state.ahead)
         ahead = [one.entry for part in state.parts[state.part :] for one in part]
         names = dict.fromkeys([*context.objects_of_interest(ahead), *scene.grounding.landmarks])
         return scene.look([name for name in names if name not in scene.altered], hand)
-
-    def _ahead(self) -> list[Candidate]:
-        """What the parts after the present one can be carried out by."""
-        return [one for part in self.state.parts[self.state.part + 1 :] for one in part]
 
     def _plan(self, hand: Hand) -> None:
         """Plan the present part, once its objects are found."""
@@ -347,6 +344,6 @@ class EpisodeController:
             return None
         self.executor.stop(Status.WAITING)
         state.begin_next_part()
-        self.scene.ground(state.parts[state.part], self._ahead(), hand)
+        self.scene.ground(state.parts[state.part], state.ahead, hand)
         logger.info("%r: part %d of %d", self.instruction, state.part + 1, len(state.parts))
         return self._look_for_plan(hand)

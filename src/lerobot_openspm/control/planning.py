@@ -10,11 +10,7 @@ from functools import cached_property
 import numpy as np
 
 from lerobot_openspm.control.clearance import crowding, lifted, taken
-from lerobot_openspm.control.feasibility import (
-    TransferLimits,
-    find_stance,
-    geometric_score,
-)
+from lerobot_openspm.control.feasibility import TransferLimits, find_stance, geometric_score
 from lerobot_openspm.control.finger_room import finger_room
 from lerobot_openspm.control.joint_room import ways_out
 from lerobot_openspm.control.plan import Plan
@@ -203,7 +199,7 @@ class PlanningContext:
                 break
             is_found = all(name in first.object_poses for name in entry.objects)
             targets = replace(first, entry=entry).targets(self) if is_found else ()
-            if problems := taken(targets, first.object_poses, points, first.not_meant):
+            if problems := taken(entry, targets, first.object_poses, points, first.not_meant):
                 occupied = occupied or problems
             else:
                 tried.append(entry)

@@ -122,6 +122,11 @@ class EpisodeState:
         return self.part + 1 >= len(self.parts)
 
     @property
+    def ahead(self) -> list[Candidate]:
+        """What the parts after the present one can be carried out by."""
+        return [one for part in self.parts[self.part + 1 :] for one in part]
+
+    @property
     def succeeded(self) -> bool | None:
         """Whether the instruction is seen to be done; None before the end and where it is not seen."""
         if self.status is Status.NO_PROGRESS:

@@ -17,14 +17,8 @@ from lerobot_openspm.types import Symmetry
 
 # How far the hand backs off at the end.
 RETREAT_M = 0.06
-# A hand that is at most this much too low need not rise.
-LEVEL_M = 0.02
-# A hand that is turned by more than this at the end of a part is turned back before the next one, radians.
-TURNED_RAD = 0.8
-# A target that is only passed by is met within this distance and angle, metres and radians ...
+# A target that is only passed by is met within this distance and angle, metres and radians.
 PASSING_M, PASSING_RAD = 0.015, 0.15
-# ... and the way back between two parts ends within these.
-BACK_M, BACK_RAD = 0.1, 0.3
 # A door or a drawer is pushed so much further than was shown, metres, until it stops the hand.
 SHUT_M = 0.02
 # Of the hand about its approach axis, the z axis of its frame.
@@ -212,28 +206,6 @@ def half_turned(targets: Sequence[Target]) -> tuple[Target, ...]:
     Two fingers that close on one another take hold either way round.
     """
     return tuple(replace(one, T_world_ee=one.T_world_ee @ HALF_TURN) for one in targets)
-
-
-def rise(last: Target, T_start: Array) -> tuple[Target, ...]:
-    """Straight up from the last key pose to the height of where the episode began, if that is higher.
-
-    A hand that is turned otherwise by now goes back about there: not every turn can be made anywhere. The
-    next part of an instruction then begins as its demonstrations did: clear of what stands around, and
-    without the hand between the cameras and the objects.
-
-    Args:
-        last: The last key pose.
-        T_start: Where the hand was when the episode began, ``T_world_ee`` ``(4, 4)``.
-    """
-    key_pose = replace(last.key_pose, phase="retreat", n_steps=1, dwell=False, axis=None, confidence=0.5)
-    if float(se3.distances(last.T_world_ee, T_start)[1]) > TURNED_RAD:
-        back = Target(T_start, key_pose, precise=False, passing_m=BACK_M, passing_rad=BACK_RAD)
-        return (back,)
-    if T_start[2, 3] - last.T_world_ee[2, 3] < LEVEL_M:
-        return ()
-    T_world_ee = last.T_world_ee.copy()
-    T_world_ee[2, 3] = T_start[2, 3]
-    return (Target(T_world_ee, key_pose, precise=False),)
 
 
 def _shut(targets: Sequence[Target], entry: MemoryEntry) -> list[Target]:

@@ -194,6 +194,11 @@ class Outcome:
         return any(self.is_met({**object_poses, axes: T}) for T in turned)
 
 
+def episode_of(source: str) -> int:
+    """Number of the episode that an entry was mined from: 20 of the source "name#20", or "name#20.2"."""
+    return int(source.rpartition("#")[2].partition(".")[0])
+
+
 @dataclass(frozen=True)
 class MemoryEntry:
     """One demonstration, compressed.
@@ -205,7 +210,8 @@ class MemoryEntry:
         quality: The paper's ``r_i``, 0 to 1: how closely the demonstration agrees with others of its task,
             updated by how it fared at deployment.
         version: The paper's ``nu_i``: counts up when an entry is replaced.
-        source: Dataset and episode the entry was mined from.
+        source: Dataset and episode the entry was mined from, "name#20"; "name#20.2" where the episode did
+            this a second time.
         object_poses: Poses ``T_world_obj`` ``(4, 4)`` of the objects at the start of the demonstration.
         trials: How often the entry was acted by at deployment, where it is known whether that succeeded.
         successes: How many of these succeeded.

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from collections import Counter
 from collections.abc import Mapping
 
 from lerobot_openspm.errors import DatasetError
@@ -40,7 +41,7 @@ def build_entries(mined: MinedDataset) -> tuple[MemoryEntry, ...]:
 
 def task_entries(task: MinedTask, source: str) -> tuple[MemoryEntry, ...]:
     """The memory entries of one task's demonstrations; `source` is the name of their dataset."""
-    sub_tasks, entries = task.sub_tasks, list[MemoryEntry]()
+    sub_tasks, entries, times = task.sub_tasks, list[MemoryEntry](), Counter[int]()
     named = {name for sub_task in sub_tasks for name in sub_task.objects}
     for item, demonstration, axes, quality, outcomes in zip(
         task.episodes, task.aligned, task.axes, task.qualities, task.outcomes, strict=True
@@ -51,9 +52,11 @@ def task_entries(task: MinedTask, source: str) -> tuple[MemoryEntry, ...]:
                 item.episode.index, source, " and ".join(map(repr, sorted(missing))),
             )  # fmt: skip
             continue
+        times[item.episode.index] += 1
         key_poses = _remember(demonstration, task.anchors, axes, len(sub_tasks))
         key = RetrievalKey(sub_tasks, tuple(pose.phase for pose in key_poses))
-        where = f"{source}#{item.episode.index}"
+        again = times[item.episode.index]
+        where = f"{source}#{item.episode.index}" + (f".{again}" if again > 1 else "")
         poses = {name: T for name, T in demonstration.object_poses.items() if name in named}
         known = tuple(one for one in outcomes if all(name in poses for name in one.objects))
         entries.append(
