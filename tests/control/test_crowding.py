@@ -337,3 +337,17 @@ def test_what_lies_in_a_basket_takes_no_place():
     there = {"bowl": (release.T_world_ee @ se3.inverse(grasp.T_world_ee) @ poses["bowl"],)}
     assert taken(shown, targets, poses, {}, there)
     assert not taken(replace(shown, key=replace(shown.key, sub_tasks=put_in)), targets, poses, {}, there)
+
+
+def test_what_goes_into_a_basket_is_not_put_beside_its_place():
+    """Beside it is the basket's wall."""
+    context, poses, home = scene(None, 0.0)
+    (on,) = context.entries
+    (sub_task,) = on.key.sub_tasks
+    into = replace(on, key=replace(on.key, sub_tasks=(replace(sub_task, relation="in"),)))
+    asides = [
+        [way.aside for way in Plan(replace(entry, outcomes=(ON_PLATE,)), poses, home).otherwise_put(context)]
+        for entry in (on, into)
+    ]
+    assert any(aside != (0.0, 0.0) for aside in asides[0])
+    assert all(aside == (0.0, 0.0) for aside in asides[1])

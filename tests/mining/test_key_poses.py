@@ -4,7 +4,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 from tests.mining import episodes
-from tests.mining.episodes import METRES_PER_ACTION, OPEN, RADIANS_PER_ACTION, SPEED, Drawer
+from tests.mining.episodes import SPEED, Drawer
 
 from lerobot_openspm.geometry import se3
 from lerobot_openspm.mining.key_poses import find_key_poses
@@ -317,19 +317,3 @@ def test_an_episode_that_ends_while_carrying_keeps_its_grasp():
     phases = [pose.phase for pose in find_key_poses(cut, observe_robot([episode]))]
     assert "grasp" in phases
     assert "release" not in phases
-
-
-@pytest.mark.parametrize("sign", [1.0, -1.0])
-def test_the_robot_is_observed_and_not_assumed(sign):
-    drawn = [episodes.pick_and_place(close_command=sign, yaw=0.5)[0], episodes.turn()[0]]
-    drawn[1].commands = [command * sign for command in drawn[1].commands]
-    robot = observe_robot([drawing.episode() for drawing in drawn])
-    assert (robot.close_command, robot.open_command) == (sign, -sign)
-    assert robot.command(True) == sign
-    assert robot.closed(np.array([sign, -sign, 0.9 * sign])).tolist() == [True, False, True]
-    assert robot.open_width == pytest.approx(OPEN)
-    assert robot.metres_per_action == pytest.approx(METRES_PER_ACTION, rel=0.02)
-    assert robot.radians_per_action == pytest.approx(RADIANS_PER_ACTION, rel=0.02)
-    assert robot.metres_per_step == pytest.approx(SPEED, rel=0.1)
-    positions = np.concatenate([drawing.episode().T_world_ee[:, :3, 3] for drawing in drawn])
-    np.testing.assert_allclose(robot.workspace, [positions.min(axis=0), positions.max(axis=0)])

@@ -132,13 +132,15 @@ class Plan:
     def otherwise_put(self, context: PlanningContext) -> list[Plan]:
         """The plan, putting down what is carried turned, where its landmark is round, or beside its place.
 
-        It is put no further beside it than counts as there.
+        It is put no further beside it than counts as there. In a basket or a drawer, its wall is beside it.
         """
         symmetries = context.symmetries
         onto = [symmetries.get(one.anchor.place) for one in self._puts if one.target in symmetries]
         is_round = any(landmark is not None and landmark.turn == 0 for landmark in onto)
         ways: list[Plan] = [replace(self, around=radians) for radians in TURNS if radians and is_round]
         most = min((one.tolerance_m for one in self._puts), default=0.0)
+        if any(self.entry.key.sub_tasks[one.sub_task].relation == "in" for one in self._puts):
+            return ways
         yaws = np.linspace(0, 2 * np.pi, ASIDE_DIRECTIONS, endpoint=False)
         return ways + [
             replace(self, aside=(metres * float(np.cos(yaw)), metres * float(np.sin(yaw))))

@@ -15,6 +15,8 @@ from lerobot_openspm.memory.robot import RobotModel
 # Commanded and achieved motion are compared over windows this long, because an operational-space
 # controller answers a command over several steps.
 GAIN_WINDOW_STEPS = 5
+# ... and an axis tells the gain if they vary together by at least this share of what they do along the best.
+TELLING_SHARE = 0.9
 # Gripper commands that differ by less than this are one command.
 MIN_COMMAND_RANGE = 1e-3
 
@@ -91,14 +93,22 @@ def _gripper_commands(episodes: Sequence[Episode], known: RobotModel | None) -> 
 
 
 def _gain(episodes: Sequence[Episode], part: slice) -> float:
-    """Least-squares slope of achieved over commanded motion; 0 when nothing was commanded."""
-    k, cross, power = GAIN_WINDOW_STEPS, 0.0, 0.0
+    """Least-squares slope of achieved over commanded motion, of the axes that tell it; 0 when none does.
+
+    A demonstrator who only keeps the hand level commands against what disturbs it. About such an axis the
+    hand follows its commands badly, and the slope is far too small.
+    """
+    k = GAIN_WINDOW_STEPS
+    cross, commanded_power, achieved_power = np.zeros(3), np.zeros(3), np.zeros(3)
     for episode in episodes:
         if len(episode) <= 2 * k:
             continue
         achieved = se3.increment(episode.T_world_ee[:-k], episode.T_world_ee[k:])[:, part]
         sums = np.cumsum(np.vstack([np.zeros(7), episode.actions]), axis=0)
         commanded = (sums[k:-1] - sums[: -k - 1])[: len(achieved), part]
-        cross += float((achieved * commanded).sum())
-        power += float((commanded**2).sum())
-    return cross / power if power > 0 else 0.0
+        cross += (achieved * commanded).sum(0)
+        commanded_power += (commanded**2).sum(0)
+        achieved_power += (achieved**2).sum(0)
+    correlation = cross / np.sqrt(np.maximum(commanded_power * achieved_power, 1e-12))
+    tells = (correlation > 0) & (correlation >= TELLING_SHARE * correlation.max())
+    return float(cross[tells].sum() / commanded_power[tells].sum()) if tells.any() else 0.0

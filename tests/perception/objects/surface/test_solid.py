@@ -148,7 +148,7 @@ def test_a_part_that_stands_beside_the_largest_piece_is_kept(stands):
     assert kept[-6:-1, -6:-1].any() == stands
 
 
-@pytest.mark.parametrize("height", [-0.004, 0.0, 0.011])
+@pytest.mark.parametrize("height", [-0.12, -0.004, 0.0, 0.011])
 @pytest.mark.parametrize("cell", [0.006, 0.02])
 def test_a_table_with_grain_or_tiles_tells_its_height(height, cell):
     grain = BACK + np.random.default_rng(1).integers(-6, 7, (300, 300, 1))

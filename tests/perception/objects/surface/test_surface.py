@@ -291,7 +291,7 @@ def test_a_record_tells_all_of_it(models):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"near": None}, "'near' of 'block'"),
+        ({"near": "patches"}, "'near' of 'block'"),
         ({"hand_cameras": "hand"}, "list of camera keys"),
         ({"spacing": -1.0}, "'spacing' is -1.0"),
         ({"typical_agreement": 0.0}, "'typical_agreement' is 0.0"),

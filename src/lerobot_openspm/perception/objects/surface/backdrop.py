@@ -35,8 +35,10 @@ STILL_LEVELS = 6.0
 TABLE_MARGIN_M = 0.25
 # ... and objects stand with their middle this near to where it went.
 REACH_M = 0.10
-# The table's height is sought in such steps, metres, in so many pictures, where so many of them show a place.
+# The table's height is sought in such steps, metres, in so many pictures, where so many of them show a place;
+# at most so far below the floor that touches tell, metres.
 HEIGHT_STEP_M, MAX_TABLE_VIEWS, MIN_TABLE_VIEWS = 0.005, 80, 5
+MOST_BELOW_M = 0.15
 # ... and told if pictures differ there by less than this share of what they usually do, and by so much less,
 # CIELAB.
 DISTINCT_SHARE, DISTINCT = 0.95, 0.02
@@ -213,7 +215,9 @@ def _table_height(
 ) -> float:
     """The height at which pictures from many places agree best about the grain of a plane.
 
-    Only what has the table's colour counts: what stands on it agrees at other heights.
+    Only what has the table's colour counts: what stands on it agrees at other heights. It is sought about the
+    floor that touches tell, and where it is not there, further below: all that was touched may be tall. A
+    table without any grain does not tell its height; it is taken to lie a little below that floor.
     """
     grid = np.stack(
         np.meshgrid(*(np.arange(low, high, 0.008) for low, high in area.T), indexing="ij"), -1
@@ -221,10 +225,8 @@ def _table_height(
     views = [(key, view) for key, group in carried.items() for view in distinct(group)[:MAX_TABLE_VIEWS]]
     pictures = [lab(view.image) for _, view in views]
     others = [hand[key] | ~table.matches(picture) for (key, _), picture in zip(views, pictures, strict=True)]
-    steps = round(BELOW_CUES_M / HEIGHT_STEP_M)
-    heights = floor + HEIGHT_STEP_M * np.arange(-steps, steps + 1).astype(float)
-    spreads = []
-    for height in heights:
+
+    def spread_at(height: float) -> float:
         plane = np.asarray(np.column_stack([grid, np.full(len(grid), height)]), float)
         seen = [
             sample(picture, view.camera, view.T_world_cam, plane, other)
@@ -234,21 +236,27 @@ def _table_height(
         spread = np.ma.median(np.ma.abs(stack - np.ma.median(stack, axis=0)).sum(-1), axis=0)
         enough = (~stack.mask[..., 0]).sum(0) >= MIN_TABLE_VIEWS
         # The mean, because a coarse pattern differs at its edges alone.
-        spreads.append(float(np.ma.mean(spread[enough])) if enough.any() else np.inf)
-    return _least(heights, np.array(spreads))
+        return float(np.ma.mean(spread[enough])) if enough.any() else np.inf
+
+    for low, high in ((-BELOW_CUES_M, BELOW_CUES_M), (-MOST_BELOW_M, 0.0)):
+        steps = np.arange(round(low / HEIGHT_STEP_M), round(high / HEIGHT_STEP_M) + 1)
+        heights = floor + HEIGHT_STEP_M * steps.astype(float)
+        found = _least(heights, np.array([spread_at(height) for height in heights]))
+        if found is not None:
+            return found
+    return floor - 2 * HEIGHT_STEP_M
 
 
-def _least(heights: Array, spreads: Array) -> float:
+def _least(heights: Array, spreads: Array) -> float | None:
     """Where a parabola through the least spread and its neighbours has its vertex.
 
-    A table without any grain does not tell its height; it is taken to lie a little below the floor that
-    touches tell, which is in the middle of the heights.
+    None where the least one lies at an end, or hardly below the usual spread.
     """
     i = int(np.argmin(spreads))
     around = spreads[i - 1 : i + 2] if 0 < i < len(heights) - 1 else np.full(3, np.inf)
     usual = float(np.median(spreads))
     if not (np.isfinite(around).all() and around[1] < min(DISTINCT_SHARE * usual, usual - DISTINCT)):
-        return float(heights[len(heights) // 2] - 2 * HEIGHT_STEP_M)
+        return None
     bend = around[0] - 2 * around[1] + around[2]
     return float(heights[i] + HEIGHT_STEP_M * 0.5 * (around[0] - around[2]) / bend)
 

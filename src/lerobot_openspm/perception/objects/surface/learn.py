@@ -13,7 +13,7 @@ from scipy.spatial import KDTree
 from lerobot_openspm.geometry import se3
 from lerobot_openspm.geometry.se3 import Array
 from lerobot_openspm.perception.objects.base import Examples, Kind, Look
-from lerobot_openspm.perception.objects.patches.learn import learn_patches, still_objects
+from lerobot_openspm.perception.objects.patches.learn import UNFOLLOWED, learn_patches, still_objects
 from lerobot_openspm.perception.objects.patches.model import PatchModel
 from lerobot_openspm.perception.objects.surface.backdrop import Backdrop, Float32, learn_backdrop
 from lerobot_openspm.perception.objects.surface.carving import Carved, Frame, Frames, carve, silhouette
@@ -22,7 +22,7 @@ from lerobot_openspm.perception.objects.surface.model import ANOTHER_SHARE, YAWS
 from lerobot_openspm.perception.objects.surface.record import from_record
 from lerobot_openspm.perception.objects.surface.relief import WEIGHTS, find_relief
 from lerobot_openspm.perception.objects.surface.search import Freedom, Place, over_table, search
-from lerobot_openspm.perception.objects.surface.sight import Surface, sight_of
+from lerobot_openspm.perception.objects.surface.sight import Surface, sight_of, sights_of
 from lerobot_openspm.perception.objects.surface.solid import (
     Depths,
     Solid,
@@ -30,6 +30,12 @@ from lerobot_openspm.perception.objects.surface.solid import (
     colours_of,
     fill_silhouettes,
     solid_under,
+)
+from lerobot_openspm.perception.objects.surface.touched import (
+    Standing,
+    poses_by_touch,
+    settle_all,
+    with_places,
 )
 from lerobot_openspm.types import DemonstrationScene, Mask, Moment, View
 
@@ -58,6 +64,8 @@ MIN_COLOURED = 40
 
 # The views of the demonstrations' first moments, and where an object stands in each: ``T_world_obj`` (4, 4).
 FirstSights = Sequence[tuple[Mapping[str, View], Array]]
+# Demonstrations with their moments.
+Films = Sequence[tuple[DemonstrationScene, Sequence[Moment]]]
 
 
 def learn_surfaces(examples: Examples) -> dict[str, SurfaceModel | PatchModel]:
@@ -67,7 +75,8 @@ def learn_surfaces(examples: Examples) -> dict[str, SurfaceModel | PatchModel]:
     it at one of these places.
     """
     near = learn_patches(examples, at_few_places=True)
-    surfaces, why = _learn_surfaces(near, examples)
+    unseen = [name for name in examples.names if UNFOLLOWED in examples.left_out.get(name, ())]
+    surfaces, why = _learn_surfaces(near, unseen, examples)
     still = still_objects(examples)
     alone = {name: model for name, model in near.items() if name not in surfaces and name in still}
     if alone and why:
@@ -78,10 +87,17 @@ def learn_surfaces(examples: Examples) -> dict[str, SurfaceModel | PatchModel]:
 
 
 def _learn_surfaces(
-    near: Mapping[str, PatchModel], examples: Examples
+    near: Mapping[str, PatchModel], unseen: Sequence[str], examples: Examples
 ) -> tuple[dict[str, SurfaceModel], str]:
-    """Surfaces by name, and why the others have none; that is empty where there are no films."""
-    films = [(scene, scene.film()) for scene in examples.scenes if near and scene.film is not None]
+    """Surfaces by name, and why the others have none; that is empty where there are no films.
+
+    Args:
+        near: What patches find in the first pictures.
+        unseen: What they do not find, though it hardly moves.
+        examples: The demonstrations.
+    """
+    names = [*near, *unseen]
+    films = [(scene, scene.film()) for scene in examples.scenes if names and scene.film is not None]
     if not films:
         return {}, ""
     backdrop = learn_backdrop(_pictures(films), examples.floor)
@@ -91,19 +107,39 @@ def _learn_surfaces(
     first = [_first_poses(scene, near) for scene in scenes]
     touched = {name: _touched(name, scenes, first) for name in near}
     heights = {name: model.height for name, model in near.items()}
+    felt = {name: poses for name in unseen if (poses := poses_by_touch(name, scenes))}
+    for name, poses in felt.items():
+        _put(name, poses[0], first)
+        own = np.array([T[:3, 3] for T in poses[0] if T is not None])
+        touched[name], heights[name] = np.zeros_like(own), float(own[0, 2])
     surfaces = build_surfaces(_frames(films, first, backdrop), touched, heights, backdrop)
+    stood: dict[str, Standing] = {}
+    for _ in range(ROUNDS if felt else 0):
+        stood = settle_all(surfaces, [film for _, film in films], felt, backdrop)
+        for name, standing in stood.items():
+            _put(name, standing.poses[0], first)
+        surfaces = build_surfaces(_frames(films, first, backdrop), touched, heights, backdrop)
     models = {}
     for name, surface in surfaces.items():
         standing = [(scene.views, T[name]) for scene, T in zip(scenes, first, strict=True) if name in T]
         surface = replace(surface, pattern=_pattern(surface, standing, backdrop))
         typical, rival = _agreements(surface, standing, backdrop, name in examples.told_apart)
-        models[name] = SurfaceModel(name, surface, backdrop, heights[name], typical, rival, near[name])
+        model = SurfaceModel(name, surface, backdrop, heights[name], typical, rival, near.get(name))
+        models[name] = with_places(model, stood[name], scenes) if name in stood else model
         logger.info("surface of %s: %d coloured points, agreement %.2f, without it %.2f",
                     name, len(surface.coloured), typical, rival)  # fmt: skip
     return models, "the hand's camera shows too little of its surface"
 
 
-def _pictures(films: Sequence[tuple[DemonstrationScene, Sequence[Moment]]]) -> dict[str, list[View]]:
+def _put(name: str, poses: Sequence[Array | None], first: Sequence[dict[str, Array]]) -> None:
+    """Write down where an object stands in each scene; nowhere in those without a pose."""
+    for T, standing in zip(poses, first, strict=True):
+        standing.pop(name, None)
+        if T is not None:
+            standing[name] = T
+
+
+def _pictures(films: Films) -> dict[str, list[View]]:
     """All pictures by camera."""
     pictures: dict[str, list[View]] = {}
     for _, moments in films:
@@ -123,7 +159,7 @@ def _first_poses(scene: DemonstrationScene, near: Mapping[str, PatchModel]) -> d
 
 
 def _frames(
-    films: Sequence[tuple[DemonstrationScene, Sequence[Moment]]],
+    films: Films,
     first: Sequence[Mapping[str, Array]],
     backdrop: Backdrop,
 ) -> list[Frame]:
@@ -233,7 +269,7 @@ def _pattern(surface: Surface, standing: FirstSights, backdrop: Backdrop) -> flo
     """How much the pattern of an object tells, from 0 to 1: by how well the demonstrations show it."""
     seen = []
     for views, T in standing:
-        sights = {c: sight_of(view, c, backdrop, None) for c, view in views.items()}
+        sights = sights_of(views, backdrop)
         seen.append(correlation_at(surface, sights, np.array([*T[:3, 3], 0.0])))
     low, high = PATTERN_SEEN
     return float(np.clip((np.median(seen) - low) / (high - low), 0, 1)) if seen else 0.0
@@ -251,7 +287,7 @@ def _agreements(
         return 0.05, 0.0
     own = []
     for views, T in standing:
-        sights = {c: sight_of(view, c, backdrop, None) for c, view in views.items()}
+        sights = sights_of(views, backdrop)
         own.append(score_at(surface, sights, np.array([*T[:3, 3], 0.0])))
     typical = float(np.clip(np.median(own), 0.05, 1.0))
     another = ANOTHER_SHARE * typical if are_several else np.inf
@@ -271,7 +307,7 @@ def _best_without(
     ground = over_table(surface, backdrop.reach, float(T_world_obj[2, 3]))
     points, best = np.empty((0, 3)), Place(np.append(T_world_obj[:3, 3], se3.yaw_of(T_world_obj)), np.inf)
     for _ in range(MOST_OF_A_KIND):
-        T = se3.from_yaw(best.pose[:3], float(best.pose[3]))
+        T = best.T_world_obj
         points = np.concatenate([points, se3.apply(T, surface.points)])
         covered = {c: _covered(view, points, surface.spacing) for c, view in views.items()}
         sights = {c: sight_of(view, c, backdrop, covered[c]) for c, view in views.items()}

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any, ClassVar
 
@@ -13,14 +13,13 @@ from numpy.typing import NDArray
 from lerobot_openspm.geometry import se3
 from lerobot_openspm.geometry.se3 import Array
 from lerobot_openspm.perception.objects.base import Look, Record
-from lerobot_openspm.perception.objects.patches.model import PatchModel
+from lerobot_openspm.perception.objects.patches.match import REACH_M
+from lerobot_openspm.perception.objects.patches.model import UNSEEN, PatchModel
 from lerobot_openspm.perception.objects.surface.backdrop import Backdrop
 from lerobot_openspm.perception.objects.surface.compare import FINE_POINTS, score_at
 from lerobot_openspm.perception.objects.surface.earlier import shown_before, sights_before
 from lerobot_openspm.perception.objects.surface.search import (
     FINE_STEPS,
-    QUICK_POINTS,
-    QUICK_STEPS,
     SAME_PLACE_M,
     Freedom,
     Place,
@@ -32,6 +31,8 @@ from lerobot_openspm.perception.objects.surface.search import (
     over_table,
     refine,
     search,
+    settle,
+    settle_near,
 )
 from lerobot_openspm.perception.objects.surface.sight import Sight, Surface, sight_of
 from lerobot_openspm.perception.objects.surface.tipped import has_tipped, lying
@@ -59,6 +60,8 @@ LIFTED_M = 0.02
 # Of the typical agreement around where an object is expected: from here on it is seen there; below that it
 # is gone; in between something may hide it.
 KEPT_SHARE, GONE_SHARE = 0.7, 0.4
+# What first pictures show badly where it stood is seen there from this agreement on.
+LEAST_SEEN = 0.15
 # That it is where it was expected needs less evidence, if the pictures tell its place as sharply as this:
 # from this share on nothing is in doubt. What tells it more vaguely than that is no evidence. Metres.
 SURE_SHARE, SHARP_M, VAGUE_M = 0.8, 0.004, 0.008
@@ -85,7 +88,8 @@ class SurfaceModel:
         height: World z of its frame when it stands on the table, metres.
         typical_agreement: How well the demonstrations' first pictures agree with its surface.
         rival_agreement: How well they agree with it elsewhere at most, where it is not.
-        near: Patches, which are more exact where it stood in the demonstrations.
+        near: Patches, more exact where it stood in demonstrations; None of what first pictures show badly.
+        shown: Of that, where it stood (x, y, z), and how well first pictures agreed there ``(k, 4)``.
     """
 
     kind: ClassVar[str] = "surface"
@@ -97,7 +101,8 @@ class SurfaceModel:
     height: float
     typical_agreement: float
     rival_agreement: float
-    near: PatchModel
+    near: PatchModel | None
+    shown: Array = field(default_factory=lambda: np.zeros((0, 4)))
 
     @property
     def yaw_period(self) -> float:
@@ -110,7 +115,7 @@ class SurfaceModel:
         return self.surface.coloured
 
     @property
-    def patches(self) -> PatchModel:
+    def patches(self) -> PatchModel | None:
         """See :class:`lerobot_openspm.perception.objects.base.KnownObject`."""
         return self.near
 
@@ -131,10 +136,12 @@ class SurfaceModel:
         there = None if expected is None or not self._is_away(expected) else self._at(look, expected)
         if there is not None and (followed := _followed(there)).status == "found":
             return followed
-        near = self.near.localise(look)
+        near = self._where_shown(look) if self.near is None else self.near.localise(look)
         if expected is not None and self._is_lifted(expected):
             return near  # in the hand, or where that put it, it is hidden more often than gone
-        if near.status == "found" and expected is not None and _apart_m(near, expected) < FOLLOWED_M:
+        if near.status == "found" and _apart_m(near.T_world_obj, expected) < FOLLOWED_M:
+            return near
+        if near.status == "found" and expected is None and self.near is None:
             return near
         sights = self._sights(look)
         if self.name in look.told_apart and expected is None:
@@ -162,17 +169,31 @@ class SurfaceModel:
         if found.status == "found":
             return found
         found = self._unless_tipped(look, sights, found)
-        if expected is None:
+        if expected is None or self.near is None:
             return found
         # Where its patches cannot tell that it is gone, it may be hidden.
         return replace(found, visible=min(found.visible, near.visible))
+
+    def _where_shown(self, look: Look) -> PoseEstimate:
+        """Where the demonstrations showed it, if first pictures show it there as they did."""
+        sights, freedom = self._sights(look), self._freedom
+        places = settle_near(self.surface, sights, self.shown[:, :3], freedom, REACH_M)
+        enough = np.maximum(KEPT_SHARE * self.shown[:, 3], LEAST_SEEN)
+        seen = [one for one, least in zip(places, enough, strict=True) if one.score >= least]
+        if not seen:
+            return UNSEEN
+        seen.sort(key=lambda place: -place.score)
+        others = tuple(one.T_world_obj for one in seen[1:])
+        return replace(self._estimate(look, sights, seen[:1]), status="found", others=others)
 
     def _is_lifted(self, T_expected: Array) -> bool:
         return bool(T_expected[2, 3] - self.height > LIFTED_M)
 
     def _is_away(self, T_expected: Array) -> bool:
         """Whether its patches cannot show it where it is expected."""
-        return self._is_lifted(T_expected) or not self.near.reaches(T_expected, FOLLOWED_M)
+        if self.near is None or self._is_lifted(T_expected):
+            return True
+        return not self.near.reaches(T_expected, FOLLOWED_M)
 
     def _at(self, look: Look, T_expected: Array) -> PoseEstimate:
         """What is seen of it around where it is expected.
@@ -257,9 +278,7 @@ class SurfaceModel:
         return Freedom(not self.surface.is_round)
 
     def _refined(self, sights: Mapping[str, Sight], T_world_obj: Array) -> Place:
-        pose, free = _pose(T_world_obj), self._freedom
-        quick = refine(self.surface, sights, pose, free, QUICK_POINTS, QUICK_STEPS)
-        return refine(self.surface, sights, quick.pose, free, FINE_POINTS, FINE_STEPS)
+        return settle(self.surface, sights, _pose(T_world_obj), self._freedom)
 
     def _estimate(
         self, look: Look, sights: Mapping[str, Sight], places: list[Place], told_apart: bool = False
@@ -271,13 +290,11 @@ class SurfaceModel:
         most = RIVAL_SHARE * likelihood(self.surface, best)
         is_rivalled = any(likelihood(self.surface, one) > most for one in rivals)
         status = "not_found" if share < self._needed(best) else "ambiguous" if is_rivalled else "found"
-        T = se3.from_yaw(best.pose[:3], float(best.pose[3]))
+        T = best.T_world_obj
         covariance = covariance_at(self.surface, sights, best.pose, not self.surface.is_round)
         visible = look.seen_share(se3.apply(T, self.surface.coloured))
         more = [one for one in rivals if self._is_another(one, best, told_apart)]
-        others = tuple(
-            se3.from_yaw(one.pose[:3], float(one.pose[3])) for one in distinct(self.surface, more, apart)
-        )
+        others = tuple(one.T_world_obj for one in distinct(self.surface, more, apart))
         sure = WITHOUT_PATTERN + (1 - WITHOUT_PATTERN) * self.surface.pattern
         return PoseEstimate(status, T, covariance, sure * float(np.clip(share, 0, 1)), visible, None, others)
 
@@ -292,7 +309,9 @@ class SurfaceModel:
 
     def to_record(self) -> Record:
         """See :class:`lerobot_openspm.perception.objects.base.KnownObject`."""
-        near_fields, near_arrays = self.near.to_record()
+        near_fields, near_arrays = (
+            (None, {"shown": self.shown}) if self.near is None else self.near.to_record()
+        )
         table = self.backdrop.table
         fields = {
             "kind": self.kind, "name": self.name, "height": self.height,
@@ -323,8 +342,8 @@ def _followed(seen: PoseEstimate) -> PoseEstimate:
     return seen
 
 
-def _apart_m(estimate: PoseEstimate, T_world_obj: Array) -> float:
-    return float(np.linalg.norm(estimate.T_world_obj[:3, 3] - T_world_obj[:3, 3]))
+def _apart_m(T: Array, other: Array | None) -> float:
+    return np.inf if other is None else float(np.linalg.norm(T[:3, 3] - other[:3, 3]))
 
 
 def _pose(T_world_obj: Array) -> Array:

@@ -32,9 +32,11 @@ BOUNDS = {
 
 def from_record(fields: Mapping[str, Any], arrays: Mapping[str, NDArray[Any]], where: str) -> SurfaceModel:
     """Inverse of :meth:`SurfaceModel.to_record`. Raises MemoryFormatError, which names ``where``."""
-    name, near, cameras = fields["name"], fields.get("near"), fields.get("hand_cameras")
-    if not isinstance(near, Mapping) or near.get("kind") != PatchModel.kind:
-        raise MemoryFormatError(f"{where}: 'near' of {name!r} must be an object of kind {PatchModel.kind}")
+    name, near, cameras = fields["name"], fields.get("near", ""), fields.get("hand_cameras")
+    if near is not None and (not isinstance(near, Mapping) or near.get("kind") != PatchModel.kind):
+        raise MemoryFormatError(
+            f"{where}: 'near' of {name!r} must be an object of kind {PatchModel.kind}, or null"
+        )
     if not isinstance(cameras, list) or not all(isinstance(one, str) for one in cameras):
         raise MemoryFormatError(f"{where}: 'hand_cameras' of {name!r} must be a list of camera keys")
     points = records.points(arrays, where, MAX_POINTS)
@@ -71,5 +73,7 @@ def from_record(fields: Mapping[str, Any], arrays: Mapping[str, NDArray[Any]], w
     return SurfaceModel(
         name, Surface(points, normals, colours, numbers["spacing"], numbers["pattern"]), backdrop,
         numbers["height"],
-        numbers["typical_agreement"], numbers["rival_agreement"], patches.from_record(near, own, where),
+        numbers["typical_agreement"], numbers["rival_agreement"],
+        None if near is None else patches.from_record(near, own, where),
+        records.array(own, "shown", (-1, 4), where, np.float64) if near is None else np.zeros((0, 4)),
     )  # fmt: skip

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from lerobot_openspm.geometry import se3
 from lerobot_openspm.geometry.se3 import Array
 from lerobot_openspm.perception.objects.surface.compare import (
     ENOUGH_SHOWN,
@@ -59,6 +60,11 @@ class Place:
 
     pose: Array
     score: float
+
+    @property
+    def T_world_obj(self) -> Array:
+        """The pose as a transform ``(4, 4)``."""
+        return se3.from_yaw(self.pose[:3], float(self.pose[3]))
 
 
 @dataclass(frozen=True)
@@ -300,6 +306,23 @@ def refine(
                 break
             pose = pose + moves[best]
     return Place(pose, score)
+
+
+def settle(surface: Surface, sights: Mapping[str, Sight], pose: Array, freedom: Freedom) -> Place:
+    """The best place around a pose (x, y, z, yaw) ``(4,)``, sought coarsely and then finely."""
+    quick = refine(surface, sights, pose, freedom, QUICK_POINTS, QUICK_STEPS)
+    return refine(surface, sights, quick.pose, freedom, FINE_POINTS, FINE_STEPS)
+
+
+def settle_near(
+    surface: Surface, sights: Mapping[str, Sight], points: Array, freedom: Freedom, reach_m: float
+) -> list[Place]:
+    """The best place around each of some points ``(k, 3)``; one that is out of reach agrees by 0."""
+    places = [settle(surface, sights, np.append(point, 0.0), freedom) for point in points]
+    away_m = [np.linalg.norm(one.pose[:3] - point) for one, point in zip(places, points, strict=True)]
+    return [
+        one if away <= reach_m else Place(one.pose, 0.0) for one, away in zip(places, away_m, strict=True)
+    ]
 
 
 def covariance_at(surface: Surface, sights: Mapping[str, Sight], pose: Array, turns: bool) -> Array:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 
@@ -187,3 +188,8 @@ def sight_of(view: View, camera: str, backdrop: Backdrop, hidden: Mask | None) -
     c = view.camera
     K = np.array([[c.fx, 0, c.cx], [0, c.fy, c.cy], [0, 0, 1]])
     return Sight(view, (K @ T_cam_world).astype(np.float32), colours * WEIGHTS, table, covered)
+
+
+def sights_of(views: Mapping[str, View], backdrop: Backdrop) -> dict[str, Sight]:
+    """Prepare views by camera of which nothing is hidden but what the hand hides in its own."""
+    return {camera: sight_of(view, camera, backdrop, None) for camera, view in views.items()}

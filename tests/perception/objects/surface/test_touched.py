@@ -1,0 +1,103 @@
+"""What the first pictures do not show is learned from where it was touched, and from the film."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+from tests.perception.objects.surface.filmed import HOME, MIDDLES, demonstration, looking_down, views_at
+
+from lerobot_openspm.geometry import se3
+from lerobot_openspm.geometry.camera import project
+from lerobot_openspm.perception.objects import store
+from lerobot_openspm.perception.objects.base import Look
+from lerobot_openspm.perception.objects.kinds import learn_objects
+from lerobot_openspm.perception.objects.surface.model import SurfaceModel
+from lerobot_openspm.perception.objects.surface.touched import poses_by_touch
+from lerobot_openspm.types import ContactCue, DemonstrationScene, View
+
+
+def covered(view, rng):
+    """A view in which something else each time stands before most of the cup."""
+    x, y, _ = MIDDLES["cup"]
+    (u, v), _ = project(view.camera, view.T_world_cam, np.array([x, y, 0.03]))
+    image = view.image.copy()
+    rows, columns = slice(int(v) - 14, int(v) + 14), slice(int(u) - 16, int(u) + 10)
+    image[rows, columns] = rng.integers(0, 255, (28, 26, 3))
+    return View(image, view.camera, view.T_world_cam)
+
+
+def badly_shown(rng):
+    """A demonstration whose fixed camera hardly sees the cup; the hand's camera passes over it."""
+    scene = demonstration(rng)
+    views = {"front": covered(scene.views["front"], rng)}
+    film = scene.film()
+    moments = [dataclasses.replace(film[0], views=views), *film[1:]]
+    return dataclasses.replace(scene, views=views, film=lambda: moments)
+
+
+@pytest.fixture(scope="module")
+def learned():
+    rng = np.random.default_rng(1)
+    return learn_objects([badly_shown(rng) for _ in range(6)], np.random.default_rng(0))
+
+
+def test_what_is_hidden_in_first_pictures_is_learned_from_the_film(learned):
+    cup, block = learned.models["cup"], learned.models["block"]
+    assert isinstance(cup, SurfaceModel)
+    assert cup.near is None
+    assert block.near is not None
+    assert len(block.shown) == 0
+    points = cup.surface.coloured + np.array([0, 0, cup.height])
+    assert np.percentile(points[:, 2], 95) == pytest.approx(0.06, abs=0.015)
+    assert cup.surface.radius == pytest.approx(0.04, abs=0.015)
+
+
+@pytest.mark.parametrize("off", [(0.0, 0.0), (0.02, -0.01)])
+def test_it_is_found_about_where_it_was_shown_and_exactly_once_the_hand_sees_it(learned, off):
+    cup, rng = learned.models["cup"], np.random.default_rng(3)
+    x, y = np.add(MIDDLES["cup"][:2], off)
+    seen = views_at({"cup": se3.from_yaw([x, y, 0.0], 0.0)}, looking_down(x - 0.05, y, 0.35))
+    front = covered(seen["front"], rng)
+
+    def away_m(found):
+        middle = se3.apply(found.T_world_obj, np.array([[*cup.surface.middle, 0.0]]))[0, :2]
+        return np.linalg.norm(middle - [x, y])
+
+    first = cup.localise(Look({"front": front}))
+    assert first.status == "found"
+    assert away_m(first) < 0.04
+    expected = {"cup": first.T_world_obj}
+    nearer = cup.localise(Look({"front": front, "hand": seen["hand"]}, expected=expected))
+    assert nearer.status == "found"
+    assert away_m(nearer) < 0.006
+
+
+def test_it_is_not_found_where_it_was_shown_if_it_is_gone(learned):
+    cup = learned.models["cup"]
+    view = views_at({}, looking_down(*HOME))["front"]
+    assert cup.localise(Look({"front": view})).status == "not_found"
+
+
+def test_a_record_tells_where_it_was_shown(learned):
+    cup = learned.models["cup"]
+    again = store.from_parts(*store.to_parts(cup), "here")
+    assert isinstance(again, SurfaceModel)
+    assert again.near is None
+    np.testing.assert_allclose(again.shown, cup.shown)
+
+
+def test_touches_tell_poses_by_place_of_which_the_most_touched_comes_first():
+    """Two plates: the second one was not touched in every demonstration."""
+    left, right = np.array([0.0, -0.3, 0.1]), np.array([0.0, 0.3, 0.12])
+
+    def scene(*touches):
+        return DemonstrationScene({}, touches)
+
+    first = ContactCue("plate", left, "release", "task: 1")
+    second = ContactCue("plate", right, "release", "task: 3")
+    poses = poses_by_touch("plate", [scene(second, first), scene(first), scene()])
+    assert [[None if T is None else T[:3, 3].tolist() for T in place] for place in poses] == [
+        [[0.0, -0.3, 0.1], [0.0, -0.3, 0.1], None],
+        [[0.0, 0.3, 0.1], None, None],
+    ]
+    assert poses_by_touch("bowl", [scene(first)]) == []
