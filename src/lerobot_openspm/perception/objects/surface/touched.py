@@ -17,15 +17,24 @@ from lerobot_openspm.perception.objects.base import Look
 from lerobot_openspm.perception.objects.patches.stillness import places_of
 from lerobot_openspm.perception.objects.surface.backdrop import Backdrop, distinct
 from lerobot_openspm.perception.objects.surface.compare import score_at
-from lerobot_openspm.perception.objects.surface.model import SurfaceModel
-from lerobot_openspm.perception.objects.surface.search import SAME_PLACE_M, Freedom, Place, settle
-from lerobot_openspm.perception.objects.surface.sight import Surface, sight_of, sights_of
+from lerobot_openspm.perception.objects.surface.model import YAWS, SurfaceModel
+from lerobot_openspm.perception.objects.surface.search import (
+    SAME_PLACE_M,
+    Freedom,
+    Place,
+    over_table,
+    search,
+    settle,
+)
+from lerobot_openspm.perception.objects.surface.sight import Sight, Surface, sight_of, sights_of
 from lerobot_openspm.types import ContactCue, DemonstrationScene, Moment, View
 
 # Pictures that show this share of an object tell where it stands; so many of a film are enough.
 SHOWN_SHARE, MAX_VIEWS = 0.5, 8
 # A film that agrees with the surface by less than this share of what most do shows something else.
 ALIKE_SHARE = 0.7
+# Another of the kind may have been touched elsewhere on it, this far from where the first one was, metres.
+AROUND_M = 0.12
 
 
 def poses_by_touch(name: str, scenes: Sequence[DemonstrationScene]) -> list[list[Array | None]]:
@@ -78,21 +87,19 @@ def settled(
         backdrop: What no object is.
     """
 
-    def places(poses: Sequence[Array | None]) -> list[Place | None]:
+    def places(poses: Sequence[Array | None], around_m: float) -> list[Place | None]:
         return [
-            None if T is None else _settled(surface, _shown(name, surface, film, T, backdrop), T, backdrop)
+            None if T is None else _place(surface, _sights(name, surface, film, T, backdrop), T, around_m)
             for film, T in zip(films, poses, strict=True)
         ]
 
-    own = places(touched[0])
+    own = places(touched[0], 0.0)
     usual = float(np.median([place.score for place in own if place is not None] or [0.0]))
     stands = [_believed(own, ALIKE_SHARE * usual)]
     if usual <= 0:
         return None
-    off = middle(stands[0]) - middle(touched[0])
     for poses in touched[1:]:
-        about = [None if T is None else T @ se3.from_yaw(off, 0.0) for T in poses]
-        seen = _believed(places(about), ALIKE_SHARE * usual)
+        seen = _believed(places(poses, AROUND_M), ALIKE_SHARE * usual)
         is_often = 2 * sum(T is not None for T in seen) >= sum(T is not None for T in poses)
         if is_often and all(np.linalg.norm(middle(seen) - middle(one)) > SAME_PLACE_M for one in stands):
             stands.append(seen)
@@ -142,24 +149,23 @@ def _seen_first(
     return float(np.clip(np.median(scores), 0.0, 1.0))
 
 
-def _settled(
-    surface: Surface, views: Mapping[str, list[View]], T_world_obj: Array, backdrop: Backdrop
+def _place(
+    surface: Surface, sights: Mapping[str, Sight], T_world_obj: Array, around_m: float
 ) -> Place | None:
-    """Where some views by camera show a surface best, near a pose; None where there are no views."""
-    sights = {
-        f"{camera}, picture {i}": sight_of(view, camera, backdrop, None)
-        for camera, seen in views.items()
-        for i, view in enumerate(seen)
-    }
+    """Where some views show a surface best, near a pose or at most so far from it; None without views."""
     if not sights:
         return None
-    return settle(surface, sights, np.array([*T_world_obj[:3, 3], 0.0]), Freedom(turns=False))
+    if around_m == 0:
+        return settle(surface, sights, np.array([*T_world_obj[:3, 3], 0.0]), Freedom(turns=False))
+    area = T_world_obj[:2, 3] + around_m * np.array([[-1.0], [1.0]])
+    ground = over_table(surface, area, float(T_world_obj[2, 3]))
+    return search(surface, sights, ground, YAWS[:1], Freedom(turns=False))[0]
 
 
-def _shown(
+def _sights(
     name: str, surface: Surface, film: Sequence[Moment], T_world_obj: Array, backdrop: Backdrop
-) -> dict[str, list[View]]:
-    """The hand's pictures by camera that show much of an object which nothing has moved yet."""
+) -> dict[str, Sight]:
+    """Some of the hand's pictures that show much of an object which nothing has moved yet."""
     points = se3.apply(T_world_obj, surface.coloured)
     shown: dict[str, list[View]] = {}
     for moment in film:
@@ -169,7 +175,11 @@ def _shown(
                 continue
             if Look({camera: view}, hidden={camera: hidden}).seen_share(points) >= SHOWN_SHARE:
                 shown.setdefault(camera, []).append(view)
-    return {camera: _some(distinct(views)) for camera, views in shown.items()}
+    return {
+        f"{camera}, picture {i}": sight_of(view, camera, backdrop, None)
+        for camera, views in shown.items()
+        for i, view in enumerate(_some(distinct(views)))
+    }
 
 
 def _some(views: list[View]) -> list[View]:
