@@ -4,6 +4,7 @@ import dataclasses
 
 import numpy as np
 import pytest
+from tests.perception.drawn_world import SHAPES, hand_camera, render
 from tests.perception.objects.surface.filmed import HOME, MIDDLES, demonstration, looking_down, views_at
 
 from lerobot_openspm.geometry import se3
@@ -12,8 +13,8 @@ from lerobot_openspm.perception.objects import store
 from lerobot_openspm.perception.objects.base import Look
 from lerobot_openspm.perception.objects.kinds import learn_objects
 from lerobot_openspm.perception.objects.surface.model import SurfaceModel
-from lerobot_openspm.perception.objects.surface.touched import poses_by_touch
-from lerobot_openspm.types import ContactCue, DemonstrationScene, View
+from lerobot_openspm.perception.objects.surface.touched import middle, poses_by_touch, settled
+from lerobot_openspm.types import ContactCue, DemonstrationScene, Moment, View
 
 
 def covered(view, rng):
@@ -84,6 +85,29 @@ def test_a_record_tells_where_it_was_shown(learned):
     assert isinstance(again, SurfaceModel)
     assert again.near is None
     np.testing.assert_allclose(again.shown, cup.shown)
+
+
+@pytest.mark.parametrize("has_another", [True, False])
+def test_another_of_the_kind_is_found_around_where_it_was_touched(learned, has_another):
+    cup = learned.models["cup"]
+    at = {"first": np.array([0.0, -0.15]), "other": np.array([0.0, 0.2])}
+    # The frame of a cup that stands there, about as it was learned.
+    T = {name: se3.from_yaw([*(xy - cup.surface.middle), cup.height], 0.0) for name, xy in at.items()}
+    shape = SHAPES["cup"]
+    stand = [(shape, se3.from_yaw([*at[name], 0.0], 0.0)) for name in at if name == "first" or has_another]
+    places = [(x, y, 0.35) for y in (-0.15, 0.2) for x in (-0.1, 0.0, 0.05)]
+    hands = [hand_camera(looking_down(*place)) for place in places]
+    film = [
+        # The first touch moves the cup, by all that is known.
+        Moment({"hand": render(stand, None, hand)["hand"]}, frozenset({"cup"} if i >= 3 else ()))
+        for i, hand in enumerate(hands)
+    ]
+    touched = [[T["first"]], [T["other"] @ se3.from_yaw([0.04, -0.05, 0.0], 0.0)]]
+    stood = settled("cup", cup.surface, [film], touched, cup.backdrop)
+    assert stood is not None
+    found = [middle(poses) for poses in stood.poses]
+    expected = [T["first"], T["other"]] if has_another else [T["first"]]
+    np.testing.assert_allclose(found, [one[:3, 3] for one in expected], atol=0.006)
 
 
 def test_touches_tell_poses_by_place_of_which_the_most_touched_comes_first():

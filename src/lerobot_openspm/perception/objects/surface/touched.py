@@ -87,19 +87,22 @@ def settled(
         backdrop: What no object is.
     """
 
-    def places(poses: Sequence[Array | None], around_m: float) -> list[Place | None]:
+    def places(
+        poses: Sequence[Array | None], films: Sequence[Sequence[Moment]], around_m: float
+    ) -> list[Place | None]:
         return [
-            None if T is None else _place(surface, _sights(name, surface, film, T, backdrop), T, around_m)
+            None if T is None else _place(surface, _sights(surface, film, T, backdrop), T, around_m)
             for film, T in zip(films, poses, strict=True)
         ]
 
-    own = places(touched[0], 0.0)
+    before = [[moment for moment in film if name not in moment.moved] for film in films]
+    own = places(touched[0], before, 0.0)
     usual = float(np.median([place.score for place in own if place is not None] or [0.0]))
     stands = [_believed(own, ALIKE_SHARE * usual)]
     if usual <= 0:
         return None
     for poses in touched[1:]:
-        seen = _believed(places(poses, AROUND_M), ALIKE_SHARE * usual)
+        seen = _believed(places(poses, films, AROUND_M), ALIKE_SHARE * usual)
         is_often = 2 * sum(T is not None for T in seen) >= sum(T is not None for T in poses)
         if is_often and all(np.linalg.norm(middle(seen) - middle(one)) > SAME_PLACE_M for one in stands):
             stands.append(seen)
@@ -163,15 +166,15 @@ def _place(
 
 
 def _sights(
-    name: str, surface: Surface, film: Sequence[Moment], T_world_obj: Array, backdrop: Backdrop
+    surface: Surface, film: Sequence[Moment], T_world_obj: Array, backdrop: Backdrop
 ) -> dict[str, Sight]:
-    """Some of the hand's pictures that show much of an object which nothing has moved yet."""
+    """Some of the hand's pictures that show much of an object at a pose."""
     points = se3.apply(T_world_obj, surface.coloured)
     shown: dict[str, list[View]] = {}
     for moment in film:
         for camera, view in moment.views.items():
             hidden = backdrop.hidden(camera, view)
-            if name in moment.moved or hidden is None:
+            if hidden is None:
                 continue
             if Look({camera: view}, hidden={camera: hidden}).seen_share(points) >= SHOWN_SHARE:
                 shown.setdefault(camera, []).append(view)
