@@ -106,6 +106,19 @@ def test_what_is_put_beside_a_thing_does_not_touch_it(relation, touched):
     assert [cue.name for cue in contact_cues(item)] == touched
 
 
+def test_a_demonstration_that_is_cut_before_the_hand_lets_go_would_have_let_go_there():
+    task = "put the bowl on the plate"
+    episode = pick_and_place()[0].episode(0, task)
+    own = find_key_poses(episode, robot())
+    place = next(i for i, pose in enumerate(own) if pose.phase == "place")
+    item = MinedEpisode(episode, tuple(own[: place + 1]), parse_instruction(task))
+    cue = contact_cues(item)[-1]
+    assert (cue.name, cue.kind) == ("plate", "release")
+    assert_array_equal(cue.point_world, own[place].T_world_ee[:3, 3])
+    carrying = replace(item, key_poses=tuple(own[:place]))
+    assert [cue.name for cue in contact_cues(carrying)] == ["bowl"]
+
+
 @pytest.mark.parametrize(
     ("task", "touched"),
     [

@@ -317,7 +317,9 @@ def contact_cues(item: MinedEpisode) -> tuple[ContactCue, ...]:
             add(sub_task.target, pose, "grasp")
         # What is opened first was shut in the first frame, so that the release is inside it.
         is_seen = sub_task.relation in UPON and (sub_task.landmark, sub_task.part) not in opened
-        if pose.phase == "release" and is_seen:
+        # A demonstration that is cut when its goal is reached would have let go there.
+        is_cut = pose.phase == "place" and pose is item.key_poses[-1]
+        if (pose.phase == "release" or is_cut) and is_seen:
             add(sub_task.landmark, pose, "release")
     for before, pose in pairwise(item.key_poses):
         pushing, pushed = (sub_task_of(one, item.sub_tasks) for one in (pose, before))
