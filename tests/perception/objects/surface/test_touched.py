@@ -7,6 +7,7 @@ import pytest
 from tests.perception.drawn_world import SHAPES, hand_camera, render
 from tests.perception.objects.surface.filmed import HOME, MIDDLES, demonstration, looking_down, views_at
 
+from lerobot_openspm.errors import MemoryFormatError
 from lerobot_openspm.geometry import se3
 from lerobot_openspm.geometry.camera import project
 from lerobot_openspm.perception.objects import store
@@ -85,6 +86,15 @@ def test_a_record_tells_where_it_was_shown(learned):
     assert isinstance(again, SurfaceModel)
     assert again.near is None
     np.testing.assert_allclose(again.shown, cup.shown)
+
+
+@pytest.mark.parametrize(
+    "shown", [np.zeros((0, 4)), np.zeros((65, 4)), np.full((1, 4), 1.5), np.full((1, 4), -0.1)]
+)
+def test_a_record_that_would_be_looked_for_at_many_places_or_none_is_refused(learned, shown):
+    fields, arrays = store.to_parts(learned.models["cup"])
+    with pytest.raises(MemoryFormatError, match=f"'cup' was shown at {len(shown)} places, expected 1 to 64"):
+        store.from_parts(fields, {**arrays, "near.shown": shown}, "here")
 
 
 @pytest.mark.parametrize("has_another", [True, False])

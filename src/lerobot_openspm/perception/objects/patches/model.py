@@ -36,8 +36,6 @@ CONSISTENT_M = 0.005
 FOUND_CORRELATION = 0.5
 INTRINSICS = ("width", "height", "fx", "fy", "cx", "cy")
 MAX_PROBES, MAX_PIXELS = 64, 4096
-# What is told where no patch can be sought.
-UNSEEN = PoseEstimate("not_found", np.eye(4), np.diag([1.0, 1.0, 1.0, UNKNOWN_YAW_STD**2]), 0.0, visible=0.0)
 
 
 @dataclass(frozen=True)
@@ -102,7 +100,7 @@ class PatchModel:
                 correlations.append(float(np.median([one.correlation for one in sights])))
                 area_px += float(np.mean([patch.image[..., 0].size for patch in probe.patches]))
         if not correlations:
-            return UNSEEN
+            return unseen()
         return self._estimate(stds, places, correlations, area_px, look.expected.get(self.name))
 
     def _estimate(
@@ -168,6 +166,12 @@ class PatchModel:
                 arrays[f"{i}.patch.{j}"] = patch.image
         fields = {"height": self.height, "typical_correlation": self.typical_correlation, "probes": probes}
         return {"kind": self.kind, "name": self.name, **fields}, arrays
+
+
+def unseen() -> PoseEstimate:
+    """What is told of an object that can be sought nowhere."""
+    unknown = np.diag([1.0, 1.0, 1.0, UNKNOWN_YAW_STD**2])
+    return PoseEstimate("not_found", np.eye(4), unknown, 0.0, visible=0.0)
 
 
 def from_record(fields: Mapping[str, Any], arrays: Mapping[str, NDArray[Any]], where: str) -> PatchModel:

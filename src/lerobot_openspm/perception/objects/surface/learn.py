@@ -49,6 +49,8 @@ SIMILAR_M, SIMILAR_COLOUR = 0.03, 10.0
 BESIDE_M = 0.02
 # Silhouettes are filled in so many rounds, since one object's surface explains what is seen beside another.
 ROUNDS = 2
+# What is known by touch alone is sought in the films, and learned again from there, so often.
+SETTLING_ROUNDS = 2
 # Of an object whose colours vary less together than this with what the demonstrations' first pictures show,
 # the pattern tells nothing; from the second value on it tells all.
 PATTERN_SEEN = 0.55, 0.8
@@ -114,7 +116,7 @@ def _learn_surfaces(
         touched[name], heights[name] = np.zeros_like(own), float(own[0, 2])
     surfaces = build_surfaces(_frames(films, first, backdrop), touched, heights, backdrop)
     stood: dict[str, Standing] = {}
-    for _ in range(ROUNDS if felt else 0):
+    for _ in range(SETTLING_ROUNDS if felt else 0):
         stood = settle_all(surfaces, [film for _, film in films], felt, backdrop)
         for name, standing in stood.items():
             _put(name, standing.poses[0], first)

@@ -14,7 +14,7 @@ from lerobot_openspm.geometry import se3
 from lerobot_openspm.geometry.se3 import Array
 from lerobot_openspm.perception.objects.base import Look, Record
 from lerobot_openspm.perception.objects.patches.match import REACH_M
-from lerobot_openspm.perception.objects.patches.model import UNSEEN, PatchModel
+from lerobot_openspm.perception.objects.patches.model import PatchModel, unseen
 from lerobot_openspm.perception.objects.surface.backdrop import Backdrop
 from lerobot_openspm.perception.objects.surface.compare import FINE_POINTS, score_at
 from lerobot_openspm.perception.objects.surface.earlier import shown_before, sights_before
@@ -181,7 +181,7 @@ class SurfaceModel:
         enough = np.maximum(KEPT_SHARE * self.shown[:, 3], LEAST_SEEN)
         seen = [one for one, least in zip(places, enough, strict=True) if one.score >= least]
         if not seen:
-            return UNSEEN
+            return unseen()
         seen.sort(key=lambda place: -place.score)
         others = tuple(one.T_world_obj for one in seen[1:])
         return replace(self._estimate(look, sights, seen[:1]), status="found", others=others)

@@ -88,19 +88,19 @@ def settled(
     """
 
     def places(
-        poses: Sequence[Array | None], films: Sequence[Sequence[Moment]], around_m: float
+        poses: Sequence[Array | None], shown: Sequence[Sequence[Moment]], around_m: float
     ) -> list[Place | None]:
         return [
             None if T is None else _place(surface, _sights(surface, film, T, backdrop), T, around_m)
-            for film, T in zip(films, poses, strict=True)
+            for film, T in zip(shown, poses, strict=True)
         ]
 
     before = [[moment for moment in film if name not in moment.moved] for film in films]
     own = places(touched[0], before, 0.0)
     usual = float(np.median([place.score for place in own if place is not None] or [0.0]))
-    stands = [_believed(own, ALIKE_SHARE * usual)]
     if usual <= 0:
         return None
+    stands = [_believed(own, ALIKE_SHARE * usual)]
     for poses in touched[1:]:
         seen = _believed(places(poses, films, AROUND_M), ALIKE_SHARE * usual)
         is_often = 2 * sum(T is not None for T in seen) >= sum(T is not None for T in poses)
