@@ -13,6 +13,7 @@ from lerobot_openspm.geometry.camera import project
 from lerobot_openspm.perception.objects import store
 from lerobot_openspm.perception.objects.base import Look
 from lerobot_openspm.perception.objects.kinds import learn_objects
+from lerobot_openspm.perception.objects.surface import learn
 from lerobot_openspm.perception.objects.surface.model import SurfaceModel
 from lerobot_openspm.perception.objects.surface.touched import middle, poses_by_touch, settled
 from lerobot_openspm.types import ContactCue, DemonstrationScene, Moment, View
@@ -52,6 +53,14 @@ def test_what_is_hidden_in_first_pictures_is_learned_from_the_film(learned):
     points = cup.surface.coloured + np.array([0, 0, cup.height])
     assert np.percentile(points[:, 2], 95) == pytest.approx(0.06, abs=0.015)
     assert cup.surface.radius == pytest.approx(0.04, abs=0.015)
+
+
+def test_what_the_films_do_not_show_where_it_was_touched_has_no_surface(monkeypatch):
+    monkeypatch.setattr(learn, "settle_all", lambda *_: {})
+    rng = np.random.default_rng(1)
+    found = learn_objects([badly_shown(rng) for _ in range(6)], np.random.default_rng(0))
+    assert not isinstance(found.models.get("cup"), SurfaceModel)
+    assert isinstance(found.models["block"], SurfaceModel)
 
 
 @pytest.mark.parametrize("off", [(0.0, 0.0), (0.02, -0.01)])

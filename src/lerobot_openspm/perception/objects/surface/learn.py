@@ -118,18 +118,21 @@ def _learn_surfaces(
     stood: dict[str, Standing] = {}
     for _ in range(SETTLING_ROUNDS if felt else 0):
         stood = settle_all(surfaces, [film for _, film in films], felt, backdrop)
-        for name, standing in stood.items():
-            _put(name, standing.poses[0], first)
+        for name, one in stood.items():
+            _put(name, one.poses[0], first)
         surfaces = build_surfaces(_frames(films, first, backdrop), touched, heights, backdrop)
     models = {}
-    for name, surface in surfaces.items():
+    # What the films hardly show where it was touched is not known.
+    for name in [name for name in surfaces if name in stood or name not in felt]:
+        surface = surfaces[name]
         standing = [(scene.views, T[name]) for scene, T in zip(scenes, first, strict=True) if name in T]
         surface = replace(surface, pattern=_pattern(surface, standing, backdrop))
         typical, rival = _agreements(surface, standing, backdrop, name in examples.told_apart)
         model = SurfaceModel(name, surface, backdrop, heights[name], typical, rival, near.get(name))
-        models[name] = with_places(model, stood[name], scenes) if name in stood else model
+        model = with_places(model, stood[name], scenes) if name in stood else model
+        models[name] = model
         logger.info("surface of %s: %d coloured points, agreement %.2f, without it %.2f",
-                    name, len(surface.coloured), typical, rival)  # fmt: skip
+                    name, len(surface.coloured), model.typical_agreement, model.rival_agreement)  # fmt: skip
     return models, "the hand's camera shows too little of its surface"
 
 
