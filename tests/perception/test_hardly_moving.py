@@ -95,6 +95,15 @@ def test_no_place_is_where_it_is_shown_most_often(shown: list[DemonstrationScene
     assert often_at("bowl", shown) == []
 
 
+def test_a_task_begins_with_it_elsewhere_however_near_the_next_one_is():
+    """As the bowls of LIBERO-Spatial: four tasks, 4 cm from one to the next, and one that moves it about."""
+    places = [replace(scene.cues[0], place=f"task {i}")
+              for i, n in enumerate((5, 6, 5, 5)) for scene in touched_at((0.04 * i, n))]  # fmt: skip
+    about = [replace(scene.cues[0], place="task 4") for scene in touched_at((0.3, 4), side=FAR_M)]
+    shown = [DemonstrationScene({}, (cue,)) for cue in [*places, *about]]
+    assert often_at("bowl", shown) == shown[5:11]
+
+
 def patches(name: str) -> PatchModel:
     return PatchModel(name, (), 0.0, 1.0)
 

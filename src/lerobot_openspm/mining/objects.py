@@ -189,14 +189,14 @@ def detect_touched(
     grasped = {name: cue for name, cue in first.items() if cue.kind == "grasp"}
 
     def is_there(name: str, one: PoseEstimate) -> bool:
-        return min(_gaps_m(objects[name], _places(one), grasped[name])) <= ASTRAY_M
+        gaps_m = _gaps_m(objects[name], _places(one), grasped[name])
+        return one.status != "not_found" and min(gaps_m) <= ASTRAY_M
 
     estimates = detect(scene.views, objects, segmenter)
     told = {name: one for name, one in estimates.items() if name in grasped and len(objects[name].points)}
     astray = [name for name, one in told.items() if not is_there(name, one)]
     again = detect(scene.views, objects, segmenter, astray) if astray else {}
-    better = {name: again[name] for name in astray if again[name].status != "not_found"}
-    return {**estimates, **{name: one for name, one in better.items() if is_there(name, one)}}
+    return {**estimates, **{name: again[name] for name in astray if is_there(name, again[name])}}
 
 
 def _ends(

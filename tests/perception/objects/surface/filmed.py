@@ -23,11 +23,11 @@ def views_at(poses, T_world_ee):
     )
 
 
-def demonstration(rng, touched=("cup", "block"), aside_m=0.0):
+def demonstration(rng, touched=("cup", "block"), aside_m=0.0, cup_by=(0.0, 0.0, 0.0), task=""):
     """The hand comes from one side to the cup, grasps it, and carries it over the block.
 
     Or it touches the distractor; only what is named is told to have been touched. The block begins so far
-    from its usual place, along the table.
+    from its usual place, along the table, and the cup by so much from its own.
     """
     poses = {
         name: se3.from_yaw([x + dx, y + dy, 0.0], yaw)
@@ -36,13 +36,14 @@ def demonstration(rng, touched=("cup", "block"), aside_m=0.0):
         )
     }
     poses["block"][0, 3] += aside_m
+    poses["cup"][:3, 3] += cup_by
     grasp = poses["cup"][:3, 3] + [0.03, 0.0, 0.05] + rng.normal(0, 0.002, 3)
     release = poses["block"][:3, 3] + [0, 0, 0.12] + rng.normal(0, 0.002, 3)
     touch = poses["distractor"][:3, 3] + [0.02, 0.0, 0.04]
     cues = (
-        ContactCue("cup", grasp, "grasp"),
-        ContactCue("block", release, "release"),
-        ContactCue("distractor", touch, "contact"),
+        ContactCue("cup", grasp, "grasp", task),
+        ContactCue("block", release, "release", task),
+        ContactCue("distractor", touch, "contact", task),
     )
     places = [
         (

@@ -15,8 +15,17 @@ from lerobot_openspm.perception.objects.base import Look
 from lerobot_openspm.perception.objects.kinds import learn_objects
 from lerobot_openspm.perception.objects.surface import learn
 from lerobot_openspm.perception.objects.surface.model import SurfaceModel
-from lerobot_openspm.perception.objects.surface.touched import middle, poses_by_touch, settled
+from lerobot_openspm.perception.objects.surface.touched import (
+    Touched,
+    middle,
+    poses_beside,
+    poses_by_touch,
+    settled,
+)
 from lerobot_openspm.types import ContactCue, DemonstrationScene, Moment, View
+
+# How far from its usual place the cup begins in another task, metres.
+RAISED = (-0.1, 0.05, 0.08)
 
 
 def covered(view, rng):
@@ -50,6 +59,7 @@ def test_what_is_hidden_in_first_pictures_is_learned_from_the_film(learned):
     assert cup.near is None
     assert block.near is not None
     assert len(block.shown) == 0
+    assert len(cup.shown) == 1
     points = cup.surface.coloured + np.array([0, 0, cup.height])
     assert np.percentile(points[:, 2], 95) == pytest.approx(0.06, abs=0.015)
     assert cup.surface.radius == pytest.approx(0.04, abs=0.015)
@@ -103,7 +113,7 @@ def test_a_record_tells_where_it_was_shown(learned):
 def test_a_record_that_would_be_looked_for_at_many_places_or_none_is_refused(learned, shown):
     fields, arrays = store.to_parts(learned.models["cup"])
     with pytest.raises(MemoryFormatError, match=f"'cup' was shown at {len(shown)} places, expected 1 to 64"):
-        store.from_parts(fields, {**arrays, "near.shown": shown}, "here")
+        store.from_parts(fields, {**arrays, "shown": shown}, "here")
 
 
 @pytest.mark.parametrize("has_another", [True, False])
@@ -121,7 +131,8 @@ def test_another_of_the_kind_is_found_around_where_it_was_touched(learned, has_a
         Moment({"hand": render(stand, None, hand)["hand"]}, frozenset({"cup"} if i >= 3 else ()))
         for i, hand in enumerate(hands)
     ]
-    touched = [[T["first"]], [T["other"] @ se3.from_yaw([0.04, -0.05, 0.0], 0.0)]]
+    aside = T["other"] @ se3.from_yaw([0.04, -0.05, 0.0], 0.0)
+    touched = Touched([[T["first"]], [aside]], cup.height)
     stood = settled("cup", cup.surface, [film], touched, cup.backdrop)
     assert stood is not None
     found = [middle(poses) for poses in stood.poses]
@@ -138,9 +149,54 @@ def test_touches_tell_poses_by_place_of_which_the_most_touched_comes_first():
 
     first = ContactCue("plate", left, "release", "task: 1")
     second = ContactCue("plate", right, "release", "task: 3")
-    poses = poses_by_touch("plate", [scene(second, first), scene(first), scene()])
-    assert [[None if T is None else T[:3, 3].tolist() for T in place] for place in poses] == [
+    touched = poses_by_touch("plate", [scene(second, first), scene(first), scene()])
+    assert [[None if T is None else T[:3, 3].tolist() for T in place] for place in touched.poses] == [
         [[0.0, -0.3, 0.1], [0.0, -0.3, 0.1], None],
         [[0.0, 0.3, 0.1], None, None],
     ]
-    assert poses_by_touch("bowl", [scene(first)]) == []
+    assert poses_by_touch("bowl", [scene(first)]) is None
+
+
+def test_what_is_grasped_higher_stands_higher_and_what_is_let_go_higher_does_not():
+    low, high = np.array([0.0, -0.3, 0.1]), np.array([0.0, 0.3, 0.25])
+    seen = [se3.from_yaw([0.0, -0.28, 0.06], 0.0), None]
+    for kind, height in (("grasp", 0.21), ("release", 0.06)):
+        cues = [ContactCue("bowl", low, kind, "table: 0"), ContactCue("bowl", high, kind, "shelf: 0")]
+        touched = poses_beside("bowl", [DemonstrationScene({}, (cue,)) for cue in cues], seen, 0.06)
+        assert touched.is_seen
+        assert touched.poses[0] is not seen
+        assert touched.poses[0][0] is seen[0]
+        assert touched.poses[1][0] is None
+        np.testing.assert_allclose(touched.poses[1][1][:3, 3], [0.0, 0.3, height])
+
+
+@pytest.fixture(scope="module")
+def at_two_places():
+    """One task begins with the cup on the table, another one with it higher, elsewhere."""
+    rng = np.random.default_rng(1)
+    on_table = [demonstration(rng, task="from the table") for _ in range(6)]
+    raised = [demonstration(rng, cup_by=RAISED, task="from the shelf") for _ in range(4)]
+    return learn_objects([*on_table, *raised], np.random.default_rng(0)).models
+
+
+def test_where_a_task_begins_with_it_higher_is_learned_from_the_films(at_two_places):
+    cup = at_two_places["cup"]
+    assert isinstance(cup, SurfaceModel)
+    assert cup.near is not None
+    low, high = cup.shown
+    np.testing.assert_allclose((high - low)[:3], RAISED, atol=0.01)
+    assert low[2] == pytest.approx(cup.height, abs=0.005)
+
+
+def test_all_of_a_kind_are_found_where_they_were_shown(at_two_places):
+    cup = at_two_places["cup"]
+    x, y, _ = MIDDLES["cup"]
+    low, high = se3.from_yaw([x, y, 0.0], 0.0), se3.from_yaw(np.add([x, y, 0.0], RAISED), 0.0)
+    hand = hand_camera(looking_down(*HOME))
+    for stand in ([low, high], [high]):
+        views = render([(SHAPES["cup"], T) for T in stand], None, hand)
+        found = cup.localise(Look(views, told_apart={"cup"}))
+        places = sorted((T[:3, 3] for T in (found.T_world_obj, *found.others)), key=lambda p: p[2])
+        assert found.status != "not_found"
+        expected = [T[:3, 3] + [*-cup.surface.middle, cup.height] for T in stand]
+        np.testing.assert_allclose(places, expected, atol=0.01)

@@ -11,7 +11,7 @@ demonstration of each of several tasks is enough.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import islice
@@ -101,24 +101,34 @@ class _Candidate:
     groups: list[list[_Trail]]
 
 
-def learn_patches(examples: Examples, at_few_places: bool = False) -> dict[str, PatchModel]:
-    """Learn the objects that hardly move; where a segmenter finds the objects, none.
+def learn_patches(examples: Examples) -> dict[str, PatchModel]:
+    """Learn the objects that hardly move; where a segmenter finds the objects, none."""
+    return _learn(dict.fromkeys(still_objects(examples), examples.scenes), examples, {})
+
+
+def learn_at_one_place(examples: Examples, learned: Mapping[str, PatchModel]) -> dict[str, PatchModel]:
+    """Learn what tasks begin with at a few places, each where it is shown most often.
 
     Args:
         examples: The demonstrations, and the objects to learn.
-        at_few_places: Also those that tasks begin with at a few places, each where it is shown most often.
+        learned: What is followed in all demonstrations.
     """
+    left = [name for name in examples.names if name not in learned]
+    return _learn({name: _often(name, examples) for name in left}, examples, learned)
+
+
+def _learn(
+    shown: Mapping[str, Sequence[DemonstrationScene]], examples: Examples, known: Mapping[str, PatchModel]
+) -> dict[str, PatchModel]:
+    """Learn objects, each from the scenes that show it; not what follows an object that is known."""
     if examples.segmenter is not None:
         return {}
-    shown: dict[str, Sequence[DemonstrationScene]] = dict.fromkeys(still_objects(examples), examples.scenes)
-    if at_few_places:
-        shown |= {name: _often(name, examples) for name in examples.names if name not in shown}
     candidates = [_candidate(name, scenes) for name, scenes in shown.items() if scenes]
     # What many patches agree on is claimed first: what they follow is not another object.
     candidates.sort(key=lambda one: -max((len(group) for group in one.groups), default=0))
     learned: dict[str, PatchModel] = {}
     for one in candidates:
-        claimants = [*examples.known, *learned.values()]
+        claimants = [*examples.known, *known.values(), *learned.values()]
         free = (group for group in one.groups if not _claimed(group[0], one.scenes, claimants))
         models = (_model(one.name, group, one.scenes) for group in free)
         if model := next((model for model in models if model is not None), None):
@@ -152,14 +162,14 @@ def _candidate(name: str, scenes: Sequence[DemonstrationScene]) -> _Candidate:
     own = _spaced(own, max(MAX_SCENES // 2, MAX_SCENES - len(others)))
     looked_at = own + _spaced(others, MAX_SCENES - len(own))
     cues = [next(cue for cue in scene.cues if cue.name == name) for scene in own]
-    trails = []
+    trails: list[_Trail] = []
     for number, place in enumerate(places_of(cues)):
         first = next(i for i, cue in enumerate(cues) if cue is place[0])
         for camera in own[first].views:
             for drop in DROPS_M:
                 points = cues[first].point_world - [0.0, 0.0, drop]
                 found = (_follow(number, first, camera, points, radius, looked_at) for radius in RADII_M)
-                trails += [trail for trail in found if trail is not None]
+                trails += [one for one in found if one is not None and _is_seen_at_all_places(one, cues)]
     return _Candidate(name, looked_at, _believable(_agreeing(trails), cues))
 
 
@@ -192,6 +202,14 @@ def _follow(
     if np.isfinite(points[:, 0]).mean() < FOLLOWED_SHARE or np.median(correlations) < LEARNED_CORRELATION:
         return None
     return _Trail(place, radius, first, probe, points, float(np.median(correlations)))
+
+
+def _is_seen_at_all_places(trail: _Trail, cues: Sequence[ContactCue]) -> bool:
+    """Whether a patch is found where each place was touched: tasks may begin with an object elsewhere."""
+    seen = np.isfinite(trail.points[: len(cues), 0])
+    places = [place for place in places_of(cues) if len(place) >= MIN_TOUCHES]
+    own = [[any(cue is one for one in place) for cue in cues] for place in places]
+    return all(seen[mask].mean() >= FOLLOWED_SHARE for mask in own)
 
 
 def _agreeing(trails: Sequence[_Trail]) -> list[list[_Trail]]:

@@ -12,6 +12,7 @@ from collections.abc import Collection, Iterable, Sequence
 
 import numpy as np
 from scipy.cluster.hierarchy import fclusterdata
+from scipy.spatial.distance import pdist
 from scipy.stats import chi2
 
 from lerobot_openspm.perception.objects.base import KnownObject
@@ -40,7 +41,8 @@ def hardly_moving(
         scenes: First frames of all demonstrations, with cues at the objects.
         known: Other objects, which are known by patches where they hardly moved.
     """
-    told = {name: p for name in names if (p := _hardly_moves(scenes, name)) is not None}
+    touches = {name: [cue for scene in scenes for cue in scene.cues if cue.name == name] for name in names}
+    told = {name: p for name, cues in touches.items() if (p := _hardly_moves(cues)) is not None}
     before = [float(model.patches is not None) for model in known if model.name not in names]
     found = {}
     for name in names:
@@ -52,34 +54,45 @@ def hardly_moving(
 
 
 def often_at(name: str, scenes: Sequence[DemonstrationScene]) -> list[DemonstrationScene]:
-    """The demonstrations in which an object stands where it is shown most often, if it has a few such places.
+    """The demonstrations in which an object is where it is shown most often, if it has a few such places.
 
-    None of them where it is moved about, or is always at one place.
+    Each task may begin with it elsewhere, or with one of a kind at each of a few places. None of them where
+    it is moved about, or is always at one place.
     """
-    shown = [scene for scene in scenes if any(cue.name == name for cue in scene.cues)]
-    touched = [next(cue for cue in scene.cues if cue.name == name).point_world[:2] for scene in shown]
-    if len(shown) < 2 * MIN_SHOWN:
-        return []
-    labels = fclusterdata(np.stack(touched), APART_M, criterion="distance", method="single")
-    groups = [
-        [scene for scene, own in zip(shown, labels, strict=True) if own == i] for i in np.unique(labels)
-    ]
+    own = [(scene, cue) for scene in scenes if (cue := _first_touch(name, scene)) is not None]
+    groups = [group for place in places_of(cue for _, cue in own) for group in _apart(place)]
     groups = [group for group in groups if len(group) >= MIN_SHOWN]
-    if len(groups) < 2 or sum(map(len, groups)) < AT_PLACES_SHARE * len(shown):
+    groups = [group for group in groups if (_hardly_moves(group) or 0.0) >= LIKELY]
+    if len(groups) < 2 or sum(map(len, groups)) < AT_PLACES_SHARE * len(own):
         return []
-    if any((_hardly_moves(group, name) or 0.0) < LIKELY for group in groups):
+    middles = [np.mean([cue.point_world[:2] for cue in group], axis=0) for group in groups]
+    if pdist(np.stack(middles)).max() < APART_M:
         return []
-    return max(groups, key=len)
+    often = max(groups, key=len)
+    return [scene for scene, cue in own if any(cue is one for one in often)]
 
 
-def _hardly_moves(scenes: Sequence[DemonstrationScene], name: str) -> float | None:
+def _first_touch(name: str, scene: DemonstrationScene) -> ContactCue | None:
+    return next((cue for cue in scene.cues if cue.name == name), None)
+
+
+def _apart(cues: Sequence[ContactCue]) -> list[list[ContactCue]]:
+    """Cues in groups that are some distance apart."""
+    if len(cues) < 2:
+        return [list(cues)]
+    touched = np.stack([cue.point_world[:2] for cue in cues])
+    labels = fclusterdata(touched, APART_M, criterion="distance", method="single")
+    return [[cue for cue, own in zip(cues, labels, strict=True) if own == i] for i in np.unique(labels)]
+
+
+def _hardly_moves(cues: Iterable[ContactCue]) -> float | None:
     """Probability, by the touches of one object alone, that its standard deviation is small.
 
     The variance's posterior given n independent deviations is an inverse chi-squared distribution, where
     nothing is known of its scale beforehand (Gelman et al., Bayesian Data Analysis, section 2.6). Kept
     strictly between 0 and 1; None where no place was touched twice.
     """
-    places = places_of(cue for scene in scenes for cue in scene.cues if cue.name == name)
+    places = places_of(cues)
     points = [np.stack([cue.point_world[:2] for cue in place]) for place in places]
     degrees = 2 * sum(len(own) - 1 for own in points)
     if degrees == 0:

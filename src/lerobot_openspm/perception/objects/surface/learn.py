@@ -13,7 +13,7 @@ from scipy.spatial import KDTree
 from lerobot_openspm.geometry import se3
 from lerobot_openspm.geometry.se3 import Array
 from lerobot_openspm.perception.objects.base import Examples, Kind, Look
-from lerobot_openspm.perception.objects.patches.learn import UNFOLLOWED, learn_patches, still_objects
+from lerobot_openspm.perception.objects.patches.learn import UNFOLLOWED, learn_at_one_place, learn_patches
 from lerobot_openspm.perception.objects.patches.model import PatchModel
 from lerobot_openspm.perception.objects.surface.backdrop import Backdrop, Float32, learn_backdrop
 from lerobot_openspm.perception.objects.surface.carving import Carved, Frame, Frames, carve, silhouette
@@ -33,6 +33,8 @@ from lerobot_openspm.perception.objects.surface.solid import (
 )
 from lerobot_openspm.perception.objects.surface.touched import (
     Standing,
+    Touched,
+    poses_beside,
     poses_by_touch,
     settle_all,
     with_places,
@@ -49,7 +51,7 @@ SIMILAR_M, SIMILAR_COLOUR = 0.03, 10.0
 BESIDE_M = 0.02
 # Silhouettes are filled in so many rounds, since one object's surface explains what is seen beside another.
 ROUNDS = 2
-# What is known by touch alone is sought in the films, and learned again from there, so often.
+# What is known by touch is sought in the films, and learned again from there, so often.
 SETTLING_ROUNDS = 2
 # Of an object whose colours vary less together than this with what the demonstrations' first pictures show,
 # the pattern tells nothing; from the second value on it tells all.
@@ -76,28 +78,35 @@ def learn_surfaces(examples: Examples) -> dict[str, SurfaceModel | PatchModel]:
     What tasks begin with at a few places is kept only with its surface, which finds it anywhere: patches find
     it at one of these places.
     """
-    near = learn_patches(examples, at_few_places=True)
-    unseen = [name for name in examples.names if UNFOLLOWED in examples.left_out.get(name, ())]
-    surfaces, why = _learn_surfaces(near, unseen, examples)
-    still = still_objects(examples)
-    alone = {name: model for name, model in near.items() if name not in surfaces and name in still}
+    still = learn_patches(examples)
+    at_one_place = learn_at_one_place(examples, still)
+    near = {**still, **at_one_place}
+    left_out = [name for name in examples.names if UNFOLLOWED in examples.left_out.get(name, ())]
+    unseen = [name for name in left_out if name not in near]
+    surfaces, why = _learn_surfaces(still, at_one_place, unseen, examples)
+    alone = {name: model for name, model in still.items() if name not in surfaces}
     if alone and why:
         logger.warning("found only about where they were shown, since %s: %s", why, ", ".join(sorted(alone)))
-    for name in near.keys() - surfaces.keys() - alone.keys():
+    for name in at_one_place.keys() - surfaces.keys():
         examples.leave_out(name, f"it begins at a few places, and {why or 'there are no films of it'}")
     return {**alone, **surfaces}
 
 
 def _learn_surfaces(
-    near: Mapping[str, PatchModel], unseen: Sequence[str], examples: Examples
+    still: Mapping[str, PatchModel],
+    at_one_place: Mapping[str, PatchModel],
+    unseen: Sequence[str],
+    examples: Examples,
 ) -> tuple[dict[str, SurfaceModel], str]:
     """Surfaces by name, and why the others have none; that is empty where there are no films.
 
     Args:
-        near: What patches find in the first pictures.
+        still: What patches find in the first pictures.
+        at_one_place: What they find at one of the places where tasks begin with it.
         unseen: What they do not find, though it hardly moves.
         examples: The demonstrations.
     """
+    near = {**still, **at_one_place}
     names = [*near, *unseen]
     films = [(scene, scene.film()) for scene in examples.scenes if names and scene.film is not None]
     if not films:
@@ -107,23 +116,28 @@ def _learn_surfaces(
         return {}, "no camera of the hand shows a table"
     scenes = [scene for scene, _ in films]
     first = [_first_poses(scene, near) for scene in scenes]
-    touched = {name: _touched(name, scenes, first) for name in near}
+    points = {name: _touched(name, scenes, first) for name in near}
     heights = {name: model.height for name, model in near.items()}
-    felt = {name: poses for name in unseen if (poses := poses_by_touch(name, scenes))}
-    for name, poses in felt.items():
-        _put(name, poses[0], first)
-        own = np.array([T[:3, 3] for T in poses[0] if T is not None])
-        touched[name], heights[name] = np.zeros_like(own), float(own[0, 2])
-    surfaces = build_surfaces(_frames(films, first, backdrop), touched, heights, backdrop)
-    stood: dict[str, Standing] = {}
-    for _ in range(SETTLING_ROUNDS if felt else 0):
-        stood = settle_all(surfaces, [film for _, film in films], felt, backdrop)
-        for name, one in stood.items():
+    touched: dict[str, Touched] = {}
+    for name in unseen:
+        if one := poses_by_touch(name, scenes):
+            touched[name], heights[name] = one, one.height
+            points[name] = np.array([T[:3, 3] for T in one.poses[0] if T is not None]) * 0.0
             _put(name, one.poses[0], first)
-        surfaces = build_surfaces(_frames(films, first, backdrop), touched, heights, backdrop)
+    for name in at_one_place:
+        seen = [poses.get(name) for poses in first]
+        if one := poses_beside(name, scenes, seen, heights[name]):
+            touched[name] = one
+    surfaces = build_surfaces(_frames(films, first, backdrop), points, heights, backdrop)
+    stood: dict[str, Standing] = {}
+    for _ in range(SETTLING_ROUNDS if touched else 0):
+        stood = settle_all(surfaces, [film for _, film in films], touched, backdrop)
+        for name, one in stood.items():
+            _put(name, one.on_table(), first)
+        surfaces = build_surfaces(_frames(films, first, backdrop), points, heights, backdrop)
     models = {}
     # What the films hardly show where it was touched is not known.
-    for name in [name for name in surfaces if name in stood or name not in felt]:
+    for name in [name for name in surfaces if name in stood or name not in unseen]:
         surface = surfaces[name]
         standing = [(scene.views, T[name]) for scene, T in zip(scenes, first, strict=True) if name in T]
         surface = replace(surface, pattern=_pattern(surface, standing, backdrop))

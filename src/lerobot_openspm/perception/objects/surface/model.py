@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 from lerobot_openspm.geometry import se3
 from lerobot_openspm.geometry.se3 import Array
 from lerobot_openspm.perception.objects.base import Look, Record
-from lerobot_openspm.perception.objects.patches.match import REACH_M
 from lerobot_openspm.perception.objects.patches.model import PatchModel, unseen
 from lerobot_openspm.perception.objects.surface.backdrop import Backdrop
 from lerobot_openspm.perception.objects.surface.compare import FINE_POINTS, score_at
@@ -32,8 +31,8 @@ from lerobot_openspm.perception.objects.surface.search import (
     refine,
     search,
     settle,
-    settle_near,
 )
+from lerobot_openspm.perception.objects.surface.shown import KEPT_SHARE, seen_where_shown
 from lerobot_openspm.perception.objects.surface.sight import Sight, Surface, sight_of
 from lerobot_openspm.perception.objects.surface.tipped import has_tipped, lying
 from lerobot_openspm.types import PoseEstimate, Symmetry
@@ -57,11 +56,9 @@ OVERLAP_SHARE = 0.8
 FOLLOWED_M = 0.02
 # An object that is expected this much above the table is in the hand, metres.
 LIFTED_M = 0.02
-# Of the typical agreement around where an object is expected: from here on it is seen there; below that it
-# is gone; in between something may hide it.
-KEPT_SHARE, GONE_SHARE = 0.7, 0.4
-# What first pictures show badly where it stood is seen there from this agreement on.
-LEAST_SEEN = 0.15
+# Of the typical agreement around where an object is expected: below this it is gone; from KEPT_SHARE on it is
+# seen there; in between something may hide it.
+GONE_SHARE = 0.4
 # That it is where it was expected needs less evidence, if the pictures tell its place as sharply as this:
 # from this share on nothing is in doubt. What tells it more vaguely than that is no evidence. Metres.
 SURE_SHARE, SHARP_M, VAGUE_M = 0.8, 0.004, 0.008
@@ -89,7 +86,7 @@ class SurfaceModel:
         typical_agreement: How well the demonstrations' first pictures agree with its surface.
         rival_agreement: How well they agree with it elsewhere at most, where it is not.
         near: Patches, more exact where it stood in demonstrations; None of what first pictures show badly.
-        shown: Of that, where it stood (x, y, z), and how well first pictures agreed there ``(k, 4)``.
+        shown: Where else it stood (x, y, z), and how well first pictures agreed there ``(k, 4)``.
     """
 
     kind: ClassVar[str] = "surface"
@@ -176,15 +173,13 @@ class SurfaceModel:
 
     def _where_shown(self, look: Look) -> PoseEstimate:
         """Where the demonstrations showed it, if first pictures show it there as they did."""
-        sights, freedom = self._sights(look), self._freedom
-        places = settle_near(self.surface, sights, self.shown[:, :3], freedom, REACH_M)
-        enough = np.maximum(KEPT_SHARE * self.shown[:, 3], LEAST_SEEN)
-        seen = [one for one, least in zip(places, enough, strict=True) if one.score >= least]
+        sights = self._sights(look)
+        seen = seen_where_shown(self.surface, sights, self.shown, self._freedom)
         if not seen:
             return unseen()
-        seen.sort(key=lambda place: -place.score)
-        others = tuple(one.T_world_obj for one in seen[1:])
-        return replace(self._estimate(look, sights, seen[:1]), status="found", others=others)
+        places = sorted((place for place, _ in seen), key=lambda place: -place.score)
+        others = tuple(one.T_world_obj for one in places[1:])
+        return replace(self._estimate(look, sights, places[:1]), status="found", others=others)
 
     def _is_lifted(self, T_expected: Array) -> bool:
         return bool(T_expected[2, 3] - self.height > LIFTED_M)
@@ -234,8 +229,10 @@ class SurfaceModel:
         return table
 
     def _all_places(self, look: Look, sights: Mapping[str, Sight]) -> list[Place]:
-        """Places on the table and on other things, several of which may hold one of the kind."""
+        """Places on the table, on other things and where it was shown; several may hold one of the kind."""
         places = self._on_table(sights, several=True)
+        shown = seen_where_shown(self.surface, sights, self.shown, self._freedom)
+        places += [replace(one, score=min(share, 1.0) * self.typical_agreement) for one, share in shown]
         if len(look.supports):
             places += self._on_things(look.supports, sights, several=True)
         return sorted(places, key=lambda place: -likelihood(self.surface, place))
@@ -309,9 +306,7 @@ class SurfaceModel:
 
     def to_record(self) -> Record:
         """See :class:`lerobot_openspm.perception.objects.base.KnownObject`."""
-        near_fields, near_arrays = (
-            (None, {"shown": self.shown}) if self.near is None else self.near.to_record()
-        )
+        near_fields, near_arrays = (None, {}) if self.near is None else self.near.to_record()
         table = self.backdrop.table
         fields = {
             "kind": self.kind, "name": self.name, "height": self.height,
@@ -326,6 +321,7 @@ class SurfaceModel:
             "colours": np.nan_to_num(self.surface.colours, nan=UNCOLOURED).astype(np.float32),
             "table_colour": np.vstack([table.mean[None], table.precision]).astype(np.float32),
             "table_area": self.backdrop.table_area.astype(np.float32),
+            "shown": self.shown,
         }
         for i, mask in enumerate(self.backdrop.hand.values()):
             arrays[f"hand.{i}"] = mask.astype(np.uint8)

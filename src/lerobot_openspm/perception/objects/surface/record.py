@@ -15,13 +15,12 @@ from lerobot_openspm.perception.objects.patches.model import PatchModel
 from lerobot_openspm.perception.objects.surface.backdrop import TABLE_MARGIN_M, Backdrop, Colour
 from lerobot_openspm.perception.objects.surface.model import UNCOLOURED, SurfaceModel
 from lerobot_openspm.perception.objects.surface.sight import Surface
+from lerobot_openspm.perception.objects.surface.touched import MAX_SHOWN
 
 # What a record may hold: points, coloured ones at least, and the table's length and width in metres, rounded.
 MAX_POINTS, MIN_COLOURED, MAX_TABLE_M, ROUNDING_M = 60_000, 8, 10.0, 1e-3
 # The frame of what stands on the table is this far above or below it at most, metres.
 MAX_ABOVE_M = 3.0
-# Each place where an object was shown is looked at whenever it is sought.
-MAX_SHOWN = 64
 BOUNDS = {
     "height": (-100.0, 100.0),
     "typical_agreement": (0.05, 1.0),
@@ -77,16 +76,16 @@ def from_record(fields: Mapping[str, Any], arrays: Mapping[str, NDArray[Any]], w
         numbers["height"],
         numbers["typical_agreement"], numbers["rival_agreement"],
         None if near is None else patches.from_record(near, own, where),
-        _shown(name, own, where) if near is None else np.zeros((0, 4)),
+        _shown(name, arrays, where, 1 if near is None else 0),
     )  # fmt: skip
 
 
-def _shown(name: str, arrays: Mapping[str, NDArray[Any]], where: str) -> NDArray[np.float64]:
-    """Where an object stood that has no patches, and how well first pictures agreed there ``(k, 4)``."""
+def _shown(name: str, arrays: Mapping[str, NDArray[Any]], where: str, least: int) -> NDArray[np.float64]:
+    """Where an object was shown that patches do not find, and how well first pictures agreed ``(k, 4)``."""
     shown = records.array(arrays, "shown", (-1, 4), where, np.float64)
-    if not 0 < len(shown) <= MAX_SHOWN or (shown[:, 3] < 0).any() or (shown[:, 3] > 1).any():
+    if not least <= len(shown) <= MAX_SHOWN or (shown[:, 3] < 0).any() or (shown[:, 3] > 1).any():
         raise MemoryFormatError(
-            f"{where}: {name!r} was shown at {len(shown)} places, expected 1 to {MAX_SHOWN}, each with an "
-            "agreement of 0 to 1; learn the objects again"
+            f"{where}: {name!r} was shown at {len(shown)} places, expected {least} to {MAX_SHOWN}, each with "
+            "an agreement of 0 to 1; learn the objects again"
         )
     return shown

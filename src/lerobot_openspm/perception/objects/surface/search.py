@@ -314,17 +314,6 @@ def settle(surface: Surface, sights: Mapping[str, Sight], pose: Array, freedom: 
     return refine(surface, sights, quick.pose, freedom, FINE_POINTS, FINE_STEPS)
 
 
-def settle_near(
-    surface: Surface, sights: Mapping[str, Sight], points: Array, freedom: Freedom, reach_m: float
-) -> list[Place]:
-    """The best place around each of some points ``(k, 3)``; one that is out of reach agrees by 0."""
-    places = [settle(surface, sights, np.append(point, 0.0), freedom) for point in points]
-    away_m = [np.linalg.norm(one.pose[:3] - point) for one, point in zip(places, points, strict=True)]
-    return [
-        one if away <= reach_m else Place(one.pose, 0.0) for one, away in zip(places, away_m, strict=True)
-    ]
-
-
 def covariance_at(surface: Surface, sights: Mapping[str, Sight], pose: Array, turns: bool) -> Array:
     """How well the pictures tell a pose: covariance ``(4, 4)`` over x, y, z and yaw, m and rad.
 

@@ -1,7 +1,8 @@
-"""Where objects stood that the fixed cameras show badly: about where they were touched, and then as filmed.
+"""Where objects stood that patches do not follow: about where they were touched, and then as filmed.
 
-What is hidden at first, or stands half beyond the picture, has no patches to follow. The hand went to it all
-the same, and its camera saw it on the way.
+What is hidden at first, or stands half beyond the picture, has no patches to follow; and of what tasks begin
+with at many places, they follow one at one place. The hand went to all of them, and its camera saw them on
+the way.
 """
 
 from __future__ import annotations
@@ -31,29 +32,97 @@ from lerobot_openspm.types import ContactCue, DemonstrationScene, Moment, View
 
 # Pictures that show this share of an object tell where it stands; so many of a film are enough.
 SHOWN_SHARE, MAX_VIEWS = 0.5, 8
-# A film that agrees with the surface by less than this share of what most do shows something else.
-ALIKE_SHARE = 0.7
+# A film that agrees with the surface by less than this share of what most do shows something else. Where all
+# films show it beside the touched point alike, up to so many metres, this share is enough.
+ALIKE_SHARE, STEADY_SHARE, STEADY_M, MIN_STEADY = 0.7, 0.45, 0.015, 3
 # Another of the kind may have been touched elsewhere on it, this far from where the first one was, metres.
 AROUND_M = 0.12
+# What stands this much higher than on the table stands on something else, metres.
+RAISED_M = 0.02
+# So many places are remembered: each is looked at whenever the object is sought.
+MAX_SHOWN = 64
 
 
-def poses_by_touch(name: str, scenes: Sequence[DemonstrationScene]) -> list[list[Array | None]]:
-    """Poses ``(4, 4)`` by scene of an object whose frame is where it was touched; None where it was not.
+@dataclass(frozen=True)
+class Touched:
+    """About where an object stood.
 
-    There is one list for each place that was touched, that of the most touches first; another place may be on
-    another of the kind. All poses have one height and one direction.
+    Attributes:
+        poses: By place, the poses ``(4, 4)`` in each scene, None where it was not touched there. The object's
+            frame is that of the first ones; the others may be on another of the kind.
+        height: World z of its frame where it stands on the table, metres.
+        is_seen: Whether first pictures show it where the first poses are.
     """
-    places = places_of(cue for scene in scenes for cue in scene.cues if cue.name == name)
+
+    poses: list[list[Array | None]]
+    height: float
+    is_seen: bool = False
+
+
+def poses_by_touch(name: str, scenes: Sequence[DemonstrationScene]) -> Touched | None:
+    """About where an object stood whose frame is where it was touched; None if it was not.
+
+    The place of the most touches comes first. All poses have one direction.
+    """
+    places = _by_place(name, scenes)
     if not places:
-        return []
+        return None
     places.sort(key=len, reverse=True)
-    height = float(np.median([cue.point_world[2] for cue in places[0]]))
+    height = _height(places[0])
+    return Touched([_poses(scenes, own, height, height) for own in places], height)
 
-    def pose(scene: DemonstrationScene, place: Sequence[ContactCue]) -> Array | None:
-        own = next((cue for cue in scene.cues if any(cue is one for one in place)), None)
-        return None if own is None else se3.from_yaw([*own.point_world[:2], height], 0.0)
 
-    return [[pose(scene, place) for scene in scenes] for place in places]
+def poses_beside(
+    name: str, scenes: Sequence[DemonstrationScene], seen: Sequence[Array | None], height: float
+) -> Touched | None:
+    """About where an object stood, given its poses where first pictures show it.
+
+    Args:
+        name: The object's name.
+        scenes: The demonstrations.
+        seen: Its poses ``(4, 4)`` in each, None where it is not seen.
+        height: World z of its frame where it stands on the table, metres.
+
+    Returns:
+        The poses, those that are seen first; None if it was not touched where it is seen.
+    """
+    places = _by_place(name, scenes)
+    own = min(places, key=lambda place: _away_m(scenes, place, seen), default=None)
+    if own is None or not np.isfinite(_away_m(scenes, own, seen)):
+        return None
+    others = [place for place in places if place is not own]
+    base = _height(own)
+    return Touched([list(seen), *(_poses(scenes, place, base, height) for place in others)], height, True)
+
+
+def _by_place(name: str, scenes: Sequence[DemonstrationScene]) -> list[list[ContactCue]]:
+    return places_of(cue for scene in scenes for cue in scene.cues if cue.name == name)
+
+
+def _height(place: Sequence[ContactCue]) -> float:
+    return float(np.median([cue.point_world[2] for cue in place]))
+
+
+def _poses(
+    scenes: Sequence[DemonstrationScene], place: Sequence[ContactCue], base: float, height: float
+) -> list[Array | None]:
+    """Poses where a place was touched; what was grasped higher than the first stands higher by as much."""
+    rise = _height(place) - base if place[0].kind == "grasp" else 0.0
+    own = [next((cue for cue in scene.cues if any(cue is one for one in place)), None) for scene in scenes]
+    return [None if cue is None else se3.from_yaw([*cue.point_world[:2], height + rise], 0.0) for cue in own]
+
+
+def _away_m(
+    scenes: Sequence[DemonstrationScene], place: Sequence[ContactCue], seen: Sequence[Array | None]
+) -> float:
+    """How far from where it is seen an object was touched, metres: the median; infinite if never there."""
+    away = [
+        float(np.linalg.norm(T[:2, 3] - cue.point_world[:2]))
+        for scene, T in zip(scenes, seen, strict=True)
+        for cue in scene.cues
+        if T is not None and any(cue is one for one in place)
+    ]
+    return float(np.median(away)) if away else np.inf
 
 
 @dataclass(frozen=True)
@@ -62,68 +131,28 @@ class Standing:
 
     Attributes:
         poses: By place where one of the kind stands, the poses ``(4, 4)`` in each film, None where it hardly
-            shows it. First those of the object that most demonstrations touch.
+            shows it. First those that tell the object's frame.
         agreement: How well the films agree with it there.
+        touched: What was known of it before.
     """
 
     poses: list[list[Array | None]]
     agreement: float
+    touched: Touched
 
-
-def settled(
-    name: str,
-    surface: Surface,
-    films: Sequence[Sequence[Moment]],
-    touched: Sequence[Sequence[Array | None]],
-    backdrop: Backdrop,
-) -> Standing | None:
-    """Where the films show a surface best; None where they hardly do.
-
-    Args:
-        name: The object's name.
-        surface: Its surface, as it was learned with the first list of poses.
-        films: The demonstrations' moments.
-        touched: About where it stands in each, as :func:`poses_by_touch` tells.
-        backdrop: What no object is.
-    """
-
-    def places(
-        poses: Sequence[Array | None], shown: Sequence[Sequence[Moment]], around_m: float
-    ) -> list[Place | None]:
+    def on_table(self) -> list[Array | None]:
+        """A pose in each film where one of the kind stands on the table, None where it shows none."""
+        low, high = self.touched.height - RAISED_M, self.touched.height + RAISED_M
         return [
-            None if T is None else _place(surface, _sights(surface, film, T, backdrop), T, around_m)
-            for film, T in zip(shown, poses, strict=True)
+            next((T for T in film if T is not None and low < T[2, 3] < high), None)
+            for film in zip(*self.poses, strict=True)
         ]
-
-    before = [[moment for moment in film if name not in moment.moved] for film in films]
-    own = places(touched[0], before, 0.0)
-    usual = float(np.median([place.score for place in own if place is not None] or [0.0]))
-    if usual <= 0:
-        return None
-    stands = [_believed(own, ALIKE_SHARE * usual)]
-    for poses in touched[1:]:
-        seen = _believed(places(poses, films, AROUND_M), ALIKE_SHARE * usual)
-        is_often = 2 * sum(T is not None for T in seen) >= sum(T is not None for T in poses)
-        if is_often and all(np.linalg.norm(middle(seen) - middle(one)) > SAME_PLACE_M for one in stands):
-            stands.append(seen)
-    return Standing(stands, usual)
-
-
-def _believed(places: Sequence[Place | None], enough: float) -> list[Array | None]:
-    """Upright poses ``(4, 4)`` of the places that agree well enough."""
-    good = [None if one is None or one.score < enough else one.pose[:3] for one in places]
-    return [None if one is None else se3.from_yaw(one, 0.0) for one in good]
-
-
-def middle(poses: Sequence[Array | None]) -> Array:
-    """Median place ``(3,)`` of those poses ``(4, 4)`` that there are."""
-    return np.median([T[:3, 3] for T in poses if T is not None], axis=0)
 
 
 def settle_all(
     surfaces: Mapping[str, Surface],
     films: Sequence[Sequence[Moment]],
-    touched: Mapping[str, Sequence[Sequence[Array | None]]],
+    touched: Mapping[str, Touched],
     backdrop: Backdrop,
 ) -> dict[str, Standing]:
     """Where films show objects that were touched, by name; see :func:`settled`."""
@@ -132,12 +161,55 @@ def settle_all(
     return {name: one for name, one in stood.items() if one is not None}
 
 
+def settled(
+    name: str,
+    surface: Surface,
+    films: Sequence[Sequence[Moment]],
+    touched: Touched,
+    backdrop: Backdrop,
+) -> Standing | None:
+    """Where the films show a surface best; None where they hardly do.
+
+    Args:
+        name: The object's name.
+        surface: Its surface, as it was learned with the first poses.
+        films: The demonstrations' moments.
+        touched: About where it stands in each.
+        backdrop: What no object is.
+    """
+    before = [[moment for moment in film if name not in moment.moved] for film in films]
+    own = _places(surface, touched.poses[0], before, backdrop)
+    usual = float(np.median([place.score for place in own if place is not None] or [0.0]))
+    if usual <= 0:
+        return None
+    stands = [touched.poses[0] if touched.is_seen else _believed(own, ALIKE_SHARE * usual)]
+    for poses in touched.poses[1:]:
+        around = _places(surface, poses, films, backdrop, touched.height)
+        share = STEADY_SHARE if _is_steady(around, poses) else ALIKE_SHARE
+        seen = _believed(around, share * usual)
+        is_often = 2 * sum(T is not None for T in seen) >= sum(T is not None for T in poses)
+        if is_often and all(np.linalg.norm(middle(seen) - middle(one)) > SAME_PLACE_M for one in stands):
+            stands.append(seen)
+    return Standing(stands, usual, touched)
+
+
+def middle(poses: Sequence[Array | None]) -> Array:
+    """Median place ``(3,)`` of those poses ``(4, 4)`` that there are."""
+    return np.median([T[:3, 3] for T in poses if T is not None], axis=0)
+
+
 def with_places(model: SurfaceModel, stood: Standing, scenes: Sequence[DemonstrationScene]) -> SurfaceModel:
-    """A model that knows where it stood, and how well first pictures show that; films tell what is usual."""
-    places = [[*middle(poses), _seen_first(model, scenes, poses)] for poses in stood.poses]
+    """A model that knows where it stood, and how well first pictures show that.
+
+    Of what first pictures show badly the films tell what is usual.
+    """
+    places = [[*middle(poses), _seen_first(model, scenes, poses)] for poses in stood.poses[:MAX_SHOWN]]
+    shown = np.array(places).reshape(-1, 4)
+    if stood.touched.is_seen:
+        return replace(model, shown=shown)
     typical = float(np.clip(stood.agreement, 0.05, 1.0))
     rival = min(model.rival_agreement, typical)
-    return replace(model, shown=np.array(places), typical_agreement=typical, rival_agreement=rival)
+    return replace(model, shown=shown, typical_agreement=typical, rival_agreement=rival)
 
 
 def _seen_first(
@@ -152,17 +224,59 @@ def _seen_first(
     return float(np.clip(np.median(scores), 0.0, 1.0))
 
 
-def _place(
-    surface: Surface, sights: Mapping[str, Sight], T_world_obj: Array, around_m: float
-) -> Place | None:
-    """Where some views show a surface best, near a pose or at most so far from it; None without views."""
-    if not sights:
-        return None
-    if around_m == 0:
+def _believed(places: Sequence[Place | None], enough: float) -> list[Array | None]:
+    """Upright poses ``(4, 4)`` of the places that agree well enough."""
+    good = [None if one is None or one.score < enough else one.pose[:3] for one in places]
+    return [None if one is None else se3.from_yaw(one, 0.0) for one in good]
+
+
+def _is_steady(places: Sequence[Place | None], poses: Sequence[Array | None]) -> bool:
+    """Whether it is seen at the same place beside where it was touched in nearly all of some films."""
+    offsets = [
+        one.pose[:3] - T[:3, 3]
+        for one, T in zip(places, poses, strict=True)
+        if one is not None and T is not None
+    ]
+    if len(offsets) < MIN_STEADY:
+        return False
+    away = np.linalg.norm(offsets - np.median(offsets, axis=0), axis=1)
+    return float(np.median(away)) <= STEADY_M
+
+
+def _places(
+    surface: Surface,
+    poses: Sequence[Array | None],
+    films: Sequence[Sequence[Moment]],
+    backdrop: Backdrop,
+    table: float | None = None,
+) -> list[Place | None]:
+    """Where each film shows a surface best at its pose, or around it; None without a pose or a view.
+
+    Args:
+        surface: What is sought.
+        poses: In each film, ``(4, 4)``.
+        films: The demonstrations' moments.
+        backdrop: What no object is.
+        table: World z of its frame on the table, metres, if it is sought around the poses.
+    """
+    places: list[Place | None] = []
+    for T, film in zip(poses, films, strict=True):
+        sights = {} if T is None else _sights(surface, film, T, backdrop)
+        places.append(None if T is None or not sights else _place(surface, sights, T, table))
+    return places
+
+
+def _place(surface: Surface, sights: Mapping[str, Sight], T_world_obj: Array, table: float | None) -> Place:
+    """Where some views show a surface best, at a pose, or around it as high and on the table."""
+    if table is None:
         return settle(surface, sights, np.array([*T_world_obj[:3, 3], 0.0]), Freedom(turns=False))
-    area = T_world_obj[:2, 3] + around_m * np.array([[-1.0], [1.0]])
-    ground = over_table(surface, area, float(T_world_obj[2, 3]))
-    return search(surface, sights, ground, YAWS[:1], Freedom(turns=False))[0]
+    area = T_world_obj[:2, 3] + AROUND_M * np.array([[-1.0], [1.0]])
+    heights = {float(T_world_obj[2, 3]), table}
+    found = [
+        search(surface, sights, over_table(surface, area, z), YAWS[:1], Freedom(turns=False))[0]
+        for z in heights
+    ]
+    return max(found, key=lambda place: place.score)
 
 
 def _sights(

@@ -1,0 +1,39 @@
+"""Looking for an object where demonstrations showed it, which first pictures may show badly."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from lerobot_openspm.geometry.se3 import Array
+from lerobot_openspm.perception.objects.patches.match import REACH_M
+from lerobot_openspm.perception.objects.surface.search import Freedom, Place, settle
+from lerobot_openspm.perception.objects.surface.sight import Sight, Surface
+
+# It is seen there if pictures agree this share of how they agreed in the demonstrations, and not less than
+# this with it.
+KEPT_SHARE, LEAST_SEEN = 0.7, 0.15
+
+
+def seen_where_shown(
+    surface: Surface, sights: Mapping[str, Sight], shown: Array, freedom: Freedom
+) -> list[tuple[Place, float]]:
+    """The places where an object is seen near where it was shown, and how well, most alike first.
+
+    Args:
+        surface: What is sought.
+        sights: The views.
+        shown: Where it was shown (x, y, z), and how well first pictures agreed there ``(k, 4)``.
+        freedom: What may change beside the horizontal place.
+
+    Returns:
+        Places, each with its agreement as a share of that in the demonstrations' first pictures.
+    """
+    found: list[tuple[Place, float]] = []
+    for x, y, z, agreed in shown:
+        place = settle(surface, sights, np.array([x, y, z, 0.0]), freedom)
+        is_near = np.linalg.norm(place.pose[:3] - [x, y, z]) <= REACH_M
+        if is_near and place.score >= max(KEPT_SHARE * agreed, LEAST_SEEN):
+            found.append((place, place.score / max(agreed, LEAST_SEEN)))
+    return sorted(found, key=lambda one: -one[1])
