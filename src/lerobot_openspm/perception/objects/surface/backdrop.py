@@ -67,8 +67,21 @@ class Colour:
 
 
 def frequent_colour(colours: Float32) -> tuple[Colour, Mask]:
-    """The most frequent of colours ``(n, 3)``, and which of them are it ``(n,)``."""
-    bins, index = np.unique(np.round(colours / BIN).astype(int), axis=0, return_inverse=True)
+    """The most frequent of colours ``(n, 3)``, and which of them are it ``(n,)``.
+
+    What has one colour all over fills a bin more than wood does that covers more of the pictures. So the next
+    colour is looked at as well, and that one taken which more of them are.
+    """
+    first, is_first = _grown(colours, np.ones(len(colours), bool))
+    if is_first.mean() > 0.5:
+        return first, is_first
+    second, is_second = _grown(colours, ~is_first)
+    return (second, is_second) if is_second.sum() > is_first.sum() else (first, is_first)
+
+
+def _grown(colours: Float32, left: Mask) -> tuple[Colour, Mask]:
+    """The colour around the fullest bin of those that are left ``(n,)``, and which of all are it ``(n,)``."""
+    bins, index = np.unique(np.round(colours[left] / BIN).astype(int), axis=0, return_inverse=True)
     fullest = bins[np.bincount(index.ravel()).argmax()] * BIN
     own = np.linalg.norm(colours - fullest, axis=1) < NEAR
     colour = Colour(fullest, np.eye(3))
