@@ -25,6 +25,7 @@ PACE = Pace(
 )
 
 PRE_GRASP = 0.08
+SETTLING_STEPS = 8
 CARRY_RISE = 0.12
 # The least height above a place from which an object is lowered to it.
 LOWERING = 0.06
@@ -73,14 +74,18 @@ def take_and_put(put: Put, hand: LiberoHand) -> Actions:
     lean = Rotation.from_rotvec([0.0, -put.lean, 0.0]).as_matrix()
     at = hand.origin(put.name) + yaw_matrix(yaw) @ put.grasp + offset
     at_grasp = transform(yaw_matrix(yaw + turn) @ lean @ DOWN, at)
-    yield from grasp(hand, at_grasp)
+    # The arm swings to the side when a leaning hand arrives, and would sweep over what is flat.
+    yield from grasp(hand, at_grasp, settles=put.lean > 0)
     yield from hand.travel(raised(at_grasp, put.rise))
     yield from place(hand, put.name, put.goal(hand), put.slant, put.like)
 
 
-def grasp(hand: LiberoHand, at_grasp: np.ndarray) -> Actions:
-    """Go before T_world_ee `at_grasp`, advance along the fingers and close them."""
+def grasp(hand: LiberoHand, at_grasp: np.ndarray, settles: bool = False) -> Actions:
+    """Go before T_world_ee `at_grasp`, settle there or not, advance along the fingers and close them."""
     yield from hand.travel(backed(at_grasp, PRE_GRASP))
+    if settles:
+        yield from hand.hold(SETTLING_STEPS)
+        yield from hand.advance(backed(at_grasp, PRE_GRASP))
     yield from hand.advance(at_grasp)
     yield from hand.grip(closing=True)
 

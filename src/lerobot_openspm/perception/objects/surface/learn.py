@@ -56,6 +56,8 @@ SETTLING_ROUNDS = 2
 # Of an object whose colours vary less together than this with what the demonstrations' first pictures show,
 # the pattern tells nothing; from the second value on it tells all.
 PATTERN_SEEN = 0.55, 0.8
+# What is this far below the table is, metres.
+SUNKEN_M = 0.005
 # A demonstration in which patches agree less than this may show something else where an object stood.
 SHOWN_SHARE = 0.85
 # In so many of the demonstrations it is measured what looks most like the object without it; what is this
@@ -114,6 +116,9 @@ def _learn_surfaces(
     backdrop = learn_backdrop(_pictures(films), examples.floor)
     if backdrop is None:
         return {}, "no camera of the hand shows a table"
+    # A patch below the table shows the table, and not what the hand touched above it.
+    near = {k: model for k, model in near.items() if model.height > backdrop.table_height - SUNKEN_M}
+    unseen = [name for name in names if name not in near]
     scenes = [scene for scene, _ in films]
     first = [_first_poses(scene, near) for scene in scenes]
     points = {name: _touched(name, scenes, first) for name in near}
@@ -124,7 +129,7 @@ def _learn_surfaces(
             touched[name], heights[name] = one, one.height
             points[name] = np.array([T[:3, 3] for T in one.poses[0] if T is not None]) * 0.0
             _put(name, one.poses[0], first)
-    for name in at_one_place:
+    for name in near.keys() & at_one_place.keys():
         seen = [poses.get(name) for poses in first]
         if one := poses_beside(name, scenes, seen, heights[name]):
             touched[name] = one
