@@ -336,3 +336,13 @@ def test_what_is_closed_is_pushed_until_it_stops_the_hand_a_little_further_than_
     assert executor.state.status is Status.DONE
     assert retries == 0
     assert left[1][0, 3] > shut - 0.01
+
+
+def test_what_stops_a_closing_hand_half_way_is_no_end_of_the_way():
+    """A bowl that stands too high jams the drawer 8 cm before it is shut."""
+    executor = Executor("closed_loop_trc", ROBOT, EpisodeState())
+    executor.begin(closing(), Hand(HOME, OPEN_WIDTH))
+    jammed = 0.05 - 0.08
+    run(executor, World(held=0.0, stuck=lambda T: bool(T[0, 3] > jammed and T[2, 3] < 0.12)), n_steps=600)
+    assert executor.state.index == 1
+    assert executor.state.status is Status.NO_PROGRESS

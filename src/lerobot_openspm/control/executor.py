@@ -147,7 +147,8 @@ class Executor:
         """Whether the present key pose is tried again because its corrections are used up."""
         approach = self.approach
         is_used_up = approach.corrections > MAX_CORRECTIONS
-        is_passed_by = not self.present.precise and self.state.index + 1 < len(self.targets)
+        is_passed_by = not (self.present.precise or self.present.until_stopped)
+        is_passed_by = is_passed_by and self.state.index + 1 < len(self.targets)
         if is_passed_by and (is_used_up or approach.is_blocked):
             # A hand that is held up short of a key pose it only passes by goes on to the next one.
             self._enter(self.state.index + 1, hand)

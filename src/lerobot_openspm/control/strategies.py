@@ -19,6 +19,8 @@ RESIDUAL_M, RESIDUAL_RAD = 0.004, 0.06
 STUCK_SHARE = 0.9
 # A blocked key pose is met within this multiple of the tolerance, because what is touched is in the way.
 BLOCKED_SHARE = 3.0
+# What stops a closing hand this near to where it goes is shut; what stops it earlier is in the way, metres.
+SHUT_LEFT_M = 0.05
 # Each step of a correction makes good this share of the residual, and five steps are one correction. Every
 # further correction adds the same share again, because friction stops a hand that asks for millimetres.
 CORRECTION_SHARE, CORRECTION_STEPS = 0.2, 5
@@ -89,7 +91,7 @@ class ClosedLoop:
 
     def _is_near(self, target: Target, approach: Approach, hand: Hand) -> bool:
         metres, radians = se3.distances(hand.T_world_ee, target.T_world_ee)
-        if target.until_stopped and approach.is_blocked:
+        if target.until_stopped and approach.is_blocked and metres <= SHUT_LEFT_M:
             return True
         if target.precise:
             share = max(float(metres) / RESIDUAL_M, float(radians) / RESIDUAL_RAD)

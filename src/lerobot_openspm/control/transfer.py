@@ -58,7 +58,7 @@ class Target:
         axis: The constraint that the way here follows, its direction in the world; None in free space.
         push: The path of what is pushed on the way here; None where nothing is pushed, or the path is not
             known or turns.
-        until_stopped: Whether it is met too where the hand goes no further, because what it pushes is shut.
+        until_stopped: Whether it is met too near where the hand goes no further, as what it pushes is shut.
         passing_m: Distance within which it is met where it is only passed by, metres.
         passing_rad: Angle within which it is, radians.
     """
