@@ -15,6 +15,7 @@ from lerobot_openspm.perception.objects.base import Look
 from lerobot_openspm.perception.objects.kinds import learn_objects
 from lerobot_openspm.perception.objects.surface import learn
 from lerobot_openspm.perception.objects.surface.model import SurfaceModel
+from lerobot_openspm.perception.objects.surface.shown import visible_share
 from lerobot_openspm.perception.objects.surface.touched import (
     Touched,
     middle,
@@ -200,3 +201,17 @@ def test_all_of_a_kind_are_found_where_they_were_shown(at_two_places):
         assert found.status != "not_found"
         expected = [T[:3, 3] + [*-cup.surface.middle, cup.height] for T in stand]
         np.testing.assert_allclose(places, expected, atol=0.01)
+
+
+@pytest.mark.parametrize(
+    ("beyond", "covered_share", "expected"), [(0, 0, 1), (0.5, 0, 1), (0, 0.5, 0.5), (0.8, 0, 0.2)]
+)
+def test_what_lies_beyond_the_picture_is_not_hidden(beyond, covered_share, expected):
+    view = views_at({}, looking_down(*HOME))["front"]
+    width = view.camera.width
+    pixels = np.stack([np.linspace(-beyond, 1 - beyond, 100) * 60, np.full(100, 100.0)], axis=1)
+    rays = np.column_stack([(pixels - [view.camera.cx, view.camera.cy]) / view.camera.focal_px, np.ones(100)])
+    points = se3.apply(view.T_world_cam, 0.5 * rays)
+    hidden = np.arange(width) < 60 * covered_share
+    look = Look({"front": view}, hidden={"front": np.broadcast_to(hidden, view.image.shape[:2])})
+    assert visible_share(look, points) == pytest.approx(expected, abs=0.03)

@@ -25,6 +25,8 @@ Float32 = NDArray[np.float32]
 BIN = np.array([4.0, 3.0, 3.0])
 # A colour begins with what lies this near to the fullest bin ...
 NEAR = 12.0
+# ... or near to the next full one, if it is so many times as much,
+MANY_MORE = 1.5
 # ... and takes in what has this squared Mahalanobis distance at most; in a picture, a little more.
 LEARNED, SEEN = 12.0, 16.0
 # What covers this share of the pixels beyond the table is a wall.
@@ -70,21 +72,12 @@ def frequent_colour(colours: Float32) -> tuple[Colour, Mask]:
     """The most frequent of colours ``(n, 3)``, and which of them are it ``(n,)``.
 
     What has one colour all over fills a bin more than wood does that covers more of the pictures. So the next
-    colour is looked at as well, and that one taken which more of them are.
+    full bin is taken instead of the fullest where many more colours are near to that.
     """
-    first, is_first = _grown(colours, np.ones(len(colours), bool))
-    if is_first.mean() > 0.5:
-        return first, is_first
-    second, is_second = _grown(colours, ~is_first)
-    return (second, is_second) if is_second.sum() > is_first.sum() else (first, is_first)
-
-
-def _grown(colours: Float32, left: Mask) -> tuple[Colour, Mask]:
-    """The colour around the fullest bin of those that are left ``(n,)``, and which of all are it ``(n,)``."""
-    bins, index = np.unique(np.round(colours[left] / BIN).astype(int), axis=0, return_inverse=True)
-    fullest = bins[np.bincount(index.ravel()).argmax()] * BIN
-    own = np.linalg.norm(colours - fullest, axis=1) < NEAR
-    colour = Colour(fullest, np.eye(3))
+    first = _near_fullest(colours, np.ones(len(colours), bool))
+    second = _near_fullest(colours, ~first)
+    own = second if second.sum() > MANY_MORE * first.sum() else first
+    colour = Colour(np.zeros(3), np.eye(3))
     for _ in range(6):
         colour = Colour(
             colours[own].mean(0).astype(float),
@@ -92,6 +85,15 @@ def _grown(colours: Float32, left: Mask) -> tuple[Colour, Mask]:
         )
         own = colour.distance(colours) < LEARNED
     return colour, own
+
+
+def _near_fullest(colours: Float32, left: Mask) -> Mask:
+    """Which colours ``(n,)`` are near to the bin that most of those that are left fill; none if none is."""
+    if not left.any():
+        return left
+    bins, index = np.unique(np.round(colours[left] / BIN).astype(int), axis=0, return_inverse=True)
+    fullest = bins[np.bincount(index.ravel()).argmax()] * BIN
+    return np.asarray(np.linalg.norm(colours - fullest, axis=1) < NEAR)
 
 
 @dataclass(frozen=True)

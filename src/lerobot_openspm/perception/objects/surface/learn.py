@@ -56,8 +56,6 @@ SETTLING_ROUNDS = 2
 # Of an object whose colours vary less together than this with what the demonstrations' first pictures show,
 # the pattern tells nothing; from the second value on it tells all.
 PATTERN_SEEN = 0.55, 0.8
-# What is this far below the table is, metres.
-SUNKEN_M = 0.005
 # A demonstration in which patches agree less than this may show something else where an object stood.
 SHOWN_SHARE = 0.85
 # In so many of the demonstrations it is measured what looks most like the object without it; what is this
@@ -116,43 +114,65 @@ def _learn_surfaces(
     backdrop = learn_backdrop(_pictures(films), examples.floor)
     if backdrop is None:
         return {}, "no camera of the hand shows a table"
-    # A patch below the table shows the table, and not what the hand touched above it.
-    near = {k: model for k, model in near.items() if model.height > backdrop.table_height - SUNKEN_M}
-    unseen = [name for name in names if name not in near]
     scenes = [scene for scene, _ in films]
     first = [_first_poses(scene, near) for scene in scenes]
     points = {name: _touched(name, scenes, first) for name in near}
     heights = {name: model.height for name, model in near.items()}
+    surfaces = build_surfaces(_frames(films, first, backdrop), points, heights, backdrop)
+    # Where nothing stands on the table, patches follow the table itself, and not what was touched above it.
+    near = {name: model for name, model in near.items() if name in surfaces}
+    unseen = [name for name in names if name not in near]
     touched: dict[str, Touched] = {}
     for name in unseen:
+        points.pop(name, None)
         if one := poses_by_touch(name, scenes):
             touched[name], heights[name] = one, one.height
-            points[name] = np.array([T[:3, 3] for T in one.poses[0] if T is not None]) * 0.0
+            points[name] = np.zeros((1, 3))
             _put(name, one.poses[0], first)
     for name in near.keys() & at_one_place.keys():
         seen = [poses.get(name) for poses in first]
         if one := poses_beside(name, scenes, seen, heights[name]):
             touched[name] = one
-    surfaces = build_surfaces(_frames(films, first, backdrop), points, heights, backdrop)
+    if touched:
+        surfaces = build_surfaces(_frames(films, first, backdrop), points, heights, backdrop)
+
+    def standing_in(name: str) -> FirstSights:
+        return [(scene.views, T[name]) for scene, T in zip(scenes, first, strict=True) if name in T]
+
     stood: dict[str, Standing] = {}
     for _ in range(SETTLING_ROUNDS if touched else 0):
         stood = settle_all(surfaces, [film for _, film in films], touched, backdrop)
         for name, one in stood.items():
             _put(name, one.on_table(), first)
         surfaces = build_surfaces(_frames(films, first, backdrop), points, heights, backdrop)
-    models = {}
     # What the films hardly show where it was touched is not known.
-    for name in [name for name in surfaces if name in stood or name not in unseen]:
-        surface = surfaces[name]
-        standing = [(scene.views, T[name]) for scene, T in zip(scenes, first, strict=True) if name in T]
-        surface = replace(surface, pattern=_pattern(surface, standing, backdrop))
-        typical, rival = _agreements(surface, standing, backdrop, name in examples.told_apart)
-        model = SurfaceModel(name, surface, backdrop, heights[name], typical, rival, near.get(name))
-        model = with_places(model, stood[name], scenes) if name in stood else model
-        models[name] = model
-        logger.info("surface of %s: %d coloured points, agreement %.2f, without it %.2f",
-                    name, len(surface.coloured), model.typical_agreement, model.rival_agreement)  # fmt: skip
+    models = {
+        name: _model(
+            name, surfaces[name], heights[name], near.get(name), standing_in(name), backdrop, examples
+        )
+        for name in surfaces
+        if name in stood or name not in unseen
+    }
+    for name in stood.keys() & models.keys():
+        models[name] = with_places(models[name], stood[name], scenes)
     return models, "the hand's camera shows too little of its surface"
+
+
+def _model(
+    name: str,
+    surface: Surface,
+    height: float,
+    near: PatchModel | None,
+    standing: FirstSights,
+    backdrop: Backdrop,
+    examples: Examples,
+) -> SurfaceModel:
+    """What is known of an object by its surface, and by how demonstrations show that where it stands."""
+    surface = replace(surface, pattern=_pattern(surface, standing, backdrop))
+    typical, rival = _agreements(surface, standing, backdrop, name in examples.told_apart)
+    logger.info("surface of %s: %d coloured points, agreement %.2f, without it %.2f",
+                name, len(surface.coloured), typical, rival)  # fmt: skip
+    return SurfaceModel(name, surface, backdrop, height, typical, rival, near)
 
 
 def _put(name: str, poses: Sequence[Array | None], first: Sequence[dict[str, Array]]) -> None:

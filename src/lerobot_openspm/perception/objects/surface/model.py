@@ -32,7 +32,7 @@ from lerobot_openspm.perception.objects.surface.search import (
     search,
     settle,
 )
-from lerobot_openspm.perception.objects.surface.shown import KEPT_SHARE, seen_where_shown
+from lerobot_openspm.perception.objects.surface.shown import KEPT_SHARE, seen_where_shown, visible_share
 from lerobot_openspm.perception.objects.surface.sight import Sight, Surface, sight_of
 from lerobot_openspm.perception.objects.surface.tipped import has_tipped, lying
 from lerobot_openspm.types import PoseEstimate, Symmetry
@@ -289,7 +289,8 @@ class SurfaceModel:
         status = "not_found" if share < self._needed(best) else "ambiguous" if is_rivalled else "found"
         T = best.T_world_obj
         covariance = covariance_at(self.surface, sights, best.pose, not self.surface.is_round)
-        visible = look.seen_share(se3.apply(T, self.surface.coloured))
+        own = se3.apply(T, self.surface.coloured)
+        visible = visible_share(look, own) if self.near is None else look.seen_share(own)
         more = [one for one in rivals if self._is_another(one, best, told_apart)]
         others = tuple(one.T_world_obj for one in distinct(self.surface, more, apart))
         sure = WITHOUT_PATTERN + (1 - WITHOUT_PATTERN) * self.surface.pattern

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 
 import numpy as np
 
 from lerobot_openspm.geometry.se3 import Array
+from lerobot_openspm.perception.objects.base import Look
 from lerobot_openspm.perception.objects.patches.match import REACH_M
 from lerobot_openspm.perception.objects.surface.search import Freedom, Place, settle
 from lerobot_openspm.perception.objects.surface.sight import Sight, Surface
@@ -14,6 +16,8 @@ from lerobot_openspm.perception.objects.surface.sight import Sight, Surface
 # It is seen there if pictures agree this share of how they agreed in the demonstrations, and not less than
 # this with it.
 KEPT_SHARE, LEAST_SEEN = 0.7, 0.15
+# Of what stands half beyond the picture at least this share is in it.
+LEAST_INSIDE = 0.3
 
 
 def seen_where_shown(
@@ -37,3 +41,12 @@ def seen_where_shown(
         if is_near and place.score >= max(KEPT_SHARE * agreed, LEAST_SEEN):
             found.append((place, place.score / max(agreed, LEAST_SEEN)))
     return sorted(found, key=lambda one: -one[1])
+
+
+def visible_share(look: Look, points_world: Array) -> float:
+    """Share of points ``(n, 3)`` that is not hidden, of those that are in the picture.
+
+    An object that first pictures show badly may stand half beyond them, which hides nothing.
+    """
+    seen, inside = look.seen_share(points_world), replace(look, hidden={}).seen_share(points_world)
+    return seen / inside if inside >= LEAST_INSIDE else seen
