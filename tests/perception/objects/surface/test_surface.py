@@ -292,7 +292,7 @@ def test_a_record_tells_all_of_it(models):
     ("change", "message"),
     [
         ({"near": "patches"}, "'near' of 'block'"),
-        ({"near": None}, "array 'shown' is missing"),
+        ({"near": None}, "'block' was shown at 0 places, expected 1 to 64"),
         ({"hand_cameras": "hand"}, "list of camera keys"),
         ({"spacing": -1.0}, "'spacing' is -1.0"),
         ({"typical_agreement": 0.0}, "'typical_agreement' is 0.0"),

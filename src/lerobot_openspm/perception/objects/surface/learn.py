@@ -8,29 +8,20 @@ from dataclasses import replace
 
 import cv2
 import numpy as np
-from scipy.spatial import KDTree
 
 from lerobot_openspm.geometry import se3
 from lerobot_openspm.geometry.se3 import Array
 from lerobot_openspm.perception.objects.base import Examples, Kind, Look
 from lerobot_openspm.perception.objects.patches.learn import UNFOLLOWED, learn_at_one_place, learn_patches
 from lerobot_openspm.perception.objects.patches.model import PatchModel
-from lerobot_openspm.perception.objects.surface.backdrop import Backdrop, Float32, learn_backdrop
-from lerobot_openspm.perception.objects.surface.carving import Carved, Frame, Frames, carve, silhouette
+from lerobot_openspm.perception.objects.surface.backdrop import Backdrop, learn_backdrop
+from lerobot_openspm.perception.objects.surface.building import build_surfaces
+from lerobot_openspm.perception.objects.surface.carving import Frame, silhouette
 from lerobot_openspm.perception.objects.surface.compare import correlation_at, score_at
 from lerobot_openspm.perception.objects.surface.model import ANOTHER_SHARE, YAWS, SurfaceModel
 from lerobot_openspm.perception.objects.surface.record import from_record
-from lerobot_openspm.perception.objects.surface.relief import WEIGHTS, find_relief
 from lerobot_openspm.perception.objects.surface.search import Freedom, Place, over_table, search
 from lerobot_openspm.perception.objects.surface.sight import Surface, sight_of, sights_of
-from lerobot_openspm.perception.objects.surface.solid import (
-    Depths,
-    Solid,
-    carve_by_colour,
-    colours_of,
-    fill_silhouettes,
-    solid_under,
-)
 from lerobot_openspm.perception.objects.surface.touched import (
     Standing,
     Touched,
@@ -43,14 +34,6 @@ from lerobot_openspm.types import DemonstrationScene, Mask, Moment, View
 
 logger = logging.getLogger(__name__)
 
-# A point is believed where so many directions show it, with colours this much alike, CIELAB.
-MIN_DIRECTIONS, MAX_SPREAD = 2, 7.0
-# How a camera shows a point that it never saw is told by the most similar point that both cameras saw.
-SIMILAR_M, SIMILAR_COLOUR = 0.03, 10.0
-# Points without believed colours are kept this near to such as have them, metres: they hide what is behind.
-BESIDE_M = 0.02
-# Silhouettes are filled in so many rounds, since one object's surface explains what is seen beside another.
-ROUNDS = 2
 # What is known by touch is sought in the films, and learned again from there, so often.
 SETTLING_ROUNDS = 2
 # Of an object whose colours vary less together than this with what the demonstrations' first pictures show,
@@ -63,8 +46,6 @@ SHOWN_SHARE = 0.85
 RIVAL_SCENES, MARGIN_PX = 6, 6
 # So many of a kind that instructions tell apart are looked for in a demonstration's first picture.
 MOST_OF_A_KIND = 6
-# An object with fewer coloured points gets no surface.
-MIN_COLOURED = 40
 
 # The views of the demonstrations' first moments, and where an object stands in each: ``T_world_obj`` (4, 4).
 FirstSights = Sequence[tuple[Mapping[str, View], Array]]
@@ -227,86 +208,6 @@ def _touched(name: str, scenes: Sequence[DemonstrationScene], first: Sequence[Ma
         if cue.name == name and name in poses
     ]
     return np.array(points).reshape(-1, 3)
-
-
-def build_surfaces(
-    frames: Sequence[Frame], touched: Mapping[str, Array], heights: Mapping[str, float], backdrop: Backdrop
-) -> dict[str, Surface]:
-    """Surfaces of objects by name.
-
-    Args:
-        frames: All pictures.
-        touched: Points ``(k, 3)`` in each object's frame at which it was touched.
-        heights: World z of each object's frame.
-        backdrop: What no object is.
-    """
-    own = {name: Frames(name, [f for f in frames if name in f.standing]) for name in touched}
-    carved: dict[str, Carved] = {}
-    solids: dict[str, Solid] = {}
-    for name, points in touched.items():
-        table = backdrop.table_height - heights[name]
-        space = carve(own[name], points, table) if len(points) and own[name].frames else None
-        if space is not None:
-            carved[name], solids[name] = space, solid_under(find_relief(own[name], space), space)
-    for _ in range(ROUNDS):
-        depths = Depths(solids)
-        solids = {
-            name: fill_silhouettes(own[name].untouched, carved[name], solid, depths, backdrop)
-            for name, solid in solids.items()
-        }
-    depths = Depths(solids)
-    solids = {name: carve_by_colour(own[name], solid, depths) for name, solid in solids.items()}
-    depths = Depths(solids)
-    surfaces = {name: _coloured(own[name], solid, depths) for name, solid in solids.items()}
-    return {name: one for name, one in surfaces.items() if len(one.coloured) >= MIN_COLOURED}
-
-
-def _coloured(frames: Frames, solid: Solid, depths: Depths) -> Surface:
-    """A solid's points with the colours that the pictures agree about."""
-    points, normals = solid.points, solid.normals
-    seen: dict[str, list[Float32]] = {"world": [], "ee": []}
-    for frame, colours in colours_of(frames, solid, depths):
-        seen[frame.view.camera.mount].append(colours)
-    fixed, hand = (_middle(seen[mount], len(points)) for mount in ("world", "ee"))
-    middle, spread, count = hand
-    believed = (count >= MIN_DIRECTIONS) & (spread <= MAX_SPREAD)
-    colours = np.stack([fixed[0], middle], 1)
-    colours[~believed] = np.nan
-    # What no two pictures agree about may be nothing at all, except right beside what they do agree about.
-    near = believed.copy()
-    if believed.any():
-        near |= KDTree(points[believed]).query(points)[0] < BESIDE_M
-    points, normals, colours = points[near], normals[near], colours[near]
-    return Surface(points, normals, _completed(points, normals, colours), solid.cell)
-
-
-def _middle(seen: Sequence[Float32], n: int) -> tuple[Array, Array, Array]:
-    """Median colours ``(n, 3)``, median distance from them and number of views ``(n,)``."""
-    if not seen:
-        return np.full((n, 3), np.nan), np.full(n, np.inf), np.zeros(n, int)
-    stack = np.ma.masked_invalid(np.stack(seen))
-    middle = np.ma.median(stack, axis=0)
-    away = np.ma.sqrt((((stack - middle) * WEIGHTS) ** 2).sum(-1))
-    count = (~stack.mask[..., 0]).sum(0)
-    return middle.filled(np.nan), np.ma.median(away, axis=0).filled(np.inf), count
-
-
-def _completed(points: Array, normals: Array, colours: Array) -> Float32:
-    """Colours ``(n, 2, 3)`` with those filled in that one of the cameras never saw."""
-    done = colours.astype(np.float32)
-    has = np.isfinite(colours[:, :, 0])
-    both = np.flatnonzero(has.all(1))
-    for known, missing in ((1, 0), (0, 1)):
-        lacking = np.flatnonzero(has[:, known] & ~has[:, missing])
-        if len(lacking) == 0:
-            continue
-        done[lacking, missing] = colours[lacking, known]
-        if len(both):
-            features = np.column_stack([points / SIMILAR_M, colours[:, known] / SIMILAR_COLOUR, normals])
-            _, index = KDTree(features[both]).query(features[lacking])
-            like = both[index]
-            done[lacking, missing] += colours[like, missing] - colours[like, known]
-    return done
 
 
 def _pattern(surface: Surface, standing: FirstSights, backdrop: Backdrop) -> float:
