@@ -131,7 +131,9 @@ class SurfaceModel:
         """Find the object: where it stood in the demonstrations, where it is expected, or anywhere."""
         expected = look.expected.get(self.name)
         there = None if expected is None or not self._is_away(expected) else self._at(look, expected)
-        if there is not None and (followed := _followed(there)).status == "found":
+        # What falls out of the hand looks like one at its height that slides away.
+        is_there = there is not None and _apart_m(there.T_world_obj, expected) < SAME_PLACE_M
+        if there is not None and is_there and (followed := _followed(there)).status == "found":
             return followed
         near = self._where_shown(look) if self.near is None else self.near.localise(look)
         if expected is not None and self._is_lifted(expected):
