@@ -23,7 +23,7 @@ from lerobot_openspm.perception.objects.surface.touched import (
     poses_by_touch,
     settled,
 )
-from lerobot_openspm.types import ContactCue, DemonstrationScene, Moment, View
+from lerobot_openspm.types import ContactCue, DemonstrationScene, Moment, PoseEstimate, View
 
 # How far from its usual place the cup begins in another task, metres.
 RAISED = (-0.1, 0.05, 0.08)
@@ -215,3 +215,14 @@ def test_what_lies_beyond_the_picture_is_not_hidden(beyond, covered_share, expec
     hidden = np.arange(width) < 60 * covered_share
     look = Look({"front": view}, hidden={"front": np.broadcast_to(hidden, view.image.shape[:2])})
     assert visible_share(look, points) == pytest.approx(expected, abs=0.03)
+
+
+@pytest.mark.parametrize(("aside_m", "status"), [(0.01, "found"), (0.05, "not_found")])
+def test_what_falls_is_not_seen_sliding_away_at_its_height(learned, monkeypatch, aside_m, status):
+    """A can that fell into a basket looks like one that hovers beside it."""
+    cup = learned.models["cup"]
+    let_go = se3.from_yaw([0.0, 0.15, cup.height + 0.15], 0.0)
+    seen = PoseEstimate("found", let_go @ se3.from_yaw([aside_m, 0.0, 0.0], 0.0), 1e-6 * np.eye(4), 1.0, 1.0)
+    monkeypatch.setattr(SurfaceModel, "_at", lambda *_: seen)
+    view = views_at({}, looking_down(*HOME))["front"]
+    assert cup.localise(Look({"front": view}, expected={"cup": let_go})).status == status
