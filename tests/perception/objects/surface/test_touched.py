@@ -61,6 +61,7 @@ def test_what_is_hidden_in_first_pictures_is_learned_from_the_film(learned):
     assert block.near is not None
     assert len(block.shown) == 0
     assert len(cup.shown) == 1
+    np.testing.assert_allclose(cup.surface.middle, 0.0, atol=1e-9)
     points = cup.surface.coloured + np.array([0, 0, cup.height])
     assert np.percentile(points[:, 2], 95) == pytest.approx(0.06, abs=0.015)
     assert cup.surface.radius == pytest.approx(0.04, abs=0.015)

@@ -209,7 +209,11 @@ def with_places(model: SurfaceModel, stood: Standing, scenes: Sequence[Demonstra
         return replace(model, shown=shown)
     typical = float(np.clip(stood.agreement, 0.05, 1.0))
     rival = min(model.rival_agreement, typical)
-    return replace(model, shown=shown, typical_agreement=typical, rival_agreement=rival)
+    # Its frame was where it was touched: at its middle it stays in place however the object is seen turned.
+    middle_xy = np.append(model.surface.middle, 0.0)
+    surface = replace(model.surface, points=model.surface.points - middle_xy)
+    shown[:, :3] += middle_xy
+    return replace(model, surface=surface, shown=shown, typical_agreement=typical, rival_agreement=rival)
 
 
 def _seen_first(
