@@ -148,8 +148,8 @@ class Executor:
         approach = self.approach
         is_used_up = approach.corrections > MAX_CORRECTIONS
         is_passed_by = not (self.present.precise or self.present.until_stopped)
-        is_passed_by = is_passed_by and self.state.index + 1 < len(self.targets)
-        if is_passed_by and (is_used_up or approach.is_blocked):
+        has_next = self.state.index + 1 < len(self.targets)
+        if is_passed_by and has_next and (is_used_up or approach.is_blocked):
             # A hand that is held up short of a key pose it only passes by goes on to the next one.
             self._enter(self.state.index + 1, hand)
             return False

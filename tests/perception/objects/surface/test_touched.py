@@ -14,10 +14,13 @@ from lerobot_openspm.perception.objects import store
 from lerobot_openspm.perception.objects.base import Look
 from lerobot_openspm.perception.objects.kinds import learn_objects
 from lerobot_openspm.perception.objects.surface import learn
+from lerobot_openspm.perception.objects.surface.backdrop import frequent_colour
 from lerobot_openspm.perception.objects.surface.model import SurfaceModel
+from lerobot_openspm.perception.objects.surface.search import Place
 from lerobot_openspm.perception.objects.surface.shown import visible_share
 from lerobot_openspm.perception.objects.surface.touched import (
     Touched,
+    _is_steady,
     middle,
     poses_beside,
     poses_by_touch,
@@ -166,7 +169,6 @@ def test_what_is_grasped_higher_stands_higher_and_what_is_let_go_higher_does_not
         cues = [ContactCue("bowl", low, kind, "table: 0"), ContactCue("bowl", high, kind, "shelf: 0")]
         touched = poses_beside("bowl", [DemonstrationScene({}, (cue,)) for cue in cues], seen, 0.06)
         assert touched.is_seen
-        assert touched.poses[0] is not seen
         assert touched.poses[0][0] is seen[0]
         assert touched.poses[1][0] is None
         np.testing.assert_allclose(touched.poses[1][1][:3, 3], [0.0, 0.3, height])
@@ -227,3 +229,23 @@ def test_what_falls_is_not_seen_sliding_away_at_its_height(learned, monkeypatch,
     monkeypatch.setattr(SurfaceModel, "_at", lambda *_: seen)
     view = views_at({}, looking_down(*HOME))["front"]
     assert cup.localise(Look({"front": view}, expected={"cup": let_go})).status == status
+
+
+def test_a_steady_offset_from_the_touch_tells_more_than_one_that_varies():
+    poses = [se3.from_yaw([0.1 * i, 0.0, 0.0], 0.0) for i in range(4)]
+    for spread, steady in ((0.005, True), (0.05, False)):
+        places = [Place(np.array([0.1 * i + (-1) ** i * spread, 0.03, 0.0, 0.0]), 0.5) for i in range(4)]
+        assert _is_steady([*places, None], [*poses, None]) is steady
+    assert not _is_steady(places[:2], poses[:2])
+
+
+@pytest.mark.parametrize(("grey_share", "is_wood"), [(0.35, True), (0.45, False)])
+def test_the_table_is_what_most_shows_and_not_what_fills_a_bin(grey_share, is_wood):
+    """Wood has many colours; a grey thing that is nearly as large is not taken for it, nor wood for that."""
+    rng = np.random.default_rng(0)
+    wood = rng.normal([43.0, 10.0, 28.0], [3.5, 3.0, 3.0], (int(1000 * (1 - grey_share)), 3))
+    grey = np.tile([5.0, 0.0, 0.0], (int(1000 * grey_share), 1)) + rng.normal(
+        0, 0.2, (int(1000 * grey_share), 3)
+    )
+    colour, _ = frequent_colour(np.concatenate([grey, wood]).astype(np.float32))
+    assert (colour.mean[0] > 30) == is_wood

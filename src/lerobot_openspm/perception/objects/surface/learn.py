@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
 
 import cv2
@@ -103,18 +103,14 @@ def _learn_surfaces(
     # Where nothing stands on the table, patches follow the table itself, and not what was touched above it.
     near = {name: model for name, model in near.items() if name in surfaces}
     unseen = [name for name in names if name not in near]
-    touched: dict[str, Touched] = {}
+    touched = {name: one for name in unseen if (one := poses_by_touch(name, scenes))}
     for name in unseen:
         points.pop(name, None)
-        if one := poses_by_touch(name, scenes):
-            touched[name], heights[name] = one, one.height
-            points[name] = np.zeros((1, 3))
-            _put(name, one.poses[0], first)
-    for name in near.keys() & at_one_place.keys():
-        seen = [poses.get(name) for poses in first]
-        if one := poses_beside(name, scenes, seen, heights[name]):
-            touched[name] = one
-    if touched:
+    for name, one in touched.items():
+        points[name], heights[name] = np.zeros((1, 3)), one.height
+        _put(name, one.poses[0], first)
+    touched |= _elsewhere(near.keys() & at_one_place.keys(), scenes, first, heights)
+    if unseen:
         surfaces = build_surfaces(_frames(films, first, backdrop), points, heights, backdrop)
 
     def standing_in(name: str) -> FirstSights:
@@ -154,6 +150,18 @@ def _model(
     logger.info("surface of %s: %d coloured points, agreement %.2f, without it %.2f",
                 name, len(surface.coloured), typical, rival)  # fmt: skip
     return SurfaceModel(name, surface, backdrop, height, typical, rival, near)
+
+
+def _elsewhere(
+    names: Collection[str],
+    scenes: Sequence[DemonstrationScene],
+    first: Sequence[Mapping[str, Array]],
+    heights: Mapping[str, float],
+) -> dict[str, Touched]:
+    """About where things stood that patches find at one place only, by name."""
+    seen = {name: [poses.get(name) for poses in first] for name in sorted(names)}
+    found = {name: poses_beside(name, scenes, poses, heights[name]) for name, poses in seen.items()}
+    return {name: one for name, one in found.items() if one is not None}
 
 
 def _put(name: str, poses: Sequence[Array | None], first: Sequence[dict[str, Array]]) -> None:

@@ -86,7 +86,7 @@ class SurfaceModel:
         typical_agreement: How well the demonstrations' first pictures agree with its surface.
         rival_agreement: How well they agree with it elsewhere at most, where it is not.
         near: Patches, more exact where it stood in demonstrations; None of what first pictures show badly.
-        shown: Where else it stood (x, y, z), and how well first pictures agreed there ``(k, 4)``.
+        shown: Where it stood (x, y, z), unless patches find it all over; how well pictures agreed ``(k, 4)``.
     """
 
     kind: ClassVar[str] = "surface"

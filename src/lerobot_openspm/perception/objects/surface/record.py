@@ -14,8 +14,8 @@ from lerobot_openspm.perception.objects.patches import model as patches
 from lerobot_openspm.perception.objects.patches.model import PatchModel
 from lerobot_openspm.perception.objects.surface.backdrop import TABLE_MARGIN_M, Backdrop, Colour
 from lerobot_openspm.perception.objects.surface.model import UNCOLOURED, SurfaceModel
+from lerobot_openspm.perception.objects.surface.shown import MAX_SHOWN
 from lerobot_openspm.perception.objects.surface.sight import Surface
-from lerobot_openspm.perception.objects.surface.touched import MAX_SHOWN
 
 # What a record may hold: points, coloured ones at least, and the table's length and width in metres, rounded.
 MAX_POINTS, MIN_COLOURED, MAX_TABLE_M, ROUNDING_M = 60_000, 8, 10.0, 1e-3
@@ -81,7 +81,7 @@ def from_record(fields: Mapping[str, Any], arrays: Mapping[str, NDArray[Any]], w
 
 
 def _shown(name: str, arrays: Mapping[str, NDArray[Any]], where: str, least: int) -> NDArray[np.float64]:
-    """Where an object was shown that patches do not find, and how well first pictures agreed ``(k, 4)``."""
+    """Where an object was shown (x, y, z), and how well first pictures agreed there ``(k, 4)``."""
     shown = records.array(arrays, "shown", (-1, 4), where, np.float64)
     if not least <= len(shown) <= MAX_SHOWN or (shown[:, 3] < 0).any() or (shown[:, 3] > 1).any():
         raise MemoryFormatError(

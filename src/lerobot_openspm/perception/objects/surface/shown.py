@@ -18,12 +18,14 @@ from lerobot_openspm.perception.objects.surface.sight import Sight, Surface
 KEPT_SHARE, LEAST_SEEN = 0.7, 0.15
 # Of what stands half beyond the picture at least this share is in it.
 LEAST_INSIDE = 0.3
+# So many places are remembered: each is looked at whenever the object is sought.
+MAX_SHOWN = 64
 
 
 def seen_where_shown(
     surface: Surface, sights: Mapping[str, Sight], shown: Array, freedom: Freedom
 ) -> list[tuple[Place, float]]:
-    """The places where an object is seen near where it was shown, and how well, most alike first.
+    """The places where an object is seen near where it was shown, and how well.
 
     Args:
         surface: What is sought.
@@ -40,7 +42,7 @@ def seen_where_shown(
         is_near = np.linalg.norm(place.pose[:3] - [x, y, z]) <= REACH_M
         if is_near and place.score >= max(KEPT_SHARE * agreed, LEAST_SEEN):
             found.append((place, place.score / max(agreed, LEAST_SEEN)))
-    return sorted(found, key=lambda one: -one[1])
+    return found
 
 
 def visible_share(look: Look, points_world: Array) -> float:

@@ -27,6 +27,7 @@ from lerobot_openspm.perception.objects.surface.search import (
     search,
     settle,
 )
+from lerobot_openspm.perception.objects.surface.shown import MAX_SHOWN
 from lerobot_openspm.perception.objects.surface.sight import Sight, Surface, sight_of, sights_of
 from lerobot_openspm.types import ContactCue, DemonstrationScene, Moment, View
 
@@ -39,8 +40,6 @@ ALIKE_SHARE, STEADY_SHARE, STEADY_M, MIN_STEADY = 0.7, 0.45, 0.015, 3
 AROUND_M = 0.12
 # What stands this much higher than on the table stands on something else, metres.
 RAISED_M = 0.02
-# So many places are remembered: each is looked at whenever the object is sought.
-MAX_SHOWN = 64
 
 
 @dataclass(frozen=True)
@@ -69,7 +68,7 @@ def poses_by_touch(name: str, scenes: Sequence[DemonstrationScene]) -> Touched |
         return None
     places.sort(key=len, reverse=True)
     height = _height(places[0])
-    return Touched([_poses(scenes, own, height, height) for own in places], height)
+    return Touched([_poses(scenes, own, places[0], height) for own in places], height)
 
 
 def poses_beside(
@@ -91,8 +90,7 @@ def poses_beside(
     if own is None or not np.isfinite(_away_m(scenes, own, seen)):
         return None
     others = [place for place in places if place is not own]
-    base = _height(own)
-    return Touched([list(seen), *(_poses(scenes, place, base, height) for place in others)], height, True)
+    return Touched([list(seen), *(_poses(scenes, place, own, height) for place in others)], height, True)
 
 
 def _by_place(name: str, scenes: Sequence[DemonstrationScene]) -> list[list[ContactCue]]:
@@ -104,10 +102,14 @@ def _height(place: Sequence[ContactCue]) -> float:
 
 
 def _poses(
-    scenes: Sequence[DemonstrationScene], place: Sequence[ContactCue], base: float, height: float
+    scenes: Sequence[DemonstrationScene],
+    place: Sequence[ContactCue],
+    first: Sequence[ContactCue],
+    height: float,
 ) -> list[Array | None]:
     """Poses where a place was touched; what was grasped higher than the first stands higher by as much."""
-    rise = _height(place) - base if place[0].kind == "grasp" else 0.0
+    are_grasps = place[0].kind == first[0].kind == "grasp"
+    rise = _height(place) - _height(first) if are_grasps else 0.0
     own = [next((cue for cue in scene.cues if any(cue is one for one in place)), None) for scene in scenes]
     return [None if cue is None else se3.from_yaw([*cue.point_world[:2], height + rise], 0.0) for cue in own]
 
