@@ -24,8 +24,8 @@ CAN_IN_BASKET = np.array([0.0, 0.0, 0.150])
 CHEESE_IN_BASKET = np.array([0.0, 0.0, 0.145])
 BOTTLE_IN_BASKET = np.array([0.0, 0.0, 0.175])
 SMALL_BOTTLE_IN_BASKET = np.array([0.0, 0.0, 0.160])
-# The cheese is flat: a hand straight above it would stand on the can beside it.
-CHEESE_LEAN = math.radians(30)
+# The cheese is flat: a hand straight above it has room beside the can when it is turned.
+BESIDE_CAN = -math.radians(25)
 # Above the basket's rim and the things that stand on the floor.
 FLOOR_CARRY_RISE = 0.20
 
@@ -43,14 +43,12 @@ INTO_BASKET = {
     "chocolate_pudding": (PUDDING_MIDDLE, CHEESE_IN_BASKET),
     "orange_juice": (CARTON_TOP, BOTTLE_IN_BASKET),
 }
-# Flat things beside which a can stands in their scene.
-LEANING = {"cream_cheese": CHEESE_LEAN, "butter": CHEESE_LEAN}
 
 
-def into_basket(name: str, aside: np.ndarray | None = None, lean: float = 0.0) -> Put:
+def into_basket(name: str, aside: np.ndarray | None = None) -> Put:
     """Put something into the basket, or a little aside of its middle (3,)."""
     grasp, goal = INTO_BASKET[name]
-    return Put(name, grasp, on("basket", goal if aside is None else goal + aside), FLOOR_CARRY_RISE, lean)
+    return Put(name, grasp, on("basket", goal if aside is None else goal + aside), FLOOR_CARRY_RISE)
 
 
 _BOWL_ON_PLATE = Put("bowl", BOWL_RIM, on("plate", BOWL_ON_PLATE))
@@ -71,7 +69,6 @@ SPATIAL = {
         "on_the_wooden_cabinet": _BOWL_ON_PLATE,
     }.items()
 }
-OBJECT = {
-    f"pick_up_the_{name}_and_place_it_in_the_basket": into_basket(name, lean=LEANING.get(name, 0.0))
-    for name in INTO_BASKET
-}
+OBJECT = {f"pick_up_the_{name}_and_place_it_in_the_basket": into_basket(name) for name in INTO_BASKET}
+_CHEESE = "pick_up_the_cream_cheese_and_place_it_in_the_basket"
+OBJECT[_CHEESE] = replace(OBJECT[_CHEESE], turn=BESIDE_CAN)

@@ -11,7 +11,6 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from lerobot_openspm.envs.libero.simulator import LiberoSimulator
 from lerobot_openspm.envs.motions import DOWN, Actions, Pace, ScriptedHand, raised, yaw_matrix
@@ -25,7 +24,6 @@ PACE = Pace(
 )
 
 PRE_GRASP = 0.08
-SETTLING_STEPS = 8
 CARRY_RISE = 0.12
 # The least height above a place from which an object is lowered to it.
 LOWERING = 0.06
@@ -49,7 +47,6 @@ class Put:
         grasp: Where from its origin to grasp it, along the world's axes, or those of a hand that is turned.
         goal: Where its origin goes.
         rise: How high to lift it.
-        lean: By which angle the hand leans towards the robot, radians.
         along: The fingers open along this object's x axis instead of the world's y.
         turn: By which angle the hand is turned about the vertical besides, radians.
         slant: Where from the goal, seen from above, the lowering begins (3,): it is lowered at a slant.
@@ -60,7 +57,6 @@ class Put:
     grasp: np.ndarray
     goal: Callable[[LiberoHand], np.ndarray]
     rise: float = CARRY_RISE
-    lean: float = 0.0
     along: str | None = None
     turn: float = 0.0
     slant: np.ndarray = field(default_factory=lambda: np.zeros(3))
@@ -71,21 +67,16 @@ def take_and_put(put: Put, hand: LiberoHand) -> Actions:
     """Grasp from above, lift straight up and place."""
     offset, turn = hand.grasp_noise()
     yaw = put.turn if put.along is None else put.turn + float(yaw_of(hand.frame(put.along))) - math.pi / 2
-    lean = Rotation.from_rotvec([0.0, -put.lean, 0.0]).as_matrix()
     at = hand.origin(put.name) + yaw_matrix(yaw) @ put.grasp + offset
-    at_grasp = transform(yaw_matrix(yaw + turn) @ lean @ DOWN, at)
-    # The arm swings to the side when a leaning hand arrives, and would sweep over what is flat.
-    yield from grasp(hand, at_grasp, settles=put.lean > 0)
+    at_grasp = transform(yaw_matrix(yaw + turn) @ DOWN, at)
+    yield from grasp(hand, at_grasp)
     yield from hand.travel(raised(at_grasp, put.rise))
     yield from place(hand, put.name, put.goal(hand), put.slant, put.like)
 
 
-def grasp(hand: LiberoHand, at_grasp: np.ndarray, settles: bool = False) -> Actions:
-    """Go before T_world_ee `at_grasp`, settle there or not, advance along the fingers and close them."""
+def grasp(hand: LiberoHand, at_grasp: np.ndarray) -> Actions:
+    """Go before T_world_ee `at_grasp`, advance along the fingers and close them."""
     yield from hand.travel(backed(at_grasp, PRE_GRASP))
-    if settles:
-        yield from hand.hold(SETTLING_STEPS)
-        yield from hand.advance(backed(at_grasp, PRE_GRASP))
     yield from hand.advance(at_grasp)
     yield from hand.grip(closing=True)
 
