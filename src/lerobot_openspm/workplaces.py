@@ -8,6 +8,7 @@ checkpoint holds the first one's memory as any other does, and those of others i
 from __future__ import annotations
 
 import shutil
+from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -17,7 +18,7 @@ from lerobot.configs import PreTrainedConfig
 from lerobot_openspm.configuration_openspm import OpenSPMConfig
 from lerobot_openspm.errors import InstructionError, OpenSPMError
 from lerobot_openspm.language.names import NameSimilarity
-from lerobot_openspm.memory.compose import plan_parts
+from lerobot_openspm.memory.compose import Candidate, plan_parts
 from lerobot_openspm.memory.entry import MemoryEntry
 from lerobot_openspm.memory.io import MEMORY_JSON, read_memory, write_memory
 from lerobot_openspm.memory.memory import Memory
@@ -91,18 +92,30 @@ def _knows(
         parts = plan_parts(instruction, read_instruction(instruction, entries, names), entries, names)
     except InstructionError:
         return False, False, -1.0
-    shown = [{one.sources[0].source for one in part if len(one.sources) == 1} for part in parts]
     is_worded = any(
         source.language == instruction for part in parts for one in part for source in one.sources
     )
     meaning = min(max(one.semantic for one in part) for part in parts)
-    return bool(set.intersection(*map(_episodes, shown))), is_worded, meaning
+    return bool(set.intersection(*_episodes(parts))), is_worded, meaning
 
 
-def _episodes(sources: set[str]) -> set[str]:
-    """The demonstrations of some sources; what is done a second time in one is of the same."""
-    each = (one.rpartition("#") for source in sources for one in source.split(SOURCES))
-    return {f"{name}#{number.partition('.')[0]}" for name, _, number in each}
+def _episodes(parts: Sequence[Sequence[Candidate]]) -> list[set[str]]:
+    """The demonstrations that show each part; what is asked twice, only those that do it twice."""
+    times = Counter(part[0].asked for part in parts)
+    found = []
+    for part in parts:
+        shown = {
+            name for one in part if len(one.sources) == 1 for name in one.sources[0].source.split(SOURCES)
+        }
+        counts = Counter(map(_episode, shown))
+        found.append({episode for episode, count in counts.items() if count >= times[part[0].asked]})
+    return found
+
+
+def _episode(source: str) -> str:
+    """The demonstration of a source; what is done a second time in one has a number of its own behind it."""
+    name, _, number = source.rpartition("#")
+    return f"{name}#{number.partition('.')[0]}"
 
 
 def join(paths: Sequence[Path], output: Path) -> list[Memory]:

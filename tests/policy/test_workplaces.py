@@ -113,6 +113,15 @@ def test_where_one_demonstration_shows_all_is_better_than_where_several_do():
     assert _knows(instruction, each, TABLE_NAMES) > _knows(instruction, each[:1], TABLE_NAMES)
 
 
+def test_what_is_asked_twice_is_shown_by_what_does_it_twice():
+    once = [entry("put the pot on the stove", source=f"a/b#{i}") for i in (1, 2)]
+    twice = [replace(one, source=f"a/b#{i}") for one, i in zip(once, ("3", "3.2"), strict=True)]
+    merged = [replace(once[0], source="a/b#3, a/b#3.2")]
+    instruction = "put both pots on the stove"
+    assert _knows(instruction, twice, TABLE_NAMES) > _knows(instruction, once, TABLE_NAMES)
+    assert _knows(instruction, merged, TABLE_NAMES) == _knows(instruction, twice, TABLE_NAMES)
+
+
 def test_workplaces_of_joined_policies_are_joined_too(
     checkpoint: Path, changed: Callable[[str, Memory], Path], capsys: pytest.CaptureFixture[str]
 ):
