@@ -31,12 +31,12 @@ from lerobot_openspm.envs.motions import DOWN, Actions, in_world, raised, yaw_ma
 from lerobot_openspm.geometry.se3 import transform
 
 # Grasp points from the object's origin, along the world's axes. Mugs are taken by the rim opposite the
-# handle, moka pots by the knob of the lid.
+# handle, moka pots by the middle of the knob on the lid: lower, the fingers stand on the lid.
 WHITE_MUG_RIM = np.array([-0.001, -0.063, 0.095])
 YELLOW_MUG_RIM = np.array([-0.001, 0.066, 0.085])
 # The outside of the handle, for a hand that comes from there.
 YELLOW_MUG_HANDLE = np.array([0.0, -0.063, 0.058])
-MOKA_POT_KNOB = np.array([0.0, 0.0, 0.078])
+MOKA_POT_KNOB = np.array([0.0, 0.0, 0.085])
 # In the axes of the hand that grasps it: the middle of the book's upper edge.
 BOOK_EDGE = np.array([-0.012, 0.0, 0.125])
 PUDDING_MIDDLE = np.array([0.0, 0.0, 0.006])
