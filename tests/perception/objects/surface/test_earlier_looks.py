@@ -96,6 +96,35 @@ def test_a_hidden_one_of_two_alike_is_not_where_the_other_one_stands(models):
     assert_allclose(told.T_world_obj[:2, 3], T[:2, 3], atol=0.01)
 
 
+def test_what_the_hand_covers_is_not_gone_to_where_another_one_stands(models):
+    model, scene = models["block"], moved(0.12, 0.12, 0.3)
+    first = Look(views_at(scene, looking_down(*HOME)))
+    T = model.localise(first).T_world_obj
+    other = se3.from_yaw([-0.12, -0.12, 0.0], 0.0)
+    both = [(SHAPES["block"], scene["block"]), (SHAPES["block"], other)]
+    views = render(both, None, hand_camera(looking_down(-0.12, -0.05, 0.3)))
+    before = (EarlierLook(first, {"block": T}),)
+    look = Look(views, hidden=around(views, T), expected={"block": T}, told_apart={"block"}, before=before)
+    covered = model.localise(look)
+    assert (covered.status, covered.visible) == ("not_found", 0.0)
+    assert_allclose(covered.T_world_obj[:2, 3], T[:2, 3], atol=0.01)
+    # Where nothing hides the place, one that has gone is found at the other.
+    views = render(both[1:], None, hand_camera(looking_down(-0.12, -0.05, 0.3)))
+    gone = model.localise(Look(views, expected={"block": T}, told_apart={"block"}, before=before))
+    assert gone.status == "found"
+    assert_allclose(gone.T_world_obj[:2, 3], other[:2, 3], atol=0.01)
+
+
+def around(views, T):
+    """Pixels about what stands at a pose, as the arm above it hides them."""
+    hidden = {}
+    for name, view in views.items():
+        uv, _ = project(view.camera, view.T_world_cam, T[:3, 3] + [0.0, 0.0, 0.03])
+        rows, columns = np.mgrid[: view.camera.height, : view.camera.width]
+        hidden[name] = np.hypot(rows - uv[1], columns - uv[0]) < 40
+    return hidden
+
+
 def test_what_the_hand_alone_has_found_is_seen_to_be_gone(models):
     model, scene = models["block"], moved(0.12, 0.12, 0.3)
     views = views_at(scene, looking_down(*HOME))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 
 import numpy as np
 
@@ -10,6 +11,7 @@ from lerobot_openspm.geometry import se3
 from lerobot_openspm.geometry.se3 import Array
 from lerobot_openspm.perception.objects.base import Look
 from lerobot_openspm.perception.objects.surface.compare import score_at
+from lerobot_openspm.perception.objects.surface.shown import visible_share
 from lerobot_openspm.perception.objects.surface.sight import Sight, Surface
 
 # Earlier looks that found an object less than so far from where it is expected tell of it, metres.
@@ -17,6 +19,8 @@ STILL_M = 0.03
 # Where other things stood before it when it was found, fixed cameras showed less of it, but at least this
 # share of the typical agreement. A camera that has this share of its points in the picture should show it.
 LEAST_SHOWN_SHARE, IN_VIEW_SHARE = 0.25, 0.5
+# Of what the hand leaves less than this share to be seen, nothing tells that it is gone.
+COVERED_SHARE = 0.5
 
 # The views of a look as surfaces are compared with them.
 SightsOf = Callable[[Look], dict[str, Sight]]
@@ -31,16 +35,21 @@ def sights_before(look: Look, name: str, T_expected: Array, sights_of: SightsOf)
     }
 
 
-def shown_before(
+def share_if_there(
     look: Look, name: str, surface: Surface, typical_agreement: float, T_expected: Array, sights_of: SightsOf
 ) -> float:
-    """The share of the typical agreement by fixed cameras when an object was found where it is expected.
+    """The share of the typical agreement that an object should show which is still where it is expected.
 
-    What stands before it hides as much of it from them now. 1 where there was no such look, where they
-    showed too little of it to tell, and where a camera of the hand should show it now.
+    What stood before it when it was found by fixed cameras hides as much of it from them now. 1 where there
+    was no such look, where they showed too little of it to tell, and where a camera of the hand should show
+    it now. 0 where the hand hides most of it.
     """
+    points = se3.apply(T_expected, surface.coloured)
+    covered = replace(look, hidden={camera: sight.hidden for camera, sight in sights_of(look).items()})
+    if visible_share(covered, points) < COVERED_SHARE:
+        return 0.0
     hand = {camera: view for camera, view in look.views.items() if view.camera.mount == "ee"}
-    if hand and Look(hand).seen_share(se3.apply(T_expected, surface.coloured)) > IN_VIEW_SHARE:
+    if hand and replace(covered, views=hand).seen_share(points) > IN_VIEW_SHARE:
         return 1.0
     for _, earlier, T in _found_there(look, name, T_expected):
         fixed = {camera for camera, view in earlier.views.items() if view.camera.mount != "ee"}

@@ -16,7 +16,7 @@ from lerobot_openspm.perception.objects.base import Look, Record
 from lerobot_openspm.perception.objects.patches.model import PatchModel, unseen
 from lerobot_openspm.perception.objects.surface.backdrop import Backdrop
 from lerobot_openspm.perception.objects.surface.compare import FINE_POINTS, score_at
-from lerobot_openspm.perception.objects.surface.earlier import shown_before, sights_before
+from lerobot_openspm.perception.objects.surface.earlier import share_if_there, sights_before
 from lerobot_openspm.perception.objects.surface.search import (
     FINE_STEPS,
     SAME_PLACE_M,
@@ -155,8 +155,8 @@ class SurfaceModel:
         if expected is not None:
             there = there or self._at(look, expected)
             typical = self.typical_agreement
-            shown = shown_before(look, self.name, self.surface, typical, expected, self._sights)
-            if there.confidence >= GONE_SHARE * shown:
+            due = share_if_there(look, self.name, self.surface, typical, expected, self._sights)
+            if there.confidence >= GONE_SHARE * due:
                 return _followed(there)
         if is_near:
             return near
