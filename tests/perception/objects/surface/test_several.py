@@ -43,12 +43,12 @@ def test_another_one_is_told_once_and_not_hidden_by_one_that_is_not_seen_well(mo
     assert other[:3, 3] == pytest.approx(poses[2][:3])
 
 
-def test_of_those_that_words_tell_apart_one_seen_well_asks_no_more_of_the_others(models):
+def test_of_those_that_words_tell_apart_others_need_not_be_seen_as_well(models):
     cup, pose = models["cup"], np.array([0.0, 0.1, models["cup"].height, 0.0])
-    best, usual = Place(pose, 1.3 * cup.typical_agreement), max(0.85, cup.found_share) * cup.typical_agreement
-    for told_apart in (False, True):
-        assert cup._is_another(Place(pose, usual + 0.01), best, told_apart) == told_apart
-        assert not cup._is_another(Place(pose, usual - 0.01), best, told_apart)
+    best = Place(pose, 1.3 * cup.typical_agreement)
+    for told_apart, least in ((True, 0.7), (False, 0.85 * 1.3)):
+        assert cup._is_another(Place(pose, (least + 0.01) * cup.typical_agreement), best, told_apart)
+        assert not cup._is_another(Place(pose, (least - 0.01) * cup.typical_agreement), best, told_apart)
 
 
 def test_others_of_a_kind_that_words_tell_apart_do_not_raise_what_is_asked(models):

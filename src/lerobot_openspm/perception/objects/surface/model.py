@@ -48,8 +48,8 @@ BELIEVED_SHARE = 0.8
 RIVAL_SHARE = 0.93
 # An object whose pattern tells nothing is at most this sure: it may be turned, or something alike.
 WITHOUT_PATTERN = 0.9
-# A place that agrees this well holds another of the kind.
-ANOTHER_SHARE = 0.85
+# A place that agrees this well holds another of the kind; where words tell several apart, there are others.
+ANOTHER_SHARE, TOLD_APART_SHARE = 0.85, 0.7
 # Two places nearer than this share of the radius cannot both hold one.
 OVERLAP_SHARE = 0.8
 # Patches that find an object this near to where it is expected are not checked again, metres.
@@ -299,13 +299,10 @@ class SurfaceModel:
         return PoseEstimate(status, T, covariance, sure * float(np.clip(share, 0, 1)), visible, None, others)
 
     def _is_another(self, place: Place, best: Place, told_apart: bool) -> bool:
-        """Whether another one of the kind stands at a place: it is nearly as well seen as the best one.
-
-        Where words tell them apart, one that is seen better than usual does not ask more of the others.
-        """
-        usual = max(ANOTHER_SHARE, self._needed(place)) * self.typical_agreement
-        enough = ANOTHER_SHARE * max(self.typical_agreement, best.score)
-        return place.score >= (min(usual, enough) if told_apart else enough)
+        """Whether another one of the kind stands at a place: it is nearly as well seen as the best one."""
+        if told_apart:
+            return place.score >= TOLD_APART_SHARE * self.typical_agreement
+        return place.score >= ANOTHER_SHARE * max(self.typical_agreement, best.score)
 
     def to_record(self) -> Record:
         """See :class:`lerobot_openspm.perception.objects.base.KnownObject`."""
