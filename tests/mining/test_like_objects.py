@@ -155,6 +155,7 @@ def test_what_is_closed_is_touched_where_it_is_shut(task, end):
         ("put the bowl on the plate", set()),
         ("put the left bowl on the plate", {"bowl"}),
         ("put the bowl on the plate next to the box", {"plate"}),
+        ("put both bowls on the plate", {"bowl"}),
     ],
 )
 def test_learning_is_told_of_what_pictures_may_show_several(task, told_apart, monkeypatch):

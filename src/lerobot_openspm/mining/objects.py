@@ -7,7 +7,7 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from itertools import pairwise
+from itertools import chain, pairwise
 from typing import Literal
 
 import numpy as np
@@ -34,6 +34,7 @@ from lerobot_openspm.types import (
     PoseEstimate,
     Segmenter,
     Shape,
+    SubTask,
     View,
 )
 
@@ -153,10 +154,8 @@ def find_objects(
     models, unlearned = dict(known), dict[str, str]()
     if named:
         logger.info("learning what these look like: %s", ", ".join(named))
-        sub_tasks = [sub_task for item in mined for sub_task in item.sub_tasks]
-        told_apart = {one.target for one in sub_tasks if one.target_where is not None}
-        told_apart |= {one.landmark for one in sub_tasks if one.landmark_where is not None}
-        learned, unlearned = learn_objects(scenes, rng, known.values(), segmenter, shape, shapes, told_apart)
+        several = _of_several([item.sub_tasks for item in mined])
+        learned, unlearned = learn_objects(scenes, rng, known.values(), segmenter, shape, shapes, several)
         models |= learned
     # What several parts call the same is for each what the hand touched in it.
     whole = zip(scenes, mined, strict=True)
@@ -173,6 +172,15 @@ def find_objects(
     own_scenes, parts = [scene for scene, _ in divisions], [part for _, part in divisions]
     ends = _ends(own_scenes, parts, found, models, segmenter)
     return FoundObjects(models, parts, found, ends, unlearned)
+
+
+def _of_several(sub_tasks: Sequence[Sequence[SubTask]]) -> set[str]:
+    """Names of which a picture may show several: words tell one from the others, or "both" are asked for."""
+    names = {one.target for own in sub_tasks for one, times in Counter(own).items() if times > 1}
+    for one in chain(*sub_tasks):
+        names |= {one.target} if one.target_where is not None else set()
+        names |= {one.landmark} if one.landmark_where is not None else set()
+    return names
 
 
 def detect_touched(
