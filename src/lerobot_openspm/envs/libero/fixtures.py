@@ -39,6 +39,8 @@ SHUT_LOWERING = 0.10
 HINGE = np.array([-0.1725, -0.088, 0.178])
 # In the door's frame, whose x points from the hinge along it: where it is pushed, and its outside.
 DOOR_X, DOOR_Y = 0.18, -0.025
+# The angle of a door that is as far open as it goes, radians.
+DOOR_OPEN = -2.094
 # Of the closed fingers' middle before the door's outside: when they come down, on the way, and at the end.
 DOOR_CLEAR, DOOR_TOUCHING, DOOR_PRESSED = 0.070, 0.012, 0.002
 
@@ -94,23 +96,24 @@ def shut_drawer(name: str, hand: LiberoHand) -> Actions:
 
 
 def shut_microwave(hand: LiberoHand) -> Actions:
-    """Lower closed fingers before the open door of the microwave and push it shut.
+    """Lower closed fingers beyond the open door of the microwave and push it shut.
 
-    The hand keeps its orientation and goes round a corner half-way, as the door goes round its hinge.
+    The hand comes down clear of a door that is as far open as it goes, because nobody who looks from before it
+    sees how far that is. It keeps its orientation and goes round a corner half-way, as the door goes round
+    its hinge.
     """
     microwave = hand.frame("microwave")
     offset, turn = hand.grasp_noise()
-    opened = hand.simulator.joint_position("microwave_1_microjoint")
     rotation = microwave[:3, :3] @ yaw_matrix(turn) @ DOWN
 
     def before(angle: float, out: float) -> np.ndarray:
         point = HINGE + yaw_matrix(angle) @ [DOOR_X, DOOR_Y - out, 0.0]
         return transform(rotation, in_world(microwave, point) + offset)
 
-    start = before(opened, DOOR_CLEAR)
+    start = before(DOOR_OPEN, DOOR_CLEAR)
     yield from hand.travel(raised(start, SHUT_LOWERING))
     yield from hand.grip(closing=True)
     yield from hand.advance(start)
-    yield from hand.advance(before(opened / 2, DOOR_TOUCHING), slowness=0.7)
+    yield from hand.advance(before(DOOR_OPEN / 2, DOOR_TOUCHING), slowness=0.7)
     yield from hand.advance(before(0.0, DOOR_PRESSED), slowness=0.7)
     yield from hand.retreat(SHUT_LOWERING)
