@@ -98,9 +98,8 @@ def shut_drawer(name: str, hand: LiberoHand) -> Actions:
 def shut_microwave(hand: LiberoHand) -> Actions:
     """Lower closed fingers beyond the open door of the microwave and push it shut.
 
-    The hand comes down clear of a door that is as far open as it goes, because nobody who looks from before it
-    sees how far that is. It keeps its orientation and goes round a corner half-way, as the door goes round
-    its hinge.
+    The hand comes down clear of a door that is as far open as it goes, because how far this one is open is
+    hardly seen. It keeps its orientation and goes round a corner half-way, as the door goes round its hinge.
     """
     microwave = hand.frame("microwave")
     offset, turn = hand.grasp_noise()
