@@ -148,3 +148,18 @@ def test_what_tilts_in_the_hand_shows_no_place_for_another_thing():
     )
     with pytest.raises(InstructionError, match="no demonstration puts anything on the plate"):
         planned("put the box on the plate", [BOX_IN_BASKET, entry(key_poses=poured)])
+
+
+def test_a_grasp_that_goes_with_the_axes_of_something_else_takes_hold_of_nothing_elsewhere():
+    turned = tuple(
+        replace(one, anchor=Anchor("box", "basket")) if one.phase == "grasp" else one
+        for one in BOX_IN_BASKET.key_poses
+    )
+    with_basket = replace(BOX_IN_BASKET, key_poses=turned, source="local/demos#2", quality=1.0)
+    (part,) = planned("put the box on the plate", [with_basket, BOX_IN_BASKET, BOWL_ON_PLATE])
+    assert [one.sources[0] for one in part] == [BOX_IN_BASKET]
+    with pytest.raises(InstructionError, match="no demonstration takes hold of the box"):
+        planned("put the box on the plate", [with_basket, BOWL_ON_PLATE])
+    # It still shows where the box goes.
+    ((only,),) = planned("put the bowl in the basket", [with_basket, BOWL_ON_PLATE])
+    assert only.sources == (BOWL_ON_PLATE, with_basket)

@@ -21,9 +21,9 @@ def opened(sub_task=0):
     return [key_pose("cabinet", T, phase, closed, sub_task=sub_task) for phase, closed in phases]
 
 
-def drawer_entry(**changes):
+def drawer_entry(instruction=DRAWER, **changes):
     key_poses = (*opened(), *(replace(pose, sub_task=1) for pose in pick_and_place("bowl", "cabinet")))
-    return entry(DRAWER, **{"key_poses": key_poses, **changes})
+    return entry(instruction, **{"key_poses": key_poses, **changes})
 
 
 def test_an_entry_with_two_sub_tasks_teaches_both():
@@ -188,3 +188,44 @@ def test_what_some_demonstration_did_without_is_no_condition():
     (_, only) = planned("put the bowl in the top drawer of the cabinet", [whole])
     alone = replace(only[0].entry, source="local/demos#9")
     assert len(planned("put the bowl in the top drawer of the cabinet", [whole, alone])) == 1
+
+
+BOX = entry("put the box in the basket", source="local/demos#1")
+
+
+def operations(instruction, *entries):
+    return [part[0].entry.key.sub_tasks[0].operation for part in planned(instruction, entries)]
+
+
+def test_which_of_two_drawers_a_box_goes_into_is_asked_back_before_one_is_opened():
+    middle = drawer_entry(DRAWER.replace("top", "middle"))
+    with pytest.raises(InstructionError, match="the middle drawer of the cabinet or the top drawer"):
+        planned("put the box in the drawer of the cabinet", [drawer_entry(), middle, BOX])
+    assert operations("put the box in the drawer of the cabinet", drawer_entry(), BOX) == ["open", "put"]
+    opening, putting = planned("put the box in the middle drawer", [drawer_entry(), middle, BOX])
+    drawers = opening[0].entry.key.sub_tasks[0].part, putting[0].entry.key.sub_tasks[0].part
+    assert drawers == ("middle drawer", "middle drawer")
+
+
+def test_what_was_closed_is_opened_again_before_something_goes_in():
+    known = (
+        drawer_entry(),
+        BOX,
+        entry("close the top drawer of the cabinet", opened(), {"cabinet": np.eye(4)}),
+    )
+    ending = "close the top drawer and put the box in the top drawer"
+    expected = ["open", "put", "close", "open", "put"]
+    assert operations(f"put the bowl in the top drawer, {ending}", *known) == expected
+    assert operations(f"open the top drawer, {ending}", *known) == ["open", "close", "open", "put"]
+    # What the words leave open is opened as the drawer that was shown, and once.
+    assert operations("open the drawer and put the box in the top drawer", *known) == ["open", "put"]
+
+
+def test_where_demonstrations_do_different_things_before_it_is_asked_back():
+    other = drawer_entry(
+        "close the top drawer of the cabinet and put the bowl in the top drawer of the cabinet"
+    )
+    asked = "put the bowl in the top drawer of the cabinet"
+    with pytest.raises(InstructionError, match=r"different things before it: 'open .*' and 'close .*'; say"):
+        planned(asked, [drawer_entry(), other])
+    assert planned(f"open the top drawer and {asked}", [drawer_entry(), other])

@@ -16,8 +16,8 @@ from lerobot_openspm.errors import InstructionError
 from lerobot_openspm.geometry import se3
 from lerobot_openspm.geometry.se3 import Array
 from lerobot_openspm.language.descriptions import phrase
+from lerobot_openspm.language.lexicon import ENGLISH, Lexicon
 from lerobot_openspm.memory.entry import (
-    ARRIVING,
     WORLD,
     Anchor,
     MemoryEntry,
@@ -28,14 +28,13 @@ from lerobot_openspm.memory.entry import (
 from lerobot_openspm.memory.looks import UNKNOWN_LOOKS, Looks
 from lerobot_openspm.memory.retrieval import MIN_SEMANTIC
 from lerobot_openspm.memory.rim_grasps import Part, Score, by_rim
+from lerobot_openspm.memory.ways import Way, grasped, way_of
 from lerobot_openspm.types import SubTask
 
 # Of the pairs of demonstrations so many are put together, the best grasps and places first.
 MAX_PAIRS = 12
 # Two things whose undersides are seen at heights that differ by less than this stood on the same surface.
 SAME_SURFACE_M = 0.025
-# Where something was only pushed to, another one is let down from this height, and let go of at that, metres.
-LOWERED_M, RELEASED_M = 0.10, 0.003
 # A hand that turns a thing by more than this on its way does not only carry it, radians.
 MOST_TILT_RAD = 0.35
 # In what is put together, a thing is somewhere by being put or by being pushed there.
@@ -64,6 +63,7 @@ def combinations(
     parts: Sequence[Part],
     score: Score,
     looks: Looks = UNKNOWN_LOOKS,
+    lexicon: Lexicon = ENGLISH,
 ) -> list[Combination]:
     """What can be put together for a sub-task that nothing shows as such.
 
@@ -72,6 +72,7 @@ def combinations(
         parts: Entries of one sub-task, each with the entry of the memory that it is a part of.
         score: Tells how well a sub-task that is known fits another one.
         looks: What is known of the objects.
+        lexicon: Says which parts stand for the whole.
 
     Returns:
         Pairs of different demonstrations, the best first; none where the sub-task puts nothing anywhere.
@@ -83,8 +84,13 @@ def combinations(
     if asked.operation not in MOVING or not asked.landmark:
         return []
     shown = [(part, source) for part, source in parts if part.key.sub_tasks[0].operation in MOVING]
-    grasps = _best(shown, lambda known: score(asked, _going_as(asked, known)), _is_grasp, "target")
-    places = _best(shown, lambda known: score(asked, _done_with(asked, known)), _is_place, "landmark")
+    grasps = _best(shown, lambda known: score(asked, _going_as(asked, known)), _is_grasp, _target)
+    places = _best(
+        shown,
+        lambda known: score(asked, _done_with(asked, known)),
+        _is_place,
+        lambda known: _place_name(known, lexicon),
+    )
     if not grasps and not places:
         return []
     sag_m = 0.0
@@ -93,13 +99,15 @@ def combinations(
             by_rim(asked, shown, score, MIN_SEMANTIC, looks),
             lambda known: score(asked, _going_as(asked, known)),
             _is_grasp,
-            "target",
+            _target,
         )
         sag_m = max((_radius(part, looks) for part, _, _ in grasps), default=0.0)
     if not grasps:
         raise InstructionError(f"no demonstration takes hold of the {asked.target} to carry it")
     if not places:
-        raise InstructionError(f"no demonstration puts anything {asked.relation} the {_place_name(asked)}")
+        raise InstructionError(
+            f"no demonstration puts anything {asked.relation} the {_place_name(asked, lexicon)}"
+        )
     n_pairs = min(MAX_PAIRS, max(len(grasps), len(places)))
     found: list[Combination] = []
     for (grasp, own, a), (place, other, b) in islice(
@@ -116,8 +124,13 @@ def _radius(part: MemoryEntry, looks: Looks) -> float:
     return 0.0 if rim is None else rim.radius
 
 
-def _place_name(asked: SubTask) -> str:
-    return f"{asked.part} of the {asked.landmark}" if asked.part else asked.landmark
+def _target(sub_task: SubTask) -> str:
+    return sub_task.target
+
+
+def _place_name(sub_task: SubTask, lexicon: Lexicon) -> str:
+    part, landmark = sub_task.part, sub_task.landmark
+    return f"{part} of the {landmark}" if part and part not in lexicon.silent_parts else landmark
 
 
 def _going_as(asked: SubTask, known: SubTask) -> SubTask:
@@ -131,6 +144,14 @@ def _done_with(asked: SubTask, known: SubTask) -> SubTask:
 
 
 def _is_grasp(part: MemoryEntry) -> bool:
+    """Whether it takes hold of its target, at a pose that is relative to nothing else."""
+    if not _carries(part):
+        return False
+    index, _ = grasped(part)
+    return set(part.key_poses[index].anchor.objects) == {part.key.sub_tasks[0].target}
+
+
+def _carries(part: MemoryEntry) -> bool:
     target = part.key.sub_tasks[0].target
     return part.carried.get(0) == target and target in part.object_poses
 
@@ -140,12 +161,12 @@ def _is_place(part: MemoryEntry) -> bool:
     if not sub_task.landmark or not part.object_poses.keys() >= set(sub_task.objects):
         return False
     is_pushed = any(pose.phase == "push" for pose in part.key_poses)
-    return bool(part.outcomes) if is_pushed else _is_grasp(part) and _carries_level(part)
+    return bool(part.outcomes) if is_pushed else _carries(part) and _carries_level(part)
 
 
 def _carries_level(part: MemoryEntry) -> bool:
     """Whether the hand puts down what it carries as it took it, but for a turn about the vertical."""
-    T_grasp = _grasped(part)[1]
+    T_grasp = grasped(part)[1]
     places = [part.demonstrated(pose) for pose in part.key_poses if pose.phase == "place"]
     upright = [(T[:3, :3] @ T_grasp[:3, :3].T)[2, 2] for T in places]
     return bool(places) and min(upright) > np.cos(MOST_TILT_RAD)
@@ -155,7 +176,7 @@ def _best(
     parts: Sequence[Part],
     score: Callable[[SubTask], float],
     is_usable: Callable[[MemoryEntry], bool],
-    what: str,
+    name: Callable[[SubTask], str],
 ) -> list[tuple[MemoryEntry, MemoryEntry, float]]:
     """The usable parts with the highest score, which all are about one thing; tasks take turns.
 
@@ -165,7 +186,7 @@ def _best(
     usable = [one for one in scored if one[2] >= MIN_SEMANTIC and is_usable(one[0])]
     most = max((one[2] for one in usable), default=0.0)
     best = [one for one in usable if one[2] == most]
-    names = sorted({getattr(part.key.sub_tasks[0], what) for part, _, _ in best})
+    names = sorted({name(part.key.sub_tasks[0]) for part, _, _ in best})
     if len(names) > 1:
         meant = " or the ".join(names)
         raise InstructionError(f"which one is meant, the {meant}? Each was shown; say it in these words")
@@ -200,9 +221,9 @@ def combined(
         taken.target: grasp.object_poses[taken.target],
         put.landmark: place.object_poses[put.landmark],
     }
-    index, T_grasp = _grasped(grasp)
+    index, T_grasp = grasped(grasp)
     stood, other_stood = _same_surface(grasp, place, looks)
-    way = _way(place, other_stood).higher(sag_m)
+    way = way_of(place, other_stood).higher(sag_m)
     placing = _placing(grasp.key_poses[index], T_grasp, T_grasp[:3, 3] - stood, way, object_poses, sub_task)
     key_poses = (*_taking(grasp, index, way.rise_m), *placing)
     outcome = _outcome(sub_task, way, place, looks)
@@ -216,12 +237,6 @@ def combined(
         object_poses=object_poses,
         outcomes=(outcome,),
     )
-
-
-def _grasped(entry: MemoryEntry) -> tuple[int, Array]:
-    """Which key pose takes hold of the target, and where the hand is then, ``T_world_ee`` ``(4, 4)``."""
-    index = next(i for i, pose in enumerate(entry.key_poses) if pose.phase == "grasp")
-    return index, entry.demonstrated(entry.key_poses[index])
 
 
 def _same_surface(grasp: MemoryEntry, place: MemoryEntry, looks: Looks) -> tuple[Array, Array]:
@@ -243,60 +258,9 @@ def _stands(entry: MemoryEntry, looks: Looks) -> Array:
     return se3.apply(entry.object_poses[target], looks.underside(target)[None])[0]
 
 
-@dataclass(frozen=True)
-class _Way:
-    """The way that what something stands on takes to its place, in the world of its demonstration.
-
-    Attributes:
-        poses: The key poses on it.
-        points: Where the middle of the underside is at each ``(3,)``, metres.
-        rise_m: How high the hand lifts the thing at first.
-    """
-
-    poses: tuple[MemoryKeyPose, ...]
-    points: tuple[Array, ...]
-    rise_m: float
-
-    def higher(self, metres: float) -> _Way:
-        """The same way with more room below, but for the place itself."""
-        up = [metres if pose.phase == "pre-place" else 0.0 for pose in self.poses]
-        points = [point + np.array([0.0, 0.0, z]) for point, z in zip(self.points, up, strict=True)]
-        return replace(self, points=tuple(points), rise_m=self.rise_m + metres)
-
-
-def _way(place: MemoryEntry, stood: Array) -> _Way:
-    """The way to the place that an entry shows, for something that stood at a point ``(3,)``."""
-    if any(pose.phase == "push" for pose in place.key_poses):
-        return _way_down(place, stood)
-    index, T_grasp = _grasped(place)
-    T_ee_world = se3.inverse(T_grasp)
-    arriving = tuple(pose for pose in place.key_poses[index + 1 :] if pose.phase in ARRIVING)
-    arrived = [place.demonstrated(pose) for pose in arriving]
-    points = [se3.apply(T @ T_ee_world, stood[None])[0] for T in arrived]
-    at_place = max(i for i, pose in enumerate(arriving) if pose.phase == "place")
-    # While the fingers open, the hand leaves the thing behind.
-    points = [
-        points[at_place] if pose.phase == "release" else p for pose, p in zip(arriving, points, strict=True)
-    ]
-    lifted = [place.demonstrated(pose)[2, 3] for pose in place.key_poses[index + 1 :] if pose.phase == "lift"]
-    return _Way(arriving, tuple(points), max((float(z - T_grasp[2, 3]) for z in lifted), default=0.0))
-
-
-def _way_down(place: MemoryEntry, stood: Array) -> _Way:
-    """The way straight down to where something was pushed to."""
-    outcome, poses = place.outcomes[0], place.object_poses
-    end = stood + outcome.place_shown(poses) - outcome.target_at(poses) + [0.0, 0.0, RELEASED_M]
-    last = next(pose for pose in reversed(place.key_poses) if pose.phase == "push")
-    arriving = tuple(
-        replace(last, phase=phase, closed=True, dwell=False, axis=None) for phase in ("pre-place", "place")
-    )
-    above = end + np.array([0.0, 0.0, LOWERED_M])
-    return _Way(arriving, (above, end), LOWERED_M)
-
-
 def _taking(grasp: MemoryEntry, index: int, rise_m: float) -> Iterable[MemoryKeyPose]:
     """The key poses that take hold of the target and lift it, at least by so many metres."""
-    target, T_grasp = grasp.key.sub_tasks[0].target, _grasped(grasp)[1]
+    target, T_grasp = grasp.key.sub_tasks[0].target, grasped(grasp)[1]
     own = [pose for pose in grasp.key_poses if set(pose.anchor.objects) == {target}]
     yield from (pose for pose in grasp.key_poses[: index + 1] if set(pose.anchor.objects) == {target})
     lifts = [pose for pose in own if pose.phase == "lift"]
@@ -313,7 +277,7 @@ def _placing(
     taken: MemoryKeyPose,
     T_grasp: Array,
     above: Array,
-    way: _Way,
+    way: Way,
     object_poses: Mapping[str, Array],
     sub_task: SubTask,
 ) -> list[MemoryKeyPose]:
@@ -334,7 +298,7 @@ def _placing(
     ]
 
 
-def _outcome(sub_task: SubTask, way: _Way, place: MemoryEntry, looks: Looks) -> Outcome:
+def _outcome(sub_task: SubTask, way: Way, place: MemoryEntry, looks: Looks) -> Outcome:
     """Where the target ends: standing where the other thing stood."""
     underside = looks.underside(sub_task.target)
     end = way.points[-1] - [0.0, 0.0, underside[2]]

@@ -127,8 +127,8 @@ def plan_parts(
             raise InstructionError(
                 f"{said!r} is a part of the instruction {instruction!r} that cannot be done: {error}"
             ) from error
-        done = (*asked[: len(asked) - len(left)], *(one.asked[0] for (one, *_) in chain))
-        needed = _condition(found, done, names.lexicon)
+        done = [sub_task for part in chain for sub_task in _likeliest(part).entry.key.sub_tasks]
+        needed = _condition(found, done, names)
         if needed is not None:
             chain.append(_longest_run((needed,), phrase(needed), entries, names, looks))
         chain.append(found)
@@ -136,25 +136,55 @@ def plan_parts(
     return tuple(chain)
 
 
-def _condition(found: Sequence[Candidate], done: Sequence[SubTask], lexicon: Lexicon) -> SubTask | None:
+def _condition(found: Sequence[Candidate], done: Sequence[SubTask], names: NameSimilarity) -> SubTask | None:
     """What has to be done before a part that nobody asked for, as all demonstrations of that did it.
 
     Before something goes into a drawer, that is opened.
 
     Args:
         found: What the part can be carried out by.
-        done: The sub-tasks that are carried out before it.
-        lexicon: Says which words mean the same.
+        done: The sub-tasks that are carried out before it, in order.
+        names: Says which names mean the same thing.
+
+    Raises:
+        InstructionError: The demonstrations did different things before it.
     """
-    needed: SubTask | None = None
-    for one in found:
-        put, shown = one.entry.key.sub_tasks[0], one.sources[-1].key.sub_tasks
-        own = next((i for i, other in enumerate(shown) if _place(other) == _place(put)), 0)
-        before = [other for other in shown[:own] if put.part and _place(put) == (other.target, other.part)]
-        if not before or any(same_meaning((before[-1],), (other,), lexicon) for other in done):
-            return None
-        needed = before[-1]
+    before = [_done_before(one) for one in found]
+    each = [one for one in before if one is not None]
+    if len(each) < len(before) or any(_is_done(one, done, names.lexicon) for one in each):
+        return None
+    needed = each[found.index(_likeliest(found))]
+    for other in each:
+        # One of the two perhaps said with fewer words.
+        alike = max(semantic_score((a,), (b,), names) for a, b in ((needed, other), (other, needed)))
+        if alike < MIN_SEMANTIC:
+            raise InstructionError(
+                f"what comes before {phrase(found[0].asked[0])!r}? Demonstrations do different things before "
+                f"it: {phrase(needed)!r} and {phrase(other)!r}; say one of these first"
+            )
     return needed
+
+
+def _done_before(one: Candidate) -> SubTask | None:
+    """What the demonstration of a candidate did last with the place where it puts something."""
+    put, shown = one.entry.key.sub_tasks[0], one.sources[-1].key.sub_tasks
+    own = next((i for i, other in enumerate(shown) if _place(other) == _place(put)), 0)
+    before = [other for other in shown[:own] if put.part and _place(put) == (other.target, other.part)]
+    return before[-1] if before else None
+
+
+def _is_done(needed: SubTask, done: Sequence[SubTask], lexicon: Lexicon) -> bool:
+    """Whether it is the last that is done with its target: a drawer that is closed again is not open."""
+    own = (
+        one.operation
+        for one in reversed(done)
+        if same_meaning((replace(one, operation=needed.operation),), (needed,), lexicon)
+    )
+    return next(own, "") == needed.operation
+
+
+def _likeliest(part: Sequence[Candidate]) -> Candidate:
+    return max(part, key=lambda one: one.semantic)
 
 
 def _place(sub_task: SubTask) -> tuple[str, str]:
@@ -227,7 +257,7 @@ def _put_together(
         return semantic_score((one,), (other,), among)
 
     try:
-        found = combinations(asked, parts, score, looks)
+        found = combinations(asked, parts, score, looks, names.lexicon)
     except InstructionError as error:
         raise InstructionError(f"{error}, and {unknown}") from error
     if not found:
