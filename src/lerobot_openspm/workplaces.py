@@ -21,6 +21,7 @@ from lerobot_openspm.language.names import NameSimilarity
 from lerobot_openspm.memory.compose import Candidate, plan_parts
 from lerobot_openspm.memory.entry import MemoryEntry
 from lerobot_openspm.memory.io import MEMORY_JSON, read_memory, write_memory
+from lerobot_openspm.memory.looks import UNKNOWN_LOOKS, Looks
 from lerobot_openspm.memory.memory import Memory
 from lerobot_openspm.memory.merging import SOURCES
 from lerobot_openspm.memory.retrieval import read_instruction
@@ -70,7 +71,7 @@ def choose(
         return 0
     outside = [_outside(memory, observation.hand.T_world_ee[:3, 3]) for memory in memories]
     near = [i for i, metres in enumerate(outside) if metres <= min(outside) + NEAR_M]
-    return max(near, key=lambda i: _knows(observation.instruction, entries[i], names))
+    return max(near, key=lambda i: _knows(observation.instruction, entries[i], names, memories[i].looks))
 
 
 def _outside(memory: Memory, position: np.ndarray) -> float:
@@ -80,7 +81,7 @@ def _outside(memory: Memory, position: np.ndarray) -> float:
 
 
 def _knows(
-    instruction: str, entries: Sequence[MemoryEntry], names: NameSimilarity
+    instruction: str, entries: Sequence[MemoryEntry], names: NameSimilarity, looks: Looks = UNKNOWN_LOOKS
 ) -> tuple[bool, bool, float]:
     """How well a memory knows an instruction.
 
@@ -89,7 +90,7 @@ def _knows(
         where it cannot be carried out.
     """
     try:
-        parts = plan_parts(instruction, read_instruction(instruction, entries, names), entries, names)
+        parts = plan_parts(instruction, read_instruction(instruction, entries, names), entries, names, looks)
     except InstructionError:
         return False, False, -1.0
     is_worded = any(

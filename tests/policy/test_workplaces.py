@@ -5,20 +5,25 @@ import shutil
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
+from typing import cast
 
+import numpy as np
 import pytest
 import torch
 from tests.memory.builders import entry
+from tests.memory.test_rim_grasps import LOOKS, PUSHED, by_the_rim
 from tests.policy.conftest import Frame, act, batch_of
 
 from lerobot_openspm.cli.join import main as join
 from lerobot_openspm.errors import OpenSPMError
 from lerobot_openspm.language.names import TABLE_NAMES
 from lerobot_openspm.memory.io import read_memory, write_memory
+from lerobot_openspm.memory.looks import UNKNOWN_LOOKS
 from lerobot_openspm.memory.memory import Memory
 from lerobot_openspm.modeling_openspm import OpenSPMPolicy
-from lerobot_openspm.perception.observation import split_batch
-from lerobot_openspm.workplaces import _knows
+from lerobot_openspm.perception.observation import Observation, split_batch
+from lerobot_openspm.workplaces import _knows, choose
 
 FAR_M = 5.0
 
@@ -120,6 +125,18 @@ def test_what_is_asked_twice_is_shown_by_what_does_it_twice():
     instruction = "put both pots on the stove"
     assert _knows(instruction, twice, TABLE_NAMES) > _knows(instruction, once, TABLE_NAMES)
     assert _knows(instruction, merged, TABLE_NAMES) == _knows(instruction, twice, TABLE_NAMES)
+
+
+def test_a_workplace_knows_what_its_things_looks_alone_let_it_do():
+    looks = [UNKNOWN_LOOKS, LOOKS]  # of a plate that was never grasped, and can be taken by its rim
+    here = np.zeros((2, 3))
+    memories = [
+        cast(Memory, SimpleNamespace(robot=SimpleNamespace(workspace=here), looks=one)) for one in looks
+    ]
+    hand = SimpleNamespace(T_world_ee=np.eye(4))
+    observation = cast(Observation, SimpleNamespace(hand=hand, instruction="put the plate on the stove"))
+    entries = [[by_the_rim(), PUSHED]] * 2
+    assert choose(observation, memories, entries, TABLE_NAMES) == 1
 
 
 def test_workplaces_of_joined_policies_are_joined_too(
