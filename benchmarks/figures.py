@@ -100,9 +100,8 @@ CALIBRATION = (
 NOISE = (*ALONG, *_benchmarks("measurement_noise"))
 # As `make libero` types it; libero_goal is not named.
 WHOLE_SUITE = "--demos=10 --states=50 --tasks=0-9"
-# One policy for all four, from fewer states.
-ALL_SUITES = "--demos=10 --states=10 --tasks=0-9"
 OTHER_SUITES = ("libero_spatial", "libero_object", "libero_10")
+SUITES = ("libero_goal", *OTHER_SUITES)
 # 50 scenes of each of ten tasks, of libero_goal 10. With other kinds than all, the same scenes.
 PLACES = {
     "libero_spatial": "--suite=libero_spatial",
@@ -160,6 +159,7 @@ COMPARISONS = (
     "conditioning",
     "compound",
     "combinations",
+    "preconditions",
     "two_bowls",
     "anywhere",
 )
@@ -187,7 +187,7 @@ FIGURES: dict[str, Figure] = {
         suite: _with(_libero("run", *ERRORS, options=f"--suite={suite} {WHOLE_SUITE}"), ARM)
         for suite in OTHER_SUITES
     },
-    "libero_all": _with(_libero("run", *ERRORS, options=f"--suite=all {ALL_SUITES}"), ARM),
+    "libero_all": _with(_libero("run", *ERRORS, options=f"--suite=all {WHOLE_SUITE}"), ARM),
     **{
         suite: _figure(
             "libero_pro",
@@ -203,8 +203,15 @@ FIGURES: dict[str, Figure] = {
     "wrong_calibration_libero": _libero(
         "wrong_calibration", "libero/places", "calls", "truth", "libero/place_errors"
     ),
-    "libero_few_shot_3": _libero("few_shot", options="--demos=3"),
-    "libero_few_shot_1": _libero("few_shot", options="--demos=1 --states=10"),
+    "libero_few_shot_3": _libero("few_shot", "libero/run", *ERRORS, options="--demos=3"),
+    "libero_few_shot_1": _libero("few_shot", "libero/run", *ERRORS, options="--demos=1 --states=10"),
+    **{
+        f"{suite}_few_shot_3": _with(
+            _libero("few_shot", "libero/run", *ERRORS, options=f"--suite={suite} --demos=3 --states=10"),
+            ARM,
+        )
+        for suite in OTHER_SUITES
+    },
     "libero_ablations": _with(
         _libero("ablations", "libero/geometric_guess", "libero/guessed_key_poses"),
         f"{PACKAGE}/mining/phase_labels",
@@ -215,7 +222,12 @@ FIGURES: dict[str, Figure] = {
     },
     "libero_losses": _libero("losses"),
     "libero_latency": _with(_libero("latency"), f"{PACKAGE}/bench"),
-    "libero_equality": _libero("equality", "libero/run", *ERRORS),
+    **{
+        f"{suite}_equality": _with(
+            _libero("equality", "libero/run", *ERRORS, options=f"--suite={suite}"), ARM
+        )
+        for suite in SUITES
+    },
     "perception_libero": _figure("perception", (*LIBERO, *ALONG), ON_LIBERO),
     "keyposes_libero": _figure("key_poses", (*KEY_POSES, *RECORDING["libero"]), ON_LIBERO),
     "calibration": _figure("calibration", (*CALIBRATION, *RECORDING["openspm_tabletop"])),

@@ -7,15 +7,16 @@ from __future__ import annotations
 
 import json
 import re
+import resource
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
 from lerobot_openspm.cli.options import require_checkpoint
-from lerobot_openspm.cli.pipeline import TRAIN_CONFIG, collect_dataset, train
+from lerobot_openspm.cli.pipeline import DONE, TRAIN_CONFIG, collect_dataset, train
 from lerobot_openspm.envs.collection import SUMMARY_FILE
 from lerobot_openspm.envs.suites import find_suite, whole_suite
-from lerobot_openspm.files import write_beside
+from lerobot_openspm.files import write_beside, write_json
 
 # The demonstrations a task of the published figures; whoever asks for fewer takes the first of them.
 DEMOS = 10
@@ -24,6 +25,8 @@ RUNS = {TABLETOP: Path("outputs/demo"), LIBERO: Path("outputs/libero")}
 TRAIN_CONFIGS = {TABLETOP: TRAIN_CONFIG, LIBERO: Path("configs/openspm_libero_train.yaml")}
 # LIBERO's, as it stands in libero_goal.
 ARM = Path("configs/arms/libero_panda.urdf")
+# Beside a training's checkpoints: how much memory it took.
+PEAK = "peak_memory.json"
 
 
 @dataclass
@@ -170,7 +173,29 @@ def policy(
     if episodes is not None:
         chosen = json.dumps(list(episodes))
         options = (f"--dataset.episodes={chosen}", f"--policy.memory_episodes={chosen}", *options)
-    return train(root, root.with_name(variant), options, TRAIN_CONFIGS[simulator])
+    output = root.with_name(variant)
+    before = _done_ns(output)
+    made = train(root, output, options, TRAIN_CONFIGS[simulator])
+    if made[1] is not None and _done_ns(output) != before:
+        # Told in KiB, of the largest process that was started from here and has ended.
+        peak = resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss
+        write_json(output / PEAK, {"peak_mb": round(1024 * peak / 1e6)})
+    return made
+
+
+def _done_ns(output: Path) -> int | None:
+    """When a training was finished; None if it was not."""
+    done = output / DONE
+    return done.stat().st_mtime_ns if done.exists() else None
+
+
+def peak_mb(checkpoint: Path) -> int | None:
+    """The most memory that a process of a checkpoint's training had (RSS), MB; None if that is not known.
+
+    Of several trainings that were started from one process, none counts less than one before it.
+    """
+    noted = checkpoint.parents[2] / PEAK
+    return json.loads(noted.read_text())["peak_mb"] if noted.is_file() else None
 
 
 def _as_its_scenes(root: Path, task: str) -> tuple[str, str]:

@@ -1,6 +1,6 @@
 """Whether the harness acts as plain lerobot-eval does: the same episodes, compared action by action.
 
-python -m benchmarks.libero.equality --suite=libero_spatial --states=2
+python -m benchmarks.libero.equality --suite=libero_spatial
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ class EqualityConfig:
     """Which suite, and how many of the benchmark's initial states a task to compare."""
 
     suite: str = SUITE
-    states: int = 2
+    states: int = 1
 
     def __post_init__(self) -> None:
         if self.suite not in OBJECTS:
@@ -55,9 +55,10 @@ def main(config: EqualityConfig) -> dict[str, Any]:
     equal = [len(a) == len(b) and np.array_equal(a, b) for a, b in zip(plain, lazy, strict=True)]
     together = [np.abs(a[: len(b)] - b[: len(a)]).max() for a, b in zip(plain, lazy, strict=True)]
     return write(
-        "libero_equality" if config.suite == SUITE else f"{config.suite}_equality",
+        f"{config.suite}_equality",
         {
             "seed": SEED,
+            "suite": config.suite,
             "n": len(equal),
             "equal": sum(equal),
             "actions": sum(len(actions) for actions in plain),

@@ -20,13 +20,23 @@ from benchmarks.harness import Row, checkpoint_files
 from benchmarks.libero.accuracy import accuracy, found_errors
 from benchmarks.libero.evaluate import SEED, STATES, evaluate_states, summary
 from benchmarks.results import run, write
-from benchmarks.stages import DEMOS, LIBERO, RUNS, dataset, demonstrations_of, policy, run_folder
+from benchmarks.stages import (
+    DEMOS,
+    LIBERO,
+    RUNS,
+    dataset,
+    demonstrations_of,
+    peak_mb,
+    policy,
+    run_folder,
+)
 
 from lerobot_openspm.cli.pipeline import THREADS, digest, discard_unless
 from lerobot_openspm.envs.libero.simulator import OBJECTS, SUITE, scene_kind, tasks
 from lerobot_openspm.envs.suites import find_suite
 from lerobot_openspm.errors import OpenSPMError
-from lerobot_openspm.workplaces import join
+from lerobot_openspm.memory.io import read_memory
+from lerobot_openspm.workplaces import folders, join
 
 logger = logging.getLogger(__name__)
 
@@ -74,6 +84,7 @@ class Part:
         root: The dataset that their demonstrations are in.
         checkpoint: The policy of these tasks alone.
         seconds: That mining and training took; None if it was interrupted.
+        peak_mb: The most memory that a process had meanwhile; None if that is not known.
     """
 
     suite: str
@@ -81,14 +92,18 @@ class Part:
     root: Path
     checkpoint: Path
     seconds: float | None
+    peak_mb: int | None
 
 
-def learned(selected: Mapping[str, Sequence[str]], demos: int = DEMOS) -> tuple[Path, list[Part]]:
+def learned(
+    selected: Mapping[str, Sequence[str]], demos: int = DEMOS, first: int | None = None
+) -> tuple[Path, list[Part]]:
     """Record demonstrations of tasks and learn from them, where that was not done.
 
     Args:
         selected: The tasks by suite.
         demos: Demonstrations a task.
+        first: Learn from so many of them, the first ones; all if not given.
 
     Returns:
         The checkpoint of all tasks, and the parts that it was joined of.
@@ -96,14 +111,14 @@ def learned(selected: Mapping[str, Sequence[str]], demos: int = DEMOS) -> tuple[
     Raises:
         OpenSPMError: No expert demonstrates one of the tasks.
     """
-    parts = [part for suite, some in selected.items() for part in _parts(suite, demos, some)]
+    parts = [part for suite, some in selected.items() for part in _parts(suite, demos, some, first)]
     if len(parts) == 1:
         return parts[0].checkpoint, parts
     if len(selected) == 1:
         folder = run_folder(LIBERO, demos, ",".join(*selected.values()))
     else:
         folder = RUNS[LIBERO] / ALL / f"demos_{demos}"
-    output = folder / "joined"
+    output = folder / ("joined" if first is None else f"few_{first}_joined")
     paths = [part.checkpoint for part in parts]
     discard_unless(output, digest([file for path in paths for file in checkpoint_files(path)], []))
     if not output.exists():
@@ -111,7 +126,7 @@ def learned(selected: Mapping[str, Sequence[str]], demos: int = DEMOS) -> tuple[
     return output, parts
 
 
-def _parts(suite: str, demos: int, selected: Sequence[str]) -> list[Part]:
+def _parts(suite: str, demos: int, selected: Sequence[str], first: int | None) -> list[Part]:
     """What is learned of each scene. Scenes in which cameras and robot stand alike share a dataset."""
     names, shown = list(tasks(suite)), find_suite(LIBERO, suite).tasks("all")
     if unshown := [f"{names.index(task)} {task}" for task in selected if task not in shown]:
@@ -128,11 +143,13 @@ def _parts(suite: str, demos: int, selected: Sequence[str]) -> list[Part]:
         scenes = _grouped(alike, scene)
         for own in scenes:
             logger.info("mining and training: %s", ", ".join(own))
-            is_all = len(scenes) == 1
-            variant = "train" if is_all else f"train_{scene(own[0])}"
-            episodes = None if is_all else [n for task in own for n in recorded[task]]
+            variant = "train" if first is None else f"few_{first}"
+            if len(scenes) > 1:
+                variant += f"_{scene(own[0])}"
+            is_all = len(scenes) == 1 and first is None
+            episodes = None if is_all else [n for task in own for n in recorded[task][:first]]
             made = policy(LIBERO, variant, root=root, selection=selection, episodes=episodes)
-            parts.append(Part(suite, own, root, *made))
+            parts.append(Part(suite, own, root, *made, peak_mb(made[0])))
     return parts
 
 
@@ -154,15 +171,15 @@ def main(config: RunConfig) -> dict[str, Any]:
     """Do what is missing. The whole suite from 50 states is written down as a published result."""
     checkpoint, parts = learned(config.selected(), config.demos)
     told = {suite: _evaluated(config, suite, checkpoint, parts) for suite in config.selected()}
-    timing = _timing(parts)
+    spent = learning(checkpoint, parts)
     if config.suite != ALL:
-        return {**told[config.suite], **timing, "checkpoint": str(checkpoint)}
+        return {**told[config.suite], **spent, "checkpoint": str(checkpoint)}
     if config.demos == DEMOS and all(some == list(tasks(suite)) for suite, some in config.selected().items()):
         about = {"seed": SEED, "demonstrations": DEMOS, "n": sum(one["n"] for one in told.values())}
         kept = ("success", "n", "interval", "mean_steps")
         rates = {suite: {key: one[key] for key in kept} for suite, one in told.items()}
-        write("libero_all", {**about, **timing, "per_suite": rates}, THREADS)
-    return {**told, **timing, "checkpoint": str(checkpoint)}
+        write("libero_all", {**about, **spent, "per_suite": rates}, THREADS)
+    return {**told, **spent, "checkpoint": str(checkpoint)}
 
 
 def _evaluated(config: RunConfig, suite: str, checkpoint: Path, parts: Sequence[Part]) -> dict[str, Any]:
@@ -186,7 +203,7 @@ def _evaluated(config: RunConfig, suite: str, checkpoint: Path, parts: Sequence[
     is_whole = config.demos == DEMOS and config.states == STATES and selected == list(tasks(suite))
     if is_whole and config.suite == suite:
         about = {"seed": SEED, "demonstrations": DEMOS}
-        write(suite, {**about, **_timing(parts), **figures}, THREADS)
+        write(suite, {**about, **learning(checkpoint, parts), **figures}, THREADS)
         # Which way round the other suites' things look alike is not known, so their yaw is not judged.
         if suite == SUITE:
             write("libero_accuracy", {**about, "n": figures["n"], **found}, THREADS)
@@ -196,10 +213,29 @@ def _evaluated(config: RunConfig, suite: str, checkpoint: Path, parts: Sequence[
     return {**told, "per_task": per_task, **places}
 
 
-def _timing(parts: Sequence[Part]) -> dict[str, float | None]:
-    """How long mining and training of all parts took; None where one was interrupted."""
+def learning(checkpoint: Path, parts: Sequence[Part]) -> dict[str, float | None]:
+    """How long mining and training of all parts took, the most memory of a process, and what came of it.
+
+    None where one was interrupted.
+    """
     seconds = [part.seconds for part in parts if part.seconds is not None]
-    return {"mine_and_train_s": round(sum(seconds), 1) if len(seconds) == len(parts) else None}
+    peaks = [part.peak_mb for part in parts if part.peak_mb is not None]
+    return {
+        "mine_and_train_s": round(sum(seconds), 1) if len(seconds) == len(parts) else None,
+        "peak_mb": max(peaks) if len(peaks) == len(parts) else None,
+        **size(checkpoint),
+    }
+
+
+def size(checkpoint: Path) -> dict[str, float]:
+    """How many entries and objects all workplaces of a checkpoint hold, and how large it is."""
+    memories = [read_memory(folder) for folder in folders(checkpoint)]
+    held = sum(path.stat().st_size for path in checkpoint.rglob("*") if path.is_file())
+    return {
+        "entries": sum(len(memory.entries) for memory in memories),
+        "objects": sum(len(memory.objects) for memory in memories),
+        "checkpoint_mb": round(held / 1e6, 2),
+    }
 
 
 def select_tasks(selection: str, suite: str = SUITE) -> list[str]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from benchmarks.figures import FIGURES, OTHER_SUITES
+from benchmarks.figures import FIGURES, OTHER_SUITES, SUITES
 from benchmarks.libero.failures import FAR_OFF_MM as FAR_OFF
 from benchmarks.libero.places_tables import places_sections
 from benchmarks.markdown import (
@@ -14,6 +14,7 @@ from benchmarks.markdown import (
     grid,
     looked_at,
     percent,
+    quoted,
     section,
     share,
     table,
@@ -29,6 +30,10 @@ OTHERS = """# On LIBERO's other suites
 The same with at most 280 steps in libero_spatial and libero_object, and at most 520 in libero_10. What is
 called the same looks otherwise in each of the nine scenes of libero_10, and cameras and robot stand elsewhere
 in some: each scene is learned by itself, and one policy is joined of them."""
+HARNESS = """# The harness against lerobot-eval
+
+Episodes by LeRobot's own rollout and by the harness, which renders only when the policy looks, from the
+first initial state of each task. Equal: both took the same actions bit by bit."""
 # As the paper's table quotes them: parameters, chunk length, success in percent, frequency in Hz.
 PUBLISHED = (
     ("Diffusion Policy", "260 M", 8, 68.3, 14.2),
@@ -49,6 +54,7 @@ CONTACTS: Columns = {
     "Touched others": lambda row: share(row["touched"]),
     "Moved others": lambda row: share(row["moved"]),
 }
+LEARNED: Columns = {**SUCCESS, "Mean steps": "mean_steps", "Mining and training, s": "mine_and_train_s"}
 TOUCHED = (
     "Others: objects that neither the instruction nor the goal names. Shares of the episodes, failed ones "
     "too, in which the arm, the hand or what it carried or pushed touched one, and in which one was moved by "
@@ -92,14 +98,17 @@ def libero_sections() -> list[str]:
             section("Few demonstrations", [*few, "libero_goal"], _few_shot),
             section("A new task by memory alone", new, _new_tasks),
             section("Loss over epochs", "libero_losses", _losses),
-            section("The harness against lerobot-eval", "libero_equality", _equality),
         ],
     )
     others = [section(f"On {suite}", suite, _suite) for suite in OTHER_SUITES]
-    return [
-        *on_goal,
-        *chapter(OTHERS, [*others, section("One policy for all four", "libero_all", _all_suites)]),
+    joined = ["libero_all", *SUITES] if quoted("libero_all") else []
+    on_others = [
+        *others,
+        section("One policy for all four", joined, _all_suites),
+        section("From three demonstrations a task", [f"{one}_few_shot_3" for one in OTHER_SUITES], _by_suite),
     ]
+    equal = section("The four suites", [f"{suite}_equality" for suite in SUITES], _equality)
+    return [*on_goal, *chapter(OTHERS, on_others), *chapter(HARNESS, [equal])]
 
 
 def _variant(result: Quoted) -> str:
@@ -111,8 +120,20 @@ def _suite(result: Quoted) -> str:
     return f"{_per_task(result)}\n\n{_taken(result)}\n\n{_sorted(result)}{looked_at(result)}"
 
 
-def _all_suites(result: Quoted) -> str:
-    return f"{grid(result['per_suite'], STEPS, 'Suite')}\n\n{_taken(result)}"
+def _all_suites(results: list[Quoted]) -> str:
+    """The joint policy, suite by suite beside the policy of that suite alone where that was measured."""
+    result, *others = results
+    alone = {other.name: other["success"] for other in others}
+    rows = {
+        suite: {**row, "alone": alone.get(suite), "all": row["success"]}
+        for suite, row in result["per_suite"].items()
+    }
+    columns: Columns = {
+        **STEPS,
+        "Policy of this suite alone": lambda row: share(row["alone"]),
+        "Difference, points": lambda row: row["alone"] and f"{100 * (row['all'] - row['alone']):+.1f}",
+    }
+    return f"{grid(rows, columns, 'Suite')}\n\n{_taken(result)}"
 
 
 def _per_task(result: Quoted) -> str:
@@ -121,10 +142,15 @@ def _per_task(result: Quoted) -> str:
 
 
 def _taken(result: Quoted) -> str:
-    """How long it learned from how many demonstrations."""
-    seconds = result["mine_and_train_s"]
-    taken = "was interrupted" if seconds is None else f"took {seconds:.0f} s"
-    return f"Mining and training on {result['demonstrations']} demonstrations a task {taken}."
+    """How long and in how much memory it learned from how many demonstrations, and what came of it."""
+    seconds, peak = result["mine_and_train_s"], result["peak_mb"]
+    taken = "was interrupted" if seconds is None else f"took {seconds:.0f} s ({seconds / 60:.0f} min)"
+    memory = "" if peak is None else f", the largest process {peak} MB of memory"
+    return (
+        f"Mining and training on {result['demonstrations']} demonstrations a task {taken}{memory}. The "
+        f"checkpoint holds {result['entries']} entries and {result['objects']} objects, and has "
+        f"{result['checkpoint_mb']} MB."
+    )
 
 
 def _sorted(result: Quoted) -> str:
@@ -232,9 +258,11 @@ def _accuracy(result: Quoted) -> str:
 
 
 def _few_shot(results: list[Quoted]) -> str:
-    rows = {str(result["demonstrations"]): result for result in results}
-    more = {"Mean steps": "mean_steps", "Mining and training, s": "mine_and_train_s"}
-    return grid(rows, {**SUCCESS, **more}, "Demonstrations a task")
+    return grid({str(one["demonstrations"]): one for one in results}, LEARNED, "Demonstrations a task")
+
+
+def _by_suite(results: list[Quoted]) -> str:
+    return grid({one["suite"]: one for one in results}, LEARNED, "Suite")
 
 
 def _new_tasks(results: list[Quoted]) -> str:
@@ -254,9 +282,9 @@ def _losses(result: Quoted) -> str:
     return f"![Training and validation loss](images/{result['plot']})\n\n{last}"
 
 
-def _equality(result: Quoted) -> str:
-    return (
-        f"{result['equal']} of {result['n']} episodes by LeRobot's own rollout and by the harness, "
-        "which renders only when the policy looks, took the same actions bit by bit "
-        f"({result['actions']} actions; largest difference {result['largest_difference']})."
-    )
+def _equality(results: list[Quoted]) -> str:
+    columns: Columns = {
+        "Episodes": "n", "Equal": "equal", "Actions": "actions",
+        "Largest difference": "largest_difference",
+    }  # fmt: skip
+    return grid({one["suite"]: one for one in results}, columns, "Suite")

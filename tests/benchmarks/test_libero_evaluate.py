@@ -207,6 +207,10 @@ def made_up(calls: list[Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -
     monkeypatch.setattr(run, "scene", lambda task: "SCENE1" if "bowl" in task else "SCENE2")
     monkeypatch.setattr(run, "demonstrations_of", lambda _: {task: [i] for i, task in enumerate(TASKS)})
     monkeypatch.setattr(run, "policy", policy)
+    monkeypatch.setattr(run, "peak_mb", lambda path: 900 if path.name == "train_SCENE1" else 700)
+    monkeypatch.setattr(
+        run, "size", lambda path: {"entries": 7, "objects": 5, "checkpoint_mb": len(path.name)}
+    )
     monkeypatch.setattr(run, "discard_unless", lambda *_: None)
     monkeypatch.setattr(run, "join", lambda paths, _: calls.append([path.name for path in paths]))
     monkeypatch.setattr(run, "found_errors", lambda _, __, rows: [{"plate": (0.03, None)} for _ in rows])
@@ -234,6 +238,13 @@ def test_each_scene_is_learned_by_itself_and_one_policy_is_joined_and_evaluated(
     ]  # fmt: skip
     assert told["checkpoint"].endswith("joined")
     assert (told["n"], told["mine_and_train_s"], told["position_mm_mean"]) == (150, 60.0, 30.0)
+    # The largest of three trainings, and what was joined.
+    assert (told["peak_mb"], told["checkpoint_mb"]) == (900, len("joined"))
+    assert {key: written["libero_10"][key] for key in ("peak_mb", "entries", "objects")} == {
+        "peak_mb": 900,
+        "entries": 7,
+        "objects": 5,
+    }
     assert list(written) == ["libero_10"]
     assert [(one["task"], one["state"], one["off_mm"]) for one in written["libero_10"]["failed"]] == [
         (task, 0, 30.0) for task in TASKS
@@ -241,6 +252,19 @@ def test_each_scene_is_learned_by_itself_and_one_policy_is_joined_and_evaluated(
     run.main(run.RunConfig("libero_10", states=2, tasks="0-2"))
     run.main(run.RunConfig("libero_10", tasks="0,1"))
     assert len(written) == 1
+
+
+def test_of_some_demonstrations_those_of_each_task_that_come_first_are_learned(tmp_path, monkeypatch):
+    calls = list[Any]()
+    made_up(calls, tmp_path, monkeypatch)
+    monkeypatch.setattr(
+        run, "demonstrations_of", lambda _: {task: [i, i + 3] for i, task in enumerate(TASKS)}
+    )
+    checkpoint, _ = run.learned({"libero_10": list(TASKS)}, first=1)
+    trained = [call for call in calls if isinstance(call, tuple) and isinstance(call[0], str)]
+    # Recorded are all, so the last one is told which to learn from as well.
+    assert trained == [("few_1_SCENE2", [0]), ("few_1_SCENE1", [1]), ("few_1", [2])]
+    assert checkpoint.name == "few_1_joined"
 
 
 def test_of_all_suites_one_policy_is_published_with_the_rate_of_each(tmp_path, monkeypatch):
@@ -252,6 +276,7 @@ def test_of_all_suites_one_policy_is_published_with_the_rate_of_each(tmp_path, m
     assert Path(told["checkpoint"]).parts[-3:] == ("all", "demos_10", "joined")
     assert list(written) == ["libero_all"]
     assert (written["libero_all"]["n"], written["libero_all"]["seed"]) == (60, harness.SEED)
+    assert (written["libero_all"]["peak_mb"], written["libero_all"]["entries"]) == (900, 7)
     assert {name: one["n"] for name, one in written["libero_all"]["per_suite"].items()} == {
         "libero": 30,
         "libero_10": 30,

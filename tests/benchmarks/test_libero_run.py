@@ -1,10 +1,20 @@
-"""`make libero`: which tasks are learned together, and what is asked for wrongly."""
+"""`make libero`: which tasks are learned together, what that takes, and what is asked for wrongly."""
+
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import pytest
-from benchmarks.libero import run
-from benchmarks.libero.run import ALL, RunConfig, scene
+from benchmarks.libero import few_shot, run
+from benchmarks.libero.few_shot import FewShotConfig
+from benchmarks.libero.run import ALL, Part, RunConfig, learning, scene, size
+from tests.memory.memories import a_memory
 
+from benchmarks import stages
+from lerobot_openspm.cli.pipeline import DONE
 from lerobot_openspm.envs.libero.simulator import OBJECTS
+from lerobot_openspm.memory.io import write_memory
+from lerobot_openspm.workplaces import folder
 
 
 @pytest.fixture(autouse=True)
@@ -37,3 +47,70 @@ def test_the_tasks_of_a_scene_are_learned_together():
 def test_what_is_asked_for_wrongly_is_refused(options, words):
     with pytest.raises(ValueError, match=words):
         RunConfig(**options)
+
+
+def test_a_checkpoint_holds_what_all_its_workplaces_do(tmp_path: Path):
+    memory = a_memory()
+    for i in range(2):
+        write_memory(memory, folder(tmp_path, i))
+    (tmp_path / "model.safetensors").write_bytes(bytes(5_000_000))
+    told = size(tmp_path)
+    assert (told["entries"], told["objects"]) == (2 * len(memory.entries), 2 * len(memory.objects))
+    held = sum(path.stat().st_size for path in tmp_path.rglob("*") if path.is_file())
+    assert told["checkpoint_mb"] == pytest.approx(held / 1e6, abs=0.01)
+    assert told["checkpoint_mb"] > 5
+
+
+def test_what_learning_took_is_not_known_where_a_part_was_interrupted(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(run, "size", lambda _: {})
+    whole = Part("libero_10", ["a"], Path(), Path(), 60.0, 700)
+    torn = Part("libero_10", ["b"], Path(), Path(), None, None)
+    assert learning(Path(), [whole, whole]) == {"mine_and_train_s": 120.0, "peak_mb": 700}
+    assert learning(Path(), [whole, torn]) == {"mine_and_train_s": None, "peak_mb": None}
+
+
+def test_the_memory_of_a_training_is_noted_when_it_was_run_and_kept_with_it(tmp_path: Path, monkeypatch):
+    took: list[float | None] = [12.0]
+
+    def train(_: Path, output: Path, *__: Any) -> tuple[Path, float | None]:
+        if not (output / DONE).exists():
+            output.mkdir()
+            (output / DONE).write_text("{}")
+        return output / "checkpoints/last/pretrained_model", took[0]
+
+    peaks = iter((500_000, 900_000))
+    monkeypatch.setattr(stages, "train", train)
+    monkeypatch.setattr(stages.resource, "getrusage", lambda _: SimpleNamespace(ru_maxrss=next(peaks)))
+    for _ in range(2):
+        checkpoint, _ = stages.policy(stages.TABLETOP, root=tmp_path / "dataset")
+        assert stages.peak_mb(checkpoint) == 512
+    took[0] = None  # of a training that was resumed the rest tells nothing
+    checkpoint, _ = stages.policy(stages.TABLETOP, "resumed", root=tmp_path / "dataset")
+    assert stages.peak_mb(checkpoint) is None
+
+
+@pytest.mark.parametrize(
+    ("suite", "name"),
+    [("libero_goal", "libero_few_shot_3"), ("libero_spatial", "libero_spatial_few_shot_3")],
+)
+def test_of_each_suite_success_with_few_demonstrations_is_written_down(suite: str, name: str, monkeypatch):
+    asked, written = list[Any](), dict[str, Any]()
+    monkeypatch.setattr(few_shot, "find_suite", lambda *_: SimpleNamespace(tasks=lambda _: ["a", "b"]))
+    monkeypatch.setattr(few_shot, "run_folder", lambda *_: Path("of_suite"))
+    monkeypatch.setattr(
+        few_shot, "learned", lambda selected, first: asked.append((selected, first)) or (Path("few"), [])
+    )
+    monkeypatch.setattr(few_shot, "learning", lambda *_: {"peak_mb": 700})
+    monkeypatch.setattr(
+        few_shot, "evaluate_states", lambda *some, **named: asked.append((*some, named["suite"])) or []
+    )
+    monkeypatch.setattr(few_shot, "summary", lambda _: {"n": 20})
+    monkeypatch.setattr(few_shot, "write", lambda name, content, _: written.update({name: content}))
+    few_shot.main(FewShotConfig(suite, states=10))
+    assert asked == [
+        ({suite: ["a", "b"]}, 3),
+        (Path("few"), Path("of_suite/few_3_evaluation"), 10, ["a", "b"], suite),
+    ]
+    assert list(written) == [name]
+    told = {"suite": suite, "demonstrations": 3, "peak_mb": 700, "n": 20}
+    assert written[name].items() >= told.items()

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from benchmarks.figures import FIGURES
+from benchmarks.figures import FIGURES, SUITES
 from benchmarks.results import RESULTS
 from benchmarks.staleness import MARK, read_result
 
@@ -19,6 +19,7 @@ ORIGIN = {
     "seed": 0,
 }  # fmt: skip
 RATE = {"success": 0.5, "n": 4, "interval": [0.15, 0.85], "mean_steps": 100.0, "touched": 0.25, "moved": 0.0}
+LEARNED = {"mine_and_train_s": 200, "peak_mb": 870, "entries": 80, "objects": 12, "checkpoint_mb": 3.5}
 FAILURES = {"words": 0, "perception": 1, "reach": 0, "grasp": 1, "placing": 0}
 # Headline figures, of whose failed episodes films are looked at.
 FILMED = (
@@ -47,8 +48,8 @@ def put(results: dict[str, Any], name: str, **content: Any) -> None:
 
 
 def put_main_result(results: dict[str, Any], **content: Any) -> None:
-    rest = {"demonstrations": 10, "mine_and_train_s": 200, "failures": FAILURES}
-    put(results, "libero_goal", **RATE, **rest, **content)
+    rest = {"demonstrations": 10, "failures": FAILURES}
+    put(results, "libero_goal", **RATE, **rest, **LEARNED, **content)
 
 
 def test_the_committed_pages_are_made_of_the_committed_results():
@@ -156,14 +157,47 @@ def test_contacts_that_no_task_asks_for_are_told_beside_success(results):
 
 
 def test_other_suites_have_a_chapter_of_their_own(results):
-    learned = {"demonstrations": 10, "mine_and_train_s": None}
+    learned = {**LEARNED, "demonstrations": 10, "mine_and_train_s": None, "peak_mb": None}
     put(results, "libero_object", **RATE, **learned, per_task={"milk": RATE}, failures=FAILURES)
     text = tables.results_page().partition("# On LIBERO's other suites")[2]
     assert "## On libero_object" in text
     assert "| milk | 50.0 % | 15.0 to 85.0 % | 4 | 100.0 | 25.0 % | 0.0 % |" in text
-    assert "on 10 demonstrations a task was interrupted." in text
+    assert "on 10 demonstrations a task was interrupted. The checkpoint holds 80 entries" in text
     assert "| episodes | 0 | 1 | 0 | 1 | 0 |" in text
     assert "- libero_10: `python -m benchmarks.libero.run --suite=libero_10 --demos=10" in text
+
+
+def test_one_policy_for_all_is_told_suite_by_suite_beside_the_policy_of_each_and_what_it_took(results):
+    put(
+        results,
+        "libero_object",
+        **{**RATE, "success": 0.6},
+        **LEARNED,
+        demonstrations=10,
+        per_task={},
+        failures=FAILURES,
+    )
+    assert "One policy for all four" not in tables.results_page()
+    per_suite = {"libero_object": RATE, "libero_10": RATE}
+    put(results, "libero_all", **LEARNED, n=8, demonstrations=10, per_suite=per_suite)
+    text = tables.results_page().partition("## One policy for all four")[2]
+    assert "| libero object | 50.0 % | 15.0 to 85.0 % | 4 | 100.0 | 60.0 % | -10.0 |" in text
+    assert "| libero 10 | 50.0 % | 15.0 to 85.0 % | 4 | 100.0 | - | - |" in text
+    took = "took 200 s (3 min), the largest process 870 MB of memory. The checkpoint holds 80 entries and 12"
+    assert f"{took} objects, and has 3.5 MB." in text
+    marks = {("libero_all", "peak_mb"), ("libero_all", "checkpoint_mb"), ("libero_object", "success")}
+    assert marks <= set(MARK.findall(text))
+
+
+def test_each_suite_has_a_row_of_few_demonstrations_and_of_the_comparison_with_lerobot_eval(results):
+    for suite in SUITES:
+        put(results, f"{suite}_equality", suite=suite, n=10, equal=9, actions=1234, largest_difference=0.5)
+    put(results, "libero_10_few_shot_3", **RATE, suite="libero_10", demonstrations=3, mine_and_train_s=90)
+    text = tables.results_page()
+    assert "| libero 10 | 50.0 % | 15.0 to 85.0 % | 4 | 100.0 | 90 |" in text
+    equal = text.partition("# The harness against lerobot-eval")[2]
+    for suite in SUITES:
+        assert f"| {suite.replace('_', ' ')} | 10 | 9 | 1234 | 0.5 |" in equal
 
 
 def test_what_films_show_is_told_of_the_commit_whose_episodes_they_are_of(results, tmp_path, monkeypatch):
@@ -213,13 +247,21 @@ def failed_episodes(result: dict[str, Any]) -> list[tuple[str, int]]:
     return [(one["task"], one["state"]) if isinstance(one, dict) else (one[0], one[1]) for one in failed]
 
 
-def test_new_combinations_have_a_row_each(results):
+@pytest.mark.parametrize(
+    ("name", "title"),
+    [
+        ("combinations", "New combinations of a thing and a place"),
+        ("preconditions", "A drawer that nobody says is shut"),
+    ],
+)
+def test_new_combinations_have_a_row_each_and_all_together(name, title, results):
     run = {**RATE, "per_task": {"a": 0.5}}
-    put(results, "combinations", n=4, runs={"combinations": run}, instructions={"a": "put a on b"})
+    put(results, name, n=4, runs={name: run}, instructions={"a": "put a on b"})
     text = tables.results_page()
-    assert "New combinations of a thing and a place" in text
+    assert title in text
+    assert f"| {name} | 50.0 % | 15.0 to 85.0 % | 4 | 100.0 |" in text
     assert "| put a on b | 50.0 % | 15.0 to 85.0 % | 4 |" in text
-    assert tables.NOTES["combinations"] in text
+    assert tables.NOTES[name] in text
 
 
 def test_first_looks_anywhere_are_told_beside_success_and_so_is_which_layouts_are_left_out(results):

@@ -58,6 +58,7 @@ def test_the_policy_as_it_is_keeps_its_figures():
         ("oracle", ["oracle"], 1000),
         ("conditioning", ["equivariant", "paper"], 1000),
         ("combinations", ["combinations"], 17_000),
+        ("preconditions", ["preconditions"], 24_000),
         ("two_bowls", ["two_bowls"], 11_000),
         ("anywhere", ["anywhere"], 14_000),
     ],
@@ -79,6 +80,22 @@ def test_of_new_combinations_there_are_ten_scenes_each(monkeypatch: pytest.Monke
     assert asked == [(10, 17_000, SELECTIONS["combinations"])]
     assert list(told) == list(SELECTIONS["combinations"])
     assert len(set(told.values())) == 20
+
+
+def test_of_each_task_with_a_drawer_that_is_shut_unsaid_there_are_fifteen_scenes(monkeypatch):
+    asked = []
+    monkeypatch.setattr(tabletop, "evaluate", lambda *a, **b: asked.append((*a[2:], b["tasks"])) or EPISODES)
+    told = main(TabletopConfig("preconditions"))["instructions"]
+    ((scenes, seed, tasks),) = asked
+    assert (scenes, seed, tasks) == (15, 24_000, tuple(told))
+    assert scenes * len(tasks) >= 50
+    assert all("drawer" in one and "open" not in one for one in told.values())
+    silent = [
+        name
+        for name, text in main(TabletopConfig("combinations"))["instructions"].items()
+        if "drawer" in text and "open" not in text
+    ]
+    assert list(told) == silent
 
 
 def test_an_unknown_comparison_is_refused():
