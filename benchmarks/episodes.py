@@ -70,6 +70,7 @@ class Episode:
             "key_pose": state.index,
             "phase": targets[state.index].key_pose.phase if targets else None,
             "attempts": state.attempts,
+            "parts": [{"attempts": attempts, "seconds": seconds} for attempts, seconds in state.spent],
             "entry": " and ".join(one.source for one in state.used[-1]) if state.used else None,
         }
 

@@ -10,7 +10,7 @@ from tests.memory.builders import OPEN_WIDTH, entry, hand_pose, key_pose, robot
 from lerobot_openspm.control import executor as executing
 from lerobot_openspm.control.executor import Executor
 from lerobot_openspm.control.state import EpisodeState, Status
-from lerobot_openspm.control.strategies import RESIDUAL_M, RESIDUAL_RAD
+from lerobot_openspm.control.strategies import CORRECTION_STEPS, RESIDUAL_M, RESIDUAL_RAD, Approach
 from lerobot_openspm.control.transfer import SHUT_M, transfer
 from lerobot_openspm.errors import OpenSPMError
 from lerobot_openspm.geometry import se3
@@ -209,6 +209,26 @@ def test_a_via_point_that_is_blocked_is_left_behind():
     assert executor.state.index == 1
     assert retries == 0
     assert executor.state.status is Status.RUNNING
+
+
+def test_a_hand_that_cannot_get_away_has_done_its_part():
+    executor = make()
+    last = replace(executor.targets[-1], T_world_ee=hand_pose(0, 0, 0.4), precise=False)
+    executor.begin([last], Hand(HOME, OPEN_WIDTH))
+    _, retries, _ = run(executor, World(stuck=lambda T: True))
+    assert (executor.state.status, retries) == (Status.DONE, 0)
+
+
+def test_a_hand_that_swings_about_a_key_pose_is_not_blocked():
+    executor = make(key_poses=[key_pose("bowl", np.eye(4), "grasp")])
+    T = executor.targets[0].T_world_ee
+    for swing_m, is_blocked in ((0.008, False), (0.0, True)):
+        approach = Approach(HOME)
+        for side in (1, -1, 1, -1):
+            off = T @ se3.transform(np.eye(3), np.array([0.0, 0.008 + side * swing_m, 0.0]))
+            for _ in range(CORRECTION_STEPS):
+                executor.strategy.correct(executor.targets[0], approach, Hand(off, OPEN_WIDTH))
+        assert approach.is_blocked == is_blocked
 
 
 def test_a_retry_begins_at_the_first_approach_of_the_same_contact():

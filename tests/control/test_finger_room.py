@@ -34,6 +34,12 @@ def test_it_goes_straight_where_the_fingers_have_room(along):
     assert finger_room(SHOWN, TARGETS, beside(along), OPEN_WIDTH) == {}
 
 
+def test_it_goes_straight_where_going_aside_frees_hardly_anything():
+    plate = np.stack(np.meshgrid(np.linspace(-0.1, 0.1, 41), np.linspace(-0.1, 0.06, 33), [0.005]), axis=-1)
+    points = {"plate": se3.apply(GRASP.T_world_ee, plate.reshape(-1, 3))}
+    assert finger_room(SHOWN, TARGETS, points, OPEN_WIDTH) == {}
+
+
 def test_both_fingers_keep_clear_of_what_they_close_on():
     most = OPEN_WIDTH - 2 * (LEAST_ROOM_M + 0.004)
     for opening, is_shifted in ((most, False), (most - 0.004, True)):

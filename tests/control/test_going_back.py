@@ -260,6 +260,9 @@ def test_what_was_put_down_is_seen_to_be_there_before_the_rest_is_done():
         assert (one.state.part, one.state.attempts) == (part, attempts)
         assert one.state.index == 0
     assert one.state.verdicts == (True,)
+    ((attempts, seconds),) = one.state.spent
+    assert attempts == 1
+    assert 0 < seconds < one.scene.time_s
     assert {target.key_pose.anchor.place for target in one.executor.targets} == {"cabinet"}
 
 

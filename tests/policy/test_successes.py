@@ -91,7 +91,7 @@ def test_a_failure_counts_for_the_part_that_failed_and_not_for_the_one_that_was_
     policy.select_action(batch_of([recorded[0][0], recorded[3][0]]))
     done, failed = (policy.episodes[i].controller.state for i in (0, 1))
     done.parts, done.used = done.parts + failed.parts, done.used + failed.used
-    done.begin_next_part()
+    done.begin_next_part(1.0)
     done.verdicts = (True,)
     policy.report_successes([False, None])
     assert trials(policy) == {done.used[0][0].source: (1, 1), done.used[1][0].source: (1, 0)}

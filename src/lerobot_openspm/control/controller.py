@@ -343,7 +343,7 @@ class EpisodeController:
         if state.is_last_part:
             return None
         self.executor.stop(Status.WAITING)
-        state.begin_next_part()
+        state.begin_next_part(self.scene.time_s)
         self.scene.ground(state.parts[state.part], state.ahead, hand)
         logger.info("%r: part %d of %d", self.instruction, state.part + 1, len(state.parts))
         return self._look_for_plan(hand)

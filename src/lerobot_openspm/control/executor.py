@@ -149,9 +149,12 @@ class Executor:
         is_used_up = approach.corrections > MAX_CORRECTIONS
         is_passed_by = not (self.present.precise or self.present.until_stopped)
         has_next = self.state.index + 1 < len(self.targets)
-        if is_passed_by and has_next and (is_used_up or approach.is_blocked):
+        if is_passed_by and (is_used_up or approach.is_blocked):
             # A hand that is held up short of a key pose it only passes by goes on to the next one.
-            self._enter(self.state.index + 1, hand)
+            if has_next:
+                self._enter(self.state.index + 1, hand)
+            else:
+                self.stop(Status.DONE)
             return False
         if self._is_held_up_from_below(hand):
             logger.info("letting go here: what is carried is held up from below")

@@ -24,6 +24,8 @@ LEAST_ROOM_M = 0.004
 HALF_WIDTH_M, THICKNESS_M, FROM_M, TO_M = 0.016, 0.028, -0.05, 0.01
 # Fewer points of other objects in the fingers' way are noise.
 NOISE_POINTS = 3
+# A shift leaves at most this share of what is in the fingers' way, else it is for nothing.
+MOST_LEFT = 0.5
 
 
 def finger_room(
@@ -52,7 +54,7 @@ def finger_room(
         choices = [metres for metres in SHIFTS_M if abs(metres) <= max(most, 0.0)]
         in_way = [_in_fingers(near, metres, open_width) for metres in choices]
         best = int(np.argmin(in_way))
-        if in_way[0] >= NOISE_POINTS and choices[best]:
+        if in_way[0] >= NOISE_POINTS and in_way[best] <= MOST_LEFT * in_way[0]:
             shifts[pose.sub_task] = choices[best]
     return shifts
 

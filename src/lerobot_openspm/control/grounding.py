@@ -60,9 +60,12 @@ def demonstrations(
     for one in candidates:
         own = Candidate(one.entry, 1.0, (one.entry,), one.entry.key.sub_tasks)
         told, then = references(one, object_meant), references(own, object_meant)
+        landmarks = {object_meant(asked.landmark) for asked in one.asked}
         for name, where in told.items():
             if then.get(name) == where and not set(where.landmarks) <= set(known):
-                shown.setdefault(name, []).append(one.sources[0].object_poses)
+                # What was put together has its landmark from the demonstration of the place.
+                source = one.sources[-1 if name in landmarks else 0]
+                shown.setdefault(name, []).append(source.object_poses)
     return {name: tuple(poses) for name, poses in shown.items()}
 
 

@@ -210,13 +210,14 @@ class PlanningContext:
 
     def otherwise(self, plan: Plan) -> Plan:
         """A plan that grasps from another side, where the arm can follow it so; else the plan itself."""
+        plan = replace(plan, shifts={})  # they lead a hand that grasps from another side elsewhere
         ways = [
             way
             for way in plan.turns(self)
             if abs(float(se3.wrap_angle(way.turned - plan.turned))) > OTHERWISE_RAD
         ]
         found = self._clearest([replace(way, out=self._ways_out(way)) for way in ways], self._points(plan))
-        return plan if found is None else found[0]
+        return self._with_finger_room(plan if found is None else found[0])
 
     def _clearest(
         self, turned: Sequence[Plan], points: Mapping[str, Array]

@@ -17,6 +17,8 @@ FAILS = {
     "lift": "the {} does not stay in the hand",
     "pre-place": "the hand does not get to the {}",
     "place": "nothing can be put at the {}",
+    "release": "the hand does not let go at the {}",
+    "retreat": "the hand does not get away from the {}",
     "push": "the {} cannot be pushed",
     "open": "the {} does not open",
     "turn": "the {} does not turn",

@@ -110,16 +110,22 @@ class SceneState:
         self.tracker.forget(others)
         self.altered -= others
 
+    @property
+    def time_s(self) -> float:
+        """Seconds since the episode began."""
+        return self._step * self._context.step_s
+
     def look(self, names: Sequence[str], hand: Hand, back_to: int | None = None) -> LookRequest:
         """A look for some objects, now."""
         expected = self.tracker.poses(hand.T_world_ee)
         held = self.tracker.held & frozenset(names)
         told_apart = (frozenset(self.grounding.said) | self.grounding.several) & frozenset(names)
-        time_s = self._step * self._context.step_s
         displaced = frozenset(self.tracker.displaced)
         is_unknown = not self.tracker.held and not expected.keys() >= frozenset(names)
         is_loaded = is_unknown and are_around_something(hand, self._context.robot)
-        return LookRequest(tuple(names), expected, time_s, held, told_apart, displaced, back_to, is_loaded)
+        return LookRequest(
+            tuple(names), expected, self.time_s, held, told_apart, displaced, back_to, is_loaded
+        )
 
     def take_in(self, detections: Detections, hand: Hand, is_felt: bool = False) -> frozenset[str]:
         """Take in what a look brought; the names of the objects that are somewhere else than before.

@@ -75,6 +75,8 @@ class EpisodeState:
         used: For each part that was begun, the entries of the memory that it was carried out by: one, or two
             that were put together.
         verdicts: For each part that was ended, whether it is seen to be done; None where that is not known.
+        spent: For each part that was ended, attempts beyond the first, and when it ended, seconds since the
+            episode began.
         index: The key pose that is approached.
         replans: Chunks asked for so far; seeds the noise of each.
         attempts: Attempts beyond the first at the present part.
@@ -94,6 +96,7 @@ class EpisodeState:
     refused: Plan = NO_PLAN
     used: tuple[tuple[MemoryEntry, ...], ...] = ()
     verdicts: tuple[bool | None, ...] = ()
+    spent: tuple[tuple[int, float], ...] = ()
     index: int = 0
     replans: int = 0
     attempts: int = 0
@@ -148,9 +151,10 @@ class EpisodeState:
             fared[id(entry)] = entry, before and (success or (verdict is True and not is_denied))
         return list(fared.values())
 
-    def begin_next_part(self) -> None:
-        """Turn to the next part, which has attempts and looks of its own."""
+    def begin_next_part(self, time_s: float) -> None:
+        """Turn to the next part, which has attempts and looks of its own, so long after the episode began."""
         self.verdicts = (*self.verdicts, self.verdict)
+        self.spent = (*self.spent, (self.attempts, time_s))
         self.part += 1
         self.attempts, self.looks_left, self.verdict = 0, LOOKS_AT_OUTCOME, None
         self.gone, self.followed = {}, set()

@@ -17,6 +17,8 @@ from lerobot_openspm.types import Execution, Hand
 RESIDUAL_M, RESIDUAL_RAD = 0.004, 0.06
 # Where a correction leaves more than this share of the residual, something solid is in the hand's way.
 STUCK_SHARE = 0.9
+# A hand that gets no closer but has moved by more than this swings, metres with radians weighed in.
+SWINGS_M = 0.003
 # A blocked key pose is met within this multiple of the tolerance, because what is touched is in the way.
 BLOCKED_SHARE = 3.0
 # What stops a closing hand this near to where it goes is shut; what stops it earlier is in the way, metres.
@@ -37,7 +39,8 @@ class Approach:
         corrections: Corrections begun so far.
         late_steps: Steps of corrections taken so far.
         left: Distance from the key pose at the last correction, metres with radians weighed in.
-        is_blocked: Whether that correction brought the hand no closer.
+        corrected_at: Where the hand was then, ``T_world_ee`` ``(4, 4)``.
+        is_blocked: Whether that correction brought the hand no closer, and it stands still.
         travelled: How far a drawer or a knob has followed the hand, metres or radians.
     """
 
@@ -47,6 +50,7 @@ class Approach:
     corrections: int = 0
     late_steps: int = 0
     left: float = np.inf
+    corrected_at: Array | None = None
     is_blocked: bool = False
     travelled: float = 0.0
 
@@ -133,8 +137,10 @@ class ClosedLoopTRC(ClosedLoop):
         if approach.late_steps % CORRECTION_STEPS == 0:
             approach.corrections += 1
             left = float(se3.distance(hand.T_world_ee, target.T_world_ee))
-            approach.is_blocked = left > STUCK_SHARE * approach.left
-            approach.left = left
+            at = approach.corrected_at
+            is_still = at is None or float(se3.distance(hand.T_world_ee, at)) < SWINGS_M
+            approach.is_blocked = is_still and left > STUCK_SHARE * approach.left
+            approach.left, approach.corrected_at = left, hand.T_world_ee
         approach.late_steps += 1
         share = min(1.0, CORRECTION_SHARE * approach.corrections)
         return self.toward(target, hand.T_world_ee, share)
