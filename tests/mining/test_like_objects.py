@@ -145,6 +145,10 @@ def test_what_is_closed_is_touched_where_it_is_shut(task, end):
     item = MinedEpisode(episode, tuple(find_key_poses(episode, robot())), parse_instruction(task))
     (cue,) = contact_cues(item)
     frame = at["push"] if end else at["approach"]
+    # A demonstration that is cut when its goal is reached ends with the push.
+    last = max(i for i, pose in enumerate(item.key_poses) if pose.phase == "push")
+    cut = contact_cues(replace(item, key_poses=item.key_poses[: last + 1]))
+    assert [one.name for one in cut] == ["cabinet"]
     assert (cue.name, cue.kind) == ("cabinet", "contact")
     assert np.linalg.norm(cue.point_world - episode.T_world_ee[frame - 1][:3, 3]) < 0.02
 

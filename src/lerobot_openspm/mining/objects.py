@@ -336,6 +336,9 @@ def contact_cues(item: MinedEpisode) -> tuple[ContactCue, ...]:
         elif before.phase == "push" != pose.phase and pushed.operation == "close":
             # The hand sets out before a door or a drawer, and ends where that belongs.
             add(pushed.target, before, "contact")
+    last = item.key_poses[-1] if item.key_poses else None
+    if last is not None and last.phase == "push" and sub_task_of(last, item.sub_tasks).operation == "close":
+        add(sub_task_of(last, item.sub_tasks).target, last, "contact")
     return tuple(found)
 
 

@@ -30,7 +30,7 @@ def test_a_place_is_told_once_however_often_it_was_found(models):
     surface = models["cup"].surface
     poses = [np.array([x, 0.1, 0.0, 0.0]) for x in (0.0, 0.01, 0.12, 0.13)]
     places = [Place(pose, score) for pose, score in zip(poses, (0.9, 0.8, 0.7, 0.6), strict=True)]
-    assert [place.score for place in distinct(surface, places, 0.035)] == [0.9, 0.7]
+    assert [place.score for place in distinct(surface, places)] == [0.9, 0.7]
 
 
 def test_another_one_is_told_once_and_not_hidden_by_one_that_is_not_seen_well(models):

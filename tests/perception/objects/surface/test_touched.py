@@ -104,6 +104,23 @@ def test_it_is_not_found_where_it_was_shown_if_it_is_gone(learned):
     assert cup.localise(Look({"front": view})).status == "not_found"
 
 
+def test_one_thing_is_told_once_however_often_it_was_shown(learned):
+    cup = learned.models["cup"]
+    x, y, z, agreed = cup.shown[0]
+    often = dataclasses.replace(cup, shown=np.array([[x + off, y, z, agreed] for off in (0.0, 0.034)]))
+    place = se3.from_yaw([*MIDDLES["cup"][:2], 0.0], 0.0)
+    found = often.localise(Look(views_at({"cup": place}, looking_down(*HOME))))
+    assert (found.status, found.others) == ("found", ())
+
+
+def test_of_those_that_words_tell_apart_one_is_sought_elsewhere_too(learned):
+    at = [MIDDLES["cup"][:2], (-0.12, -0.12)]
+    stand = [(SHAPES["cup"], se3.from_yaw([*xy, 0.0], 0.0)) for xy in at]
+    views = render(stand, None, hand_camera(looking_down(-0.05, -0.05, 0.45)))
+    found = learned.models["cup"].localise(Look(views, told_apart={"cup"}))
+    assert len(found.others) == 1
+
+
 def test_a_record_tells_where_it_was_shown(learned):
     cup = learned.models["cup"]
     again = store.from_parts(*store.to_parts(cup), "here")

@@ -22,10 +22,10 @@ from lerobot_openspm.perception.objects.surface.search import (
     SAME_PLACE_M,
     Freedom,
     Place,
+    are_apart,
     covariance_at,
     distinct,
     likelihood,
-    middles_apart,
     over_supports,
     over_table,
     refine,
@@ -50,8 +50,6 @@ RIVAL_SHARE = 0.93
 WITHOUT_PATTERN = 0.9
 # A place that agrees this well holds another of the kind; where words tell several apart, there are others.
 ANOTHER_SHARE, TOLD_APART_SHARE = 0.85, 0.7
-# Two places nearer than this share of the radius cannot both hold one.
-OVERLAP_SHARE = 0.8
 # Patches that find an object this near to where it is expected are not checked again, metres.
 FOLLOWED_M = 0.02
 # An object that is expected this much above the table is in the hand, metres.
@@ -140,17 +138,18 @@ class SurfaceModel:
             return near  # in the hand, or where that put it, it is hidden more often than gone
         if near.status == "found" and _apart_m(near.T_world_obj, expected) < FOLLOWED_M:
             return near
-        if near.status == "found" and expected is None and self.near is None:
+        is_told_apart = self.name in look.told_apart
+        if near.status == "found" and expected is None and self.near is None and not is_told_apart:
             return near
         sights = self._sights(look)
-        if self.name in look.told_apart and expected is None:
+        if is_told_apart and expected is None:
             found = self._estimate(look, sights, self._all_places(look, sights), told_apart=True)
             return self._unless_tipped(look, sights, found)
         is_seen = near.status == "found"
         near_score = score_at(self.surface, sights, _pose(near.T_world_obj)) if is_seen else 0.0
         is_near = near_score >= BELIEVED_SHARE * self.typical_agreement
         # Of two alike, another one may stand where this one was shown.
-        if is_near and (expected is None or self.name not in look.told_apart):
+        if is_near and (expected is None or not is_told_apart):
             return near
         if expected is not None:
             there = there or self._at(look, expected)
@@ -180,7 +179,7 @@ class SurfaceModel:
         if not seen:
             return unseen()
         places = sorted((place for place, _ in seen), key=lambda place: -place.score)
-        others = tuple(one.T_world_obj for one in places[1:])
+        others = tuple(one.T_world_obj for one in distinct(self.surface, places)[1:])
         return replace(self._estimate(look, sights, places[:1]), status="found", others=others)
 
     def _is_lifted(self, T_expected: Array) -> bool:
@@ -284,8 +283,7 @@ class SurfaceModel:
     ) -> PoseEstimate:
         best = places[0]
         share = best.score / self.typical_agreement
-        apart = max(SAME_PLACE_M, OVERLAP_SHARE * self.surface.radius)
-        rivals = [one for one in places[1:] if middles_apart(self.surface, one, best) > apart]
+        rivals = [one for one in places[1:] if are_apart(self.surface, one, best)]
         most = RIVAL_SHARE * likelihood(self.surface, best)
         is_rivalled = any(likelihood(self.surface, one) > most for one in rivals)
         status = "not_found" if share < self._needed(best) else "ambiguous" if is_rivalled else "found"
@@ -294,7 +292,7 @@ class SurfaceModel:
         own = se3.apply(T, self.surface.coloured)
         visible = visible_share(look, own) if self.near is None else look.seen_share(own)
         more = [one for one in rivals if self._is_another(one, best, told_apart)]
-        others = tuple(one.T_world_obj for one in distinct(self.surface, more, apart))
+        others = tuple(one.T_world_obj for one in distinct(self.surface, more))
         sure = WITHOUT_PATTERN + (1 - WITHOUT_PATTERN) * self.surface.pattern
         return PoseEstimate(status, T, covariance, sure * float(np.clip(share, 0, 1)), visible, None, others)
 

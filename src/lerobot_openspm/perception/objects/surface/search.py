@@ -45,6 +45,8 @@ SEEN_ALIKE_M = 0.25
 RISE_STEP_M = 0.025
 # Two candidates nearer than this are one, metres.
 SAME_PLACE_M = 0.035
+# Two places nearer than this share of the radius cannot both hold one.
+OVERLAP_SHARE = 0.8
 # Steps of the refinement: metres and radians.
 QUICK_STEPS = ((0.008, 0.10), (0.004, 0.05))
 FINE_STEPS = ((0.002, 0.025), (0.001, 0.0125))
@@ -136,11 +138,16 @@ def middles_apart(surface: Surface, place: Place, other: Place) -> float:
     return float(np.linalg.norm(surface.middle_at(place.pose) - surface.middle_at(other.pose)))
 
 
-def distinct(surface: Surface, places: Sequence[Place], metres: float) -> list[Place]:
-    """Those places whose middle is apart from that of all better ones by so much; the best come first."""
+def are_apart(surface: Surface, place: Place, other: Place) -> bool:
+    """Whether two places can hold one each."""
+    return middles_apart(surface, place, other) > max(SAME_PLACE_M, OVERLAP_SHARE * surface.radius)
+
+
+def distinct(surface: Surface, places: Sequence[Place]) -> list[Place]:
+    """Those places that are apart from all better ones; the best come first."""
     chosen = list[Place]()
     for place in places:
-        if all(middles_apart(surface, place, one) > metres for one in chosen):
+        if all(are_apart(surface, place, one) for one in chosen):
             chosen.append(place)
     return chosen
 

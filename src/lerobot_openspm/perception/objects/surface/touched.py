@@ -237,7 +237,7 @@ def _believed(places: Sequence[Place | None], enough: float) -> list[Array | Non
 
 
 def _is_steady(places: Sequence[Place | None], poses: Sequence[Array | None]) -> bool:
-    """Whether it is seen at the same place beside where it was touched in nearly all of some films."""
+    """Whether at least half of some films show it at the same place beside where it was touched."""
     offsets = [
         one.pose[:3] - T[:3, 3]
         for one, T in zip(places, poses, strict=True)
