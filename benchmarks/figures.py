@@ -51,11 +51,12 @@ RECORDING = {
     for simulator, patterns in RECORDED_BY.items()
 }
 RECORDING["libero"] = (*RECORDING["libero"], str(LIBERO_ASSETS))
+STAGES = _benchmarks("stages", "processes")
 TABLETOP = (
     *POLICY,
     *RECORDING["openspm_tabletop"],
     *_package("cli/options.py", "cli/pipeline.py"),
-    *_benchmarks("stages"),
+    *STAGES,
     "configs/openspm_tabletop_train.yaml",
     "configs/cameras/openspm_tabletop.json",
 )
@@ -65,8 +66,8 @@ LIBERO = (
     *RECORDING["libero"],
     *EPISODES,
     *_package("cli/options.py", "cli/pipeline.py"),
+    *STAGES,
     *_benchmarks(
-        "stages",
         "libero/contacts",
         "libero/evaluate",
         "libero/failures",
@@ -80,9 +81,8 @@ DISTURBED = (*TABLETOP, *EPISODES, *_benchmarks("disturbances", "tracking"))
 ALONG = (*EPISODES, *_benchmarks("perception", "truth"), *_package("bench"))
 KEY_POSES = (
     *_package("geometry", "mining", "types.py", "memory/robot.py"),
-    *_benchmarks(
-        "key_poses", "recording", "contact_events", "contact_sensor", "harness", "stages", "unsteady"
-    ),
+    *_benchmarks("key_poses", "recording", "contact_events", "contact_sensor", "harness", "unsteady"),
+    *STAGES,
 )
 LANGUAGE = (
     *_package("control", "geometry", "language", "memory", "mining", "types.py"),
@@ -95,7 +95,8 @@ CALIBRATION = (
         "calibration", "geometry", "types.py", "memory/robot.py", "cli/calibrate.py", "cli/pipeline.py"
     ),
     *_package(*(f"mining/{name}.py" for name in ("columns", "dataset", "signals"))),
-    *_benchmarks("calibration", "stages"),
+    *_benchmarks("calibration"),
+    *STAGES,
 )
 NOISE = (*ALONG, *_benchmarks("measurement_noise"))
 # As `make libero` types it; libero_goal is not named.

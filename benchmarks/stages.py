@@ -7,11 +7,11 @@ from __future__ import annotations
 
 import json
 import re
-import resource
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from benchmarks.processes import watched_memory
 from lerobot_openspm.cli.options import require_checkpoint
 from lerobot_openspm.cli.pipeline import DONE, TRAIN_CONFIG, collect_dataset, train
 from lerobot_openspm.envs.collection import SUMMARY_FILE
@@ -175,11 +175,10 @@ def policy(
         options = (f"--dataset.episodes={chosen}", f"--policy.memory_episodes={chosen}", *options)
     output = root.with_name(variant)
     before = _done_ns(output)
-    made = train(root, output, options, TRAIN_CONFIGS[simulator])
-    if made[1] is not None and _done_ns(output) != before:
-        # Told in KiB, of the largest process that was started from here and has ended.
-        peak = resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss
-        write_json(output / PEAK, {"peak_mb": round(1024 * peak / 1e6)})
+    with watched_memory() as peaks:
+        made = train(root, output, options, TRAIN_CONFIGS[simulator])
+    if made[1] is not None and peaks and _done_ns(output) != before:
+        write_json(output / PEAK, {"peak_mb": round(max(peaks.values()) / 1e6)})
     return made
 
 
@@ -190,10 +189,7 @@ def _done_ns(output: Path) -> int | None:
 
 
 def peak_mb(checkpoint: Path) -> int | None:
-    """The most memory that a process of a checkpoint's training had (RSS), MB; None if that is not known.
-
-    Of several trainings that were started from one process, none counts less than one before it.
-    """
+    """The most memory that a process of a checkpoint's training had (RSS), MB; None if that is not known."""
     noted = checkpoint.parents[2] / PEAK
     return json.loads(noted.read_text())["peak_mb"] if noted.is_file() else None
 

@@ -33,6 +33,7 @@ def suite(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(harness, "suite_of", lambda _: harness.SUITE)
     for module in (stages, run):
         monkeypatch.setattr(module, "find_suite", found_suite)
+    monkeypatch.setattr("benchmarks.harness.folders", lambda checkpoint: [checkpoint])
 
 
 EPISODE = {"steps": 100, "status": "done", "phase": "retreat", "attempts": 0, "contacts": {}}

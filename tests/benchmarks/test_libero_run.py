@@ -1,5 +1,6 @@
 """`make libero`: which tasks are learned together, what that takes, and what is asked for wrongly."""
 
+from contextlib import nullcontext
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -14,7 +15,6 @@ from benchmarks import stages
 from lerobot_openspm.cli.pipeline import DONE
 from lerobot_openspm.envs.libero.simulator import OBJECTS
 from lerobot_openspm.memory.io import write_memory
-from lerobot_openspm.workplaces import folder
 
 
 @pytest.fixture(autouse=True)
@@ -49,10 +49,11 @@ def test_what_is_asked_for_wrongly_is_refused(options, words):
         RunConfig(**options)
 
 
-def test_a_checkpoint_holds_what_all_its_workplaces_do(tmp_path: Path):
-    memory = a_memory()
-    for i in range(2):
-        write_memory(memory, folder(tmp_path, i))
+def test_a_checkpoint_holds_what_all_its_workplaces_do(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    memory, places = a_memory(), [tmp_path, tmp_path / "workplaces/1"]
+    monkeypatch.setattr(run, "folders", lambda _: places)
+    for place in places:
+        write_memory(memory, place)
     (tmp_path / "model.safetensors").write_bytes(bytes(5_000_000))
     told = size(tmp_path)
     assert (told["entries"], told["objects"]) == (2 * len(memory.entries), 2 * len(memory.objects))
@@ -78,9 +79,9 @@ def test_the_memory_of_a_training_is_noted_when_it_was_run_and_kept_with_it(tmp_
             (output / DONE).write_text("{}")
         return output / "checkpoints/last/pretrained_model", took[0]
 
-    peaks = iter((500_000, 900_000))
+    peaks = iter(({1: 400_000_000, 2: 512_000_000}, {}, {1: 900_000_000}))
     monkeypatch.setattr(stages, "train", train)
-    monkeypatch.setattr(stages.resource, "getrusage", lambda _: SimpleNamespace(ru_maxrss=next(peaks)))
+    monkeypatch.setattr(stages, "watched_memory", lambda: nullcontext(next(peaks)))
     for _ in range(2):
         checkpoint, _ = stages.policy(stages.TABLETOP, root=tmp_path / "dataset")
         assert stages.peak_mb(checkpoint) == 512
