@@ -17,10 +17,10 @@ from lerobot_openspm.configuration_openspm import OpenSPMConfig
 from lerobot_openspm.errors import MemoryFormatError, OpenSPMError
 from lerobot_openspm.geometry.arm import load_arm
 from lerobot_openspm.geometry.camera import check_sizes
-from lerobot_openspm.memory.io import MEMORY_JSON, arrays_file, read_memory
+from lerobot_openspm.memory.io import MEMORY_JSON, WORKPLACES, arrays_file, read_memory
 from lerobot_openspm.memory.memory import Memory, check_layouts
 from lerobot_openspm.memory.stored_entries import anchored_objects
-from lerobot_openspm.workplaces import FOLDER, folders
+from lerobot_openspm.workplaces import folders
 
 MAX_CONFIG_BYTES = 1_000_000
 # Options that name programs and addresses on the user's machine.
@@ -46,7 +46,7 @@ def checkpoint_folder(name: str | Path, revision: str | None = None, **options: 
         _check_config(directory / CONFIG_NAME)
         return directory
     download = partial(snapshot_download, str(name), **options)
-    files = [CONFIG_NAME, SAFETENSORS_SINGLE_FILE, MEMORY_JSON, f"{FOLDER}/*/{MEMORY_JSON}"]
+    files = [CONFIG_NAME, SAFETENSORS_SINGLE_FILE, MEMORY_JSON, f"{WORKPLACES}/*/{MEMORY_JSON}"]
     try:
         directory = Path(download(allow_patterns=files, revision=revision))
     except HFValidationError as error:

@@ -28,11 +28,10 @@ from lerobot_openspm.language.lexicon import read_lexicon
 from lerobot_openspm.language.names import NameSimilarity, names_from
 from lerobot_openspm.memory.entry import MemoryEntry
 from lerobot_openspm.memory.indexed_entries import indexed
-from lerobot_openspm.memory.io import write_memory
 from lerobot_openspm.memory.memory import Memory
 from lerobot_openspm.perception.observation import Observation, split_batch
 from lerobot_openspm.types import Hand, Segmenter
-from lerobot_openspm.workplaces import choose, folder, folders
+from lerobot_openspm.workplaces import choose, folders, write
 
 if TYPE_CHECKING:
     from lerobot_openspm.teaching import Lesson
@@ -144,6 +143,12 @@ class OpenSPMPolicy(PreTrainedPolicy):
                 self.episodes[i] = self._new_episode(observation)
 
     def _new_episode(self, observation: Observation) -> RunningEpisode:
+        i, memory, entries = self.workplace(observation)
+        episode = new_episode(observation, memory, entries, self.config, self.names, self.segmenter)
+        return replace(episode, workplace=i)
+
+    def workplace(self, observation: Observation) -> tuple[int, Memory, Sequence[MemoryEntry]]:
+        """At which workplace an episode begins, from 0; its memory, and its entries with their index."""
         memories = self.require_memory(), *self.elsewhere
         # Episodes share the index, which is made anew when the memory was replaced.
         for i, memory in enumerate(memories):
@@ -151,8 +156,7 @@ class OpenSPMPolicy(PreTrainedPolicy):
                 self._entries[i] = memory.entries, indexed(memory.entries)
         entries = [self._entries[i][1] for i in range(len(memories))]
         i = choose(observation, memories, entries, self.names)
-        episode = new_episode(observation, memories[i], entries[i], self.config, self.names, self.segmenter)
-        return replace(episode, workplace=i)
+        return i, memories[i], entries[i]
 
     def _chunk(self, controller: EpisodeController, hand: Hand) -> np.ndarray:
         """Generate a chunk ``(chunk_size, 7)`` in the world. Episodes go one by one, so batches act alike."""
@@ -270,8 +274,7 @@ class OpenSPMPolicy(PreTrainedPolicy):
         # The calibration travels with the memory, the user's own words in the configuration.
         saved = replace(self.config.without_places(), lexicon=self.names.lexicon.added or None)
         saved._save_pretrained(Path(save_directory))
-        for i, one in enumerate((memory, *self.elsewhere)):
-            write_memory(one, folder(Path(save_directory), i))
+        write((memory, *self.elsewhere), Path(save_directory))
 
     @classmethod
     def from_pretrained(

@@ -10,6 +10,7 @@ from __future__ import annotations
 import shutil
 from collections import Counter
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -20,34 +21,46 @@ from lerobot_openspm.errors import InstructionError, OpenSPMError
 from lerobot_openspm.language.names import NameSimilarity
 from lerobot_openspm.memory.compose import Candidate, plan_parts
 from lerobot_openspm.memory.entry import MemoryEntry
-from lerobot_openspm.memory.io import MEMORY_JSON, read_memory, write_memory
+from lerobot_openspm.memory.io import WORKPLACES, read_memory, workplaces_of, write_memory
 from lerobot_openspm.memory.looks import UNKNOWN_LOOKS, Looks
 from lerobot_openspm.memory.memory import Memory
 from lerobot_openspm.memory.merging import SOURCES
 from lerobot_openspm.memory.retrieval import read_instruction
 from lerobot_openspm.perception.observation import Observation
 
-FOLDER = "workplaces"
 # Where demonstrations begin, the hand is at the edge of what they covered: so far outside it is still there.
 NEAR_M = 0.05
 # What a policy has once, whatever the workplace.
 COMMON = (
     "input_features", "output_features", "state_layout", "action_layout", "rotation", "control_hz",
-    "perception", "segmenter", "conditioning", "chunk_size",
+    "hand_radius_m", "perception", "segmenter", "name_embeddings", "lexicon", "conditioning", "chunk_size",
 )  # fmt: skip
 
 
 def folder(checkpoint: Path, number: int) -> Path:
     """Where a checkpoint keeps the memory of a workplace; that of the first, 0, is the checkpoint's own."""
-    return checkpoint / FOLDER / str(number) if number else checkpoint
+    return checkpoint / WORKPLACES / str(number) if number else checkpoint
 
 
 def folders(checkpoint: Path) -> list[Path]:
-    """The folders with the memories of a checkpoint's workplaces, the first one's first."""
-    found = [checkpoint]
-    while (one := folder(checkpoint, len(found)) / MEMORY_JSON).is_file():
-        found.append(one.parent)
-    return found
+    """The folders with the memories of a checkpoint's workplaces, the first one's first.
+
+    Others may be left there from before: the Hub deletes nothing. Raises MemoryFormatError.
+    """
+    return [folder(checkpoint, i) for i in range(workplaces_of(checkpoint))]
+
+
+def write(memories: Sequence[Memory], checkpoint: Path) -> None:
+    """Write the memories of all workplaces into a checkpoint's folder, and remove those of others there.
+
+    The first one's says how many there are, so it is written last.
+    """
+    for i in reversed(range(len(memories))):
+        n_workplaces = 1 if i else len(memories)
+        write_memory(replace(memories[i], workplaces=n_workplaces), folder(checkpoint, i))
+    for path in (checkpoint / WORKPLACES).glob("*"):
+        if path.name.isdecimal() and int(path.name) >= len(memories):
+            shutil.rmtree(path)
 
 
 def choose(
@@ -139,10 +152,9 @@ def join(paths: Sequence[Path], output: Path) -> list[Memory]:
     beside = output.with_name(f".{output.name}.partial")
     if beside.exists():  # of a run that was interrupted
         shutil.rmtree(beside)
-    shutil.copytree(paths[0], beside, ignore=shutil.ignore_patterns(FOLDER))
+    shutil.copytree(paths[0], beside, ignore=shutil.ignore_patterns(WORKPLACES))
     memories = [read_memory(one) for path in paths for one in folders(path)]
-    for i, memory in enumerate(memories):
-        write_memory(memory, folder(beside, i))
+    write(memories, beside)
     beside.rename(output)
     return memories
 

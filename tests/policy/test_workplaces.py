@@ -16,7 +16,7 @@ from tests.memory.test_rim_grasps import LOOKS, PUSHED, by_the_rim
 from tests.policy.conftest import Frame, act, batch_of
 
 from lerobot_openspm.cli.join import main as join
-from lerobot_openspm.errors import OpenSPMError
+from lerobot_openspm.errors import MemoryFormatError, OpenSPMError
 from lerobot_openspm.language.names import TABLE_NAMES
 from lerobot_openspm.memory.io import read_memory, write_memory
 from lerobot_openspm.memory.looks import UNKNOWN_LOOKS
@@ -152,15 +152,36 @@ def test_workplaces_of_joined_policies_are_joined_too(
     assert len(OpenSPMPolicy.from_pretrained(output).elsewhere) == 2
 
 
+def test_a_checkpoint_holds_as_many_workplaces_as_its_memory_says(
+    policy: OpenSPMPolicy, checkpoint: Path, changed: Callable[[str, Memory], Path]
+):
+    both = joined(changed("far", elsewhere(read_memory(checkpoint))), checkpoint)
+    pulled = Path(shutil.copytree(both, both.with_name("pulled")))
+    shutil.rmtree(pulled / "workplaces" / "1")
+    with pytest.raises(MemoryFormatError, match=r"no memory at .*workplaces/1/memory\.json"):
+        OpenSPMPolicy.from_pretrained(pulled)
+    # The Hub keeps the others' files.
+    one = Path(shutil.copytree(checkpoint, both.with_name("one")))
+    shutil.copytree(both / "workplaces", one / "workplaces")
+    assert OpenSPMPolicy.from_pretrained(one).elsewhere == ()
+    policy.save_pretrained(both)
+    assert OpenSPMPolicy.from_pretrained(both).elsewhere == ()
+    assert not (both / "workplaces" / "1").exists()
+
+
 def test_what_cannot_be_joined_is_named_and_nothing_is_written(checkpoint: Path, tmp_path: Path):
-    other = tmp_path / "other"
-    shutil.copytree(checkpoint, other)
-    config = json.loads((other / "config.json").read_text())
-    (other / "config.json").write_text(json.dumps({**config, "control_hz": 7.0}))
-    for paths, words in (
-        ([checkpoint], "got 1 checkpoints to join, expected at least two"),
-        ([checkpoint, other], "its control_hz is 7.0"),
+    config = json.loads((checkpoint / "config.json").read_text())
+    cases = [([checkpoint], "got 1 checkpoints to join, expected at least two")]
+    for name, value in (
+        ("control_hz", 7.0),
+        ("hand_radius_m", 0.05),
+        ("lexicon", '{"synonyms": {"bowl": ["tureen"]}}'),
+        ("name_embeddings", "somebody/model"),
     ):
+        other = Path(shutil.copytree(checkpoint, tmp_path / name))
+        (other / "config.json").write_text(json.dumps({**config, name: value}))
+        cases.append(([checkpoint, other], f"its {name} is "))
+    for paths, words in cases:
         options = [f"--policy.paths=[{','.join(map(str, paths))}]", f"--output_dir={tmp_path / 'joined'}"]
         with pytest.raises(OpenSPMError, match=words):
             join(options)

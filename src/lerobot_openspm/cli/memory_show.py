@@ -133,7 +133,7 @@ def export(args: list[str]) -> None:
     if output.exists():
         raise FileExistsError(f"{output} exists already; choose another --output, or remove it")
     output.parent.mkdir(parents=True, exist_ok=True)
-    chosen = replace(memory, entries=entries, superseded=())
+    chosen = replace(memory, entries=entries, superseded=(), workplaces=1)
     if output.suffix == ".json":
         write_entries_file(chosen, output)
     else:

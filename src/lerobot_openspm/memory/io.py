@@ -53,6 +53,8 @@ from lerobot_openspm.perception.objects.store import from_parts as object_from_p
 from lerobot_openspm.perception.objects.store import to_parts as object_to_parts
 
 FORMAT = "openspm-memory"
+# Where a checkpoint keeps the memories of other workplaces than the first.
+WORKPLACES = "workplaces"
 MEMORY_JSON, ARRAYS, LOCK = "memory.json", "memory-{}.safetensors", ".memory.lock"
 # The arrays of earlier saves, and what interrupted saves have left.
 LEFTOVER = re.compile(r"memory-[0-9a-f]{64}\.safetensors|\.memory[.-].*\.partial")
@@ -85,6 +87,7 @@ class Header(Origin):
         n_entries: How many of the entries are in use; those after them are superseded.
         arrays: Name of the file of arrays; its SHA-256 is part of the name.
         not_learned: What the demonstrations could not teach.
+        workplaces: Of how many workplaces the checkpoint holds memories.
     """
 
     cameras: dict[str, Any]
@@ -93,6 +96,7 @@ class Header(Origin):
     n_entries: Count
     arrays: Annotated[str, Meta(pattern=r"\Amemory-[0-9a-f]{64}\.safetensors\Z")]
     not_learned: Annotated[list[_NotLearned], Meta(max_length=MAX_RECORDS)] = field(default_factory=list)
+    workplaces: Annotated[int, Meta(ge=1, le=1000)] = 1
 
 
 class _Named(Struct):
@@ -149,6 +153,7 @@ def _header_of(memory: Memory) -> tuple[Header, Arrays]:
         "n_entries": len(memory.entries),
         "arrays": ARRAYS.format("0" * 64),
         "not_learned": memory.not_learned,
+        "workplaces": memory.workplaces,
     }
     return record_of(fields, Header, "the memory"), arrays
 
@@ -190,6 +195,11 @@ def read_memory(directory: Path, cameras: Path | None = None) -> Memory:
 def arrays_file(directory: Path) -> str:
     """Name of the file that a memory needs beside ``memory.json``. Raises MemoryFormatError."""
     return _opened(directory)[1].arrays
+
+
+def workplaces_of(directory: Path) -> int:
+    """Of how many workplaces a checkpoint holds memories. Raises MemoryFormatError."""
+    return _opened(directory)[1].workplaces
 
 
 def _opened(directory: Path) -> tuple[OpenFile, Header, int]:
@@ -249,6 +259,7 @@ def _loaded(file: OpenFile, header: Header, start: int, cameras_file: Path | Non
         objects=_objects(header.objects, arrays, where),
         cameras=cameras,
         not_learned=tuple(NotLearned(**msgspec.structs.asdict(one)) for one in header.not_learned),
+        workplaces=header.workplaces,
     )
 
 

@@ -40,6 +40,7 @@ class Memory:
         layouts: How the robot's state and action vectors are laid out; None where it is not known.
         superseded: Entries that were replaced, merged or removed. They are kept to look at, never retrieved.
         not_learned: What the demonstrations could not teach.
+        workplaces: Of how many workplaces its checkpoint holds memories; only the first one's says it.
     """
 
     entries: Sequence[MemoryEntry]
@@ -53,6 +54,7 @@ class Memory:
     layouts: Layouts | None = None
     superseded: Sequence[MemoryEntry] = ()
     not_learned: tuple[NotLearned, ...] = ()
+    workplaces: int = 1
 
     @property
     def yaw_periods(self) -> dict[str, float]:

@@ -22,7 +22,7 @@ from lerobot_openspm.memory.memory import Memory
 from lerobot_openspm.memory.robot import RobotModel
 from lerobot_openspm.types import OWN_WORDS, SubTask
 
-VERSION = 9
+VERSION = 10
 AGAIN = "train or pull it again"
 # More than any robot, unit or count needs; sums and products of such numbers stay finite and exact.
 LIMIT = 1e9
@@ -316,9 +316,8 @@ def origin_of(memory: Memory, file_format: str) -> dict[str, Any]:
     if memory.layouts is not None:
         state, action = ({"names": v.names, "rotation": v.rotation_kind} for v in memory.layouts)
         layouts = {"state": state, "action": action}
-    own = {
-        f: getattr(memory, f) for f in ("perception", "segmentation", "shape", "simulator_objects", "robot")
-    }
+    names = "perception", "segmentation", "shape", "simulator_objects", "robot"
+    own = {name: getattr(memory, name) for name in names}
     return {"format": file_format, "version": VERSION, **own, "layouts": layouts}
 
 
