@@ -128,6 +128,8 @@ def _one_of_each_key(asked: Sequence[SubTask], entries: Sequence[MemoryEntry]) -
 def search_scene(policy: OpenSPMPolicy, observation: Observation) -> Found:
     """The entries for an observation's instruction, scored as the policy does when it begins to act.
 
+    Of several workplaces they are those of the one where the policy takes itself to be.
+
     What comes after the first part will be chosen in the scene that the first one leaves, so the entries of
     later parts have no ``S_geo``.
 
@@ -135,8 +137,8 @@ def search_scene(policy: OpenSPMPolicy, observation: Observation) -> Found:
         InstructionError: There is not a word in the instruction.
         ObservationError: The observation lacks a camera, or its images are no pictures.
     """
-    entries = policy.require_memory().entries
-    in_words = search_memory(observation.instruction, entries, policy.names, policy.require_memory().looks)
+    _, memory, entries = policy.workplace(observation)
+    in_words = search_memory(observation.instruction, entries, policy.names, memory.looks)
     if in_words.refusal:
         return in_words
     policy.reset()

@@ -1,12 +1,15 @@
 """`openspm memory search`, typed as a user types it, on the tests' small checkpoint."""
 
 import json
+import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 from tests.cli.conftest import Openspm
 
-from lerobot_openspm.memory.io import arrays_file
+from lerobot_openspm.memory.io import arrays_file, read_memory, write_memory
+from lerobot_openspm.workplaces import join
 
 BOWL = "put the bowl on the plate"
 
@@ -82,6 +85,24 @@ def test_a_mined_memory_can_be_searched_too(openspm: Openspm, checkpoint: Path, 
     for file in ("memory.json", arrays_file(checkpoint)):
         (tmp_path / file).write_bytes((checkpoint / file).read_bytes())
     assert search(openspm, BOWL, f"--path={tmp_path}") == search(openspm, BOWL, f"--path={checkpoint}")
+
+
+def test_of_several_workplaces_that_of_the_scene_is_searched_in_the_words_of_all(
+    openspm: Openspm, checkpoint: Path, tiny_dataset: Path, tmp_path: Path
+):
+    far, both = Path(shutil.copytree(checkpoint, tmp_path / "far")), tmp_path / "both"
+    memory = read_memory(far)
+    robot = replace(memory.robot, workspace=memory.robot.workspace + 5)
+    stove = tuple(entry for entry in memory.entries if entry.language != BOWL)
+    write_memory(replace(memory, entries=stove, robot=robot), far)
+    join([far, checkpoint], both)
+    config = json.loads((both / "config.json").read_text())
+    (both / "config.json").write_text(json.dumps({**config, "lexicon": '{"synonyms": {"bowl": ["tureen"]}}'}))
+    asked = "put the tureen on the plate"
+    _, found = search(openspm, asked, f"--path={both}", f"--dataset.root={tiny_dataset}")
+    assert (found["refusal"], found["status"], found["considered"]) == (None, "running", 3)
+    _, found = search(openspm, asked, f"--path={both / 'workplaces' / '1'}")
+    assert (found["refusal"], found["considered"]) == (None, 3)
 
 
 @pytest.mark.parametrize(

@@ -13,7 +13,7 @@ from lerobot_openspm.cli.memory import LimitOption
 from lerobot_openspm.errors import OpenSPMError
 from lerobot_openspm.language.lexicon import read_lexicon
 from lerobot_openspm.language.names import TABLE_NAMES, NameSimilarity, names_from
-from lerobot_openspm.memory.io import read_memory
+from lerobot_openspm.memory.io import WORKPLACES, read_memory
 from lerobot_openspm.search import Found, Hit, observation_of, search_memory, search_scene
 from lerobot_openspm.types import Reference, SubTask
 
@@ -78,12 +78,15 @@ def _search(instruction: str, config: SearchConfig) -> Found:
 
 
 def _names(path: str) -> NameSimilarity:
-    """The names that a checkpoint was given; a mined memory has none of its own."""
-    if not (Path(path) / "config.json").is_file():
+    """The names that a checkpoint was given, for all its workplaces; a mined memory has none of its own."""
+    folder = Path(path)
+    if folder.parent.name == WORKPLACES:
+        folder = folder.parent.parent
+    if not (folder / "config.json").is_file():
         return TABLE_NAMES
     from lerobot_openspm.configuration_openspm import OpenSPMConfig
 
-    config: Any = OpenSPMConfig.from_pretrained(path)
+    config: Any = OpenSPMConfig.from_pretrained(folder)
     return names_from(config.name_embeddings, read_lexicon(config.lexicon))
 
 
