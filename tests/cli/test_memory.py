@@ -178,7 +178,7 @@ def test_add_refuses_what_is_no_memory(openspm: Openspm, memory: Path, tmp_path:
     assert "pass --other=FOLDER" in refused(openspm, memory, "add")
     assert "nothing at nowhere" in refused(openspm, memory, "add", "--other=nowhere")
     (tmp_path / "some.json").write_text('{"format": "zip"}')
-    assert "expected 'openspm-entries' and 9" in refused(
+    assert "expected 'openspm-entries' and 10" in refused(
         openspm, memory, "add", f"--other={tmp_path / 'some.json'}"
     )
     empty = tmp_path / "empty"
@@ -271,7 +271,7 @@ def test_a_file_can_bring_back_what_an_entry_was(openspm: Openspm, memory: Path,
         (lambda e: e["robot"].pop("open_width"), "field `open_width` - at `$.robot`"),
         (
             lambda e: e.update(version=99),
-            "got format and version ['openspm-entries', 99], expected 'openspm-entries' and 9",
+            "got format and version ['openspm-entries', 99], expected 'openspm-entries' and 10",
         ),
     ],
 )
@@ -312,6 +312,22 @@ def test_what_was_removed_or_edited_is_restored(openspm: Openspm, memory: Path):
     assert run(openspm, memory, "restore", "--source=local/demos#2", "--version=2")["version"] == 4
     assert load(memory).entries[-1].quality == 0.1
     assert [(e.source, e.version) for e in load(memory).superseded] == [("local/demos#2", 3)]
+
+
+def test_of_entries_of_one_source_one_is_restored_by_its_instruction(openspm: Openspm, memory: Path):
+    other = entry(STOVE, source="local/demos#2")
+    write_memory(replace(made(), entries=made().entries[:2], superseded=(made().entries[2], other)), memory)
+    which = ("restore", "--source=local/demos#2")
+    error = refused(openspm, memory, *which)
+    assert (
+        f"2 entries come from 'local/demos#2'; pass --instruction=TEXT with one of: {BOWL}; {STOVE}" in error
+    )
+    error = refused(openspm, memory, *which, "--instruction=sing")
+    assert "no such superseded entry of 'local/demos#2' and 'sing', of its versions: none" in error
+    run(openspm, memory, *which, f"--instruction={BOWL}")
+    assert [e.language for e in load(memory).superseded] == [STOVE]
+    run(openspm, memory, *which)
+    assert load(memory).entries[-1].language == STOVE
 
 
 def test_merge(openspm: Openspm, memory: Path):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -43,6 +43,7 @@ class RestoreConfig(MemoryOption):
     """Put a superseded entry into use again, in the place of that of the same source and instruction."""
 
     source: str = ""  # dataset and episode of the entry, as ``list --all=true`` names them
+    instruction: str = ""  # its very instruction, where several entries have the same source
     version: int | None = None  # which version; the newest superseded one if not given
 
 
@@ -115,14 +116,20 @@ def restore(args: list[str]) -> None:
     _required(config.source, "--source=DATASET#EPISODE")
 
     def restored(memory: Memory) -> Memory:
-        old = [(e.version, i) for i, e in enumerate(memory.superseded) if e.source == config.source]
-        found = [(version, i) for version, i in old if config.version in (None, version)]
+        old = [
+            (e.version, i, e.language)
+            for i, e in enumerate(memory.superseded)
+            if e.source == config.source and config.instruction in ("", e.language)
+        ]
+        found = [one for one in old if config.version in (None, one[0])]
         if not found:
-            versions = ", ".join(str(version) for version, _ in old) or "none"
+            versions = ", ".join(str(version) for version, *_ in old) or "none"
             raise OpenSPMError(
-                f"the memory at {config.path} holds no such superseded entry of {config.source!r}, of its "
+                f"the memory at {config.path} holds no such superseded entry of {_asked(config)}, of its "
                 f"versions: {versions}; `openspm memory list --path={config.path} --all=true` lists them"
             )
+        if len(languages := sorted({language for *_, language in found})) > 1:
+            raise OpenSPMError(_several(len(found), config.source, languages))
         return memory.restored(max(found)[1])
 
     _, after = _changed(config.path, restored)
@@ -194,11 +201,23 @@ def _the_one(memory: Memory, config: RateConfig) -> int:
         return config.entry
     if len(chosen) > 1:
         languages = sorted({entry.language for entry in chosen.values()})
-        how = f"--instruction=TEXT with one of: {'; '.join(languages)}"
-        if len(languages) == 1:
-            how = f"--entry=NUMBER with one of: {_numbered(chosen)}"
-        raise OpenSPMError(f"{len(chosen)} entries come from {config.source!r}; pass {how}")
+        if len(languages) > 1:
+            raise OpenSPMError(_several(len(chosen), config.source, languages))
+        raise OpenSPMError(
+            f"{len(chosen)} entries come from {config.source!r}; pass --entry=NUMBER with one of: "
+            f"{_numbered(chosen)}"
+        )
     return next(iter(chosen))
+
+
+def _several(count: int, source: str, languages: Sequence[str]) -> str:
+    return (
+        f"{count} entries come from {source!r}; pass --instruction=TEXT with one of: {'; '.join(languages)}"
+    )
+
+
+def _asked(config: RemoveConfig | RestoreConfig | RateConfig) -> str:
+    return " and ".join(repr(value) for value in (config.source, config.instruction) if value)
 
 
 def _numbered(entries: Mapping[int, MemoryEntry]) -> str:
@@ -223,10 +242,9 @@ def _chosen(memory: Memory, config: RemoveConfig | RateConfig) -> dict[int, Memo
         if config.source in ("", entry.source) and config.instruction in ("", entry.language)
     }
     if not found:
-        asked = " and ".join(repr(value) for value in (config.source, config.instruction) if value)
         known = sorted({entry.language for entry in memory.entries})
         raise OpenSPMError(
-            f"the memory at {config.path} holds no entry of {asked}; it knows: "
+            f"the memory at {config.path} holds no entry of {_asked(config)}; it knows: "
             f"{'; '.join(known[:MAX_NAMED])}{' ...' if len(known) > MAX_NAMED else ''}. "
             f"`openspm memory list --path={config.path}` lists its entries"
         )
