@@ -62,8 +62,8 @@ TOUCHED = (
 )
 
 SEEN_BEFORE = (
-    "[libero.md](libero.md) says how often these episodes were run while the policy was developed, and what "
-    "was learned from them."
+    "[libero.md](libero.md) says which of these episodes were run while the policy was developed, and what "
+    "was made of them."
 )
 SORTED = (
     "Failed episodes by a rule; the first that fits counts. Words: the instruction was not understood. "

@@ -106,6 +106,17 @@ def test_readme_has_a_row_for_what_was_measured_alone(results):
     assert ("tabletop", "success") in MARK.findall(rows[0])
 
 
+def test_readme_stays_on_its_hundred_lines_with_all_figures(results):
+    spent = {"train_s": 30.0, "mine_and_train_s": 250.0}
+    suites = [f"libero_goal_{kind}" for kind in ("swap", "lan", "task", "object")]
+    for name in ("tabletop", "libero_few_shot_3", "libero_few_shot_1", *SUITES, *suites):
+        put(results, name, **RATE, demonstrations=10, **spent)
+    put(results, "teach", n=4, demonstrations={"1": RATE}, teach_s=9.0)
+    page = tables.with_headlines(tables.README.read_text())
+    assert page.count("| 50.0 % |") == 12
+    assert len(page.splitlines()) <= 100
+
+
 def test_kinds_of_objects_are_compared_line_by_line(results):
     bowl = {"learned": "patches", "touched": 3, "grasped": 3}
     for kinds, found in (("all", RATE), ("shape", {"success": None, "n": 0, "interval": [0.0, 1.0]})):
