@@ -58,7 +58,11 @@ def test_what_the_target_stands_on_ends_where_what_the_other_thing_stands_on_did
     # The underside of both is 2 cm above their frames' origins.
     expected = (now["plate"] @ place)[:3, 3]
     turned = stands(T_end, "box") - [0.0, 0.0, 0.02]
-    # How the way is turned belongs to the landmark where the outcome is known; here to the world.
+    # How the way is turned belongs to the landmark where the outcome is known; here to the world. The hand,
+    # at (0.01, 0.02) from the bowl, ended at (-0.02, 0) from the plate, all turned by the plate's 0.5.
+    x, y = -0.02 - 0.01, 0.0 - 0.02
+    beside = [np.cos(0.5) * x - np.sin(0.5) * y, np.sin(0.5) * x + np.cos(0.5) * y]
+    assert turned[:2] == pytest.approx(now["plate"][:2, 3] + beside, abs=1e-6)
     assert turned[2] == pytest.approx(expected[2], abs=1e-6)
     assert made.outcomes[0].is_met({**now, "box": T_end})
 
