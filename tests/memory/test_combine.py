@@ -18,7 +18,6 @@ from lerobot_openspm.types import Symmetry
 
 BOWL_ON_PLATE = entry(source="local/demos#0")
 BOX_IN_BASKET = entry("put the box in the basket", source="local/demos#1")
-ABOVE_BOX = np.array([0.0, 0.0, 0.04])
 where = st.tuples(*[st.floats(-0.3, 0.3)] * 2, st.floats(0.0, 0.3))
 yaws = st.floats(-np.pi, np.pi)
 

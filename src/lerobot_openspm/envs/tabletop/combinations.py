@@ -1,6 +1,6 @@
 """Twenty tasks that put something where the ten put something else, alone or two in one instruction.
 
-The ten show how each thing is grasped and how each place is used, but never these things in these places.
+The ten show how each thing is grasped and how each place is used, but none of these as one instruction.
 The plate is moved in none of them: the ten push it, and the hand does not hold it level by its low rim.
 """
 

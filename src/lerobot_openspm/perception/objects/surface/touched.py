@@ -33,8 +33,8 @@ from lerobot_openspm.types import ContactCue, DemonstrationScene, Moment, View
 
 # Pictures that show this share of an object tell where it stands; so many of a film are enough.
 SHOWN_SHARE, MAX_VIEWS = 0.5, 8
-# A film that agrees with the surface by less than this share of what most do shows something else. Where all
-# films show it beside the touched point alike, up to so many metres, this share is enough.
+# A film that agrees with the surface by less than this share of what most do shows something else. Where half
+# of the films show it beside the touched point alike, up to so many metres, this share is enough.
 ALIKE_SHARE, STEADY_SHARE, STEADY_M, MIN_STEADY = 0.7, 0.45, 0.015, 3
 # Another of the kind may have been touched elsewhere on it, this far from where the first one was, metres.
 AROUND_M = 0.12
