@@ -82,6 +82,12 @@ def _clusters(entries: Sequence[MemoryEntry], distance_m: float, angle_rad: floa
     return clusters
 
 
+def episode_of(source: str) -> str:
+    """The demonstration of one source; what is done a second time in it has a number of its own behind it."""
+    name, _, number = source.rpartition("#")
+    return f"{name}#{number.partition('.')[0]}"
+
+
 def merge(entries: Sequence[MemoryEntry]) -> MemoryEntry:
     """One entry in the place of several of the same structure; the first says where its objects stood."""
     counts = np.array([len(entry.source.split(SOURCES)) for entry in entries], float)
