@@ -15,17 +15,18 @@ PEAK = re.compile(r"^VmHWM:\s*(\d+) kB", re.M)
 
 @contextlib.contextmanager
 def watched_memory() -> Generator[dict[int, int]]:
-    """By process, the most memory (RSS, bytes) that it has had, of all below this one while this is entered.
+    """By process, the most memory (RSS, bytes) that it has had, of all started below this one while this is entered.
 
     Empty where the system does not tell it. What `resource.getrusage` tells of children is no less than this
     process had itself when it started them.
     """
-    peaks, is_over = dict[int, int](), threading.Event()
+    peaks, is_over, before = dict[int, int](), threading.Event(), set(_below(os.getpid()))
 
     def watch() -> None:
         while not is_over.wait(EVERY_S):
             # The last word counts: before a process runs its own program it tells this one's.
-            peaks.update({pid: peak for pid in _below(os.getpid()) if (peak := _peak(pid)) is not None})
+            started = set(_below(os.getpid())) - before
+            peaks.update({pid: peak for pid in started if (peak := _peak(pid)) is not None})
 
     thread = threading.Thread(target=watch, daemon=True)
     thread.start()

@@ -27,3 +27,13 @@ def test_processes_that_ended_before_are_not_told():
     with watched_memory() as peaks:
         pass
     assert peaks == {}
+
+
+def test_processes_that_were_there_before_are_not_told():
+    held = [sys.executable, "-c", "input()"]
+    with subprocess.Popen(held, stdin=subprocess.PIPE) as other:
+        with watched_memory() as peaks:
+            subprocess.run([sys.executable, "-c", HOLD, str(MB)], check=True)
+        other.communicate(b"\n")
+    assert len(peaks) == 1
+    assert other.pid not in peaks
