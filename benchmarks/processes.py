@@ -15,7 +15,7 @@ PEAK = re.compile(r"^VmHWM:\s*(\d+) kB", re.M)
 
 @contextlib.contextmanager
 def watched_memory() -> Generator[dict[int, int]]:
-    """By process, the most memory (RSS, bytes) that it has had, of all started below this one while this is entered.
+    """By process, the most memory (RSS, bytes) that it has had, of all started below this one meanwhile.
 
     Empty where the system does not tell it. What `resource.getrusage` tells of children is no less than this
     process had itself when it started them.

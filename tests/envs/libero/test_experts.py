@@ -8,6 +8,7 @@ from lerobot_openspm.envs.libero.long_tasks import LONG
 from lerobot_openspm.envs.libero.picks import OBJECT, SPATIAL
 from lerobot_openspm.envs.libero.simulator import LiberoSimulator, tasks
 from lerobot_openspm.envs.seeds import TUNING_SEED_START
+from lerobot_openspm.geometry.se3 import yaw_of
 
 pytest.importorskip("libero.libero", reason="needs lerobot[libero]")
 pytestmark = pytest.mark.libero
@@ -74,3 +75,17 @@ def test_same_generator_same_first_action_and_others_differ():
     simulator.close()
     np.testing.assert_array_equal(first, again)
     assert not np.array_equal(first, other)
+
+
+def test_a_can_is_taken_from_one_side_or_another():
+    simulator = make_simulator("pick_up_the_alphabet_soup_and_place_it_in_the_basket")
+    turned = set[int]()
+    for seed in range(TUNING_SEED_START + 3, TUNING_SEED_START + 5):
+        simulator.reset(seed)
+        for action in expert_actions(simulator, simulator.task, np.random.default_rng(seed)):
+            simulator.step(action)
+            if action[6] > 0:
+                break
+        turned.add(round(float(np.degrees(yaw_of(simulator.ee_pose()))) / 90) % 2)
+    assert turned == {0, 1}
+    simulator.close()

@@ -72,3 +72,7 @@ SPATIAL = {
 OBJECT = {f"pick_up_the_{name}_and_place_it_in_the_basket": into_basket(name) for name in INTO_BASKET}
 _CHEESE = "pick_up_the_cream_cheese_and_place_it_in_the_basket"
 OBJECT[_CHEESE] = replace(OBJECT[_CHEESE], turn=BESIDE_CAN)
+# Cans look alike from everywhere, and people take them from one side or another.
+for _can in ("alphabet_soup", "tomato_sauce"):
+    _task = f"pick_up_the_{_can}_and_place_it_in_the_basket"
+    OBJECT[_task] = replace(OBJECT[_task], other_turn=math.pi / 2)

@@ -49,6 +49,7 @@ class Put:
         rise: How high to lift it.
         along: The fingers open along this object's x axis instead of the world's y.
         turn: By which angle the hand is turned about the vertical besides, radians.
+        other_turn: In half of the demonstrations it is turned by this angle, as people differ.
         slant: Where from the goal, seen from above, the lowering begins (3,): it is lowered at a slant.
         like: It is put down with its axes along those of this object, not as it stood.
     """
@@ -59,6 +60,7 @@ class Put:
     rise: float = CARRY_RISE
     along: str | None = None
     turn: float = 0.0
+    other_turn: float | None = None
     slant: np.ndarray = field(default_factory=lambda: np.zeros(3))
     like: str | None = None
 
@@ -66,7 +68,11 @@ class Put:
 def take_and_put(put: Put, hand: LiberoHand) -> Actions:
     """Grasp from above, lift straight up and place."""
     offset, turn = hand.grasp_noise()
-    yaw = put.turn if put.along is None else put.turn + float(yaw_of(hand.frame(put.along))) - math.pi / 2
+    yaw = put.turn
+    if put.other_turn is not None and hand.rng.random() < 0.5:
+        yaw = put.other_turn
+    if put.along is not None:
+        yaw += float(yaw_of(hand.frame(put.along))) - math.pi / 2
     at = hand.origin(put.name) + yaw_matrix(yaw) @ put.grasp + offset
     at_grasp = transform(yaw_matrix(yaw + turn) @ DOWN, at)
     yield from grasp(hand, at_grasp)
