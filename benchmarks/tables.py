@@ -193,7 +193,8 @@ def _selection(result: Quoted) -> str:
     ((name, run),) = result["runs"].items()
     per_task = _of_each(run)
     rows = {text: per_task[task] for task, text in result["instructions"].items()}
-    return f"{grid(result['runs'], STEPS)}\n\n{NOTES[name]}\n\n{grid(rows, SUCCESS, 'Instruction')}"
+    told = f"{grid(result['runs'], STEPS)}\n\n{NOTES[name]}\n\n{grid(rows, SUCCESS, 'Instruction')}"
+    return told + looked_at(result)
 
 
 def _anywhere(result: Quoted) -> str:
@@ -220,8 +221,7 @@ def _anywhere(result: Quoted) -> str:
         f"used: {layouts['hidden']} do not show one of the two objects well enough, and the expert does not "
         f"solve {layouts['unsolved']}. One that is found turned round by half weighs much in a mean yaw."
     )
-    success = f"{_selection(result)}{looked_at(result)}"
-    return f"{success}\n\n{grid(rows, columns, 'Objects')}\n\n{told}"
+    return f"{_selection(result)}\n\n{grid(rows, columns, 'Objects')}\n\n{told}"
 
 
 def _per_task(runs: dict[str, Any]) -> str:

@@ -24,8 +24,14 @@ FAILURES = {"words": 0, "perception": 1, "reach": 0, "grasp": 1, "placing": 0}
 # Headline figures, of whose failed episodes films are looked at.
 FILMED = (
     "tabletop",
+    "compound",
+    "combinations",
+    "preconditions",
     "anywhere",
     "libero_goal",
+    "libero_spatial",
+    "libero_object",
+    "libero_10",
     "libero_goal_swap",
     "libero_goal_lan",
     "libero_goal_task",
