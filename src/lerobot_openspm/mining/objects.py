@@ -45,10 +45,11 @@ logger = logging.getLogger(__name__)
 FILMED_PER_TASK, FILMED, FILM_STEP = 10, 30, 4
 # The hand may touch an object so many frames before the motion to a contact begins.
 FRAMES_BEFORE_CONTACT = 4
-# What the hand takes hold of or pushes has its surface within this distance of the hand, seen from above.
+# What the hand takes hold of or pushes has its surface within this distance of the hand.
 TOUCH_M = 0.08
-# What is seen farther than this from where the hand grasped may be another one of the kind, metres.
-ASTRAY_M = 0.03
+# What is seen farther than this from where the hand grasped may be another one of the kind, or stand on
+# something else than it seems to, metres.
+ASTRAY_M = 0.015
 # Where one of these is said, the hand lets go above the landmark.
 UPON = ("on", "in", "at")
 # A pushed object's final pose counts from this confidence on.
@@ -283,9 +284,10 @@ def _places(estimate: PoseEstimate) -> tuple[Array, ...]:
 
 
 def _gaps_m(model: KnownObject, places: Sequence[Array], cue: ContactCue) -> list[float]:
-    """How far an object's surface is at each place from where the hand was, seen from above."""
+    """How far an object's surface is at each place from where the hand was; from above unless it grasped."""
     points = np.asarray(model.points, float) if len(model.points) else np.zeros((1, 3))
-    away = [se3.apply(T, points)[:, :2] - cue.point_world[:2] for T in places]
+    axes = 3 if cue.kind == "grasp" and len(model.points) else 2
+    away = [(se3.apply(T, points) - cue.point_world)[:, :axes] for T in places]
     return [float(np.linalg.norm(one, axis=1).min()) for one in away]
 
 
