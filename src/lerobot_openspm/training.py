@@ -23,7 +23,7 @@ from lerobot_openspm.geometry.camera import Camera, load_cameras
 from lerobot_openspm.language.lexicon import read_lexicon
 from lerobot_openspm.memory.indexed_entries import known_names
 from lerobot_openspm.memory.memory import Memory
-from lerobot_openspm.memory.merging import episode_of
+from lerobot_openspm.memory.merging import demonstration_of
 from lerobot_openspm.memory.robot import RobotModel
 from lerobot_openspm.mining.dataset import Demonstrations, open_dataset
 from lerobot_openspm.mining.entries import build_entries
@@ -130,7 +130,7 @@ def memory_of(mined: MinedDataset, config: OpenSPMConfig) -> Memory:
     )
     entries = build_entries(mined)
     episodes = len(mined.episodes) + len(mined.skipped)
-    used = {episode_of(entry.source) for entry in entries}
+    used = {demonstration_of(entry.source) for entry in entries}
     logger.info(
         "mined %d entries from %d of %d episodes; objects: %s",
         len(entries), len(used), episodes, ", ".join(sorted(mined.objects)),

@@ -24,7 +24,7 @@ from lerobot_openspm.memory.entry import MemoryEntry
 from lerobot_openspm.memory.io import WORKPLACES, read_memory, workplaces_of, write_memory
 from lerobot_openspm.memory.looks import UNKNOWN_LOOKS, Looks
 from lerobot_openspm.memory.memory import Memory
-from lerobot_openspm.memory.merging import SOURCES, episode_of
+from lerobot_openspm.memory.merging import SOURCES, demonstration_of
 from lerobot_openspm.memory.retrieval import read_instruction
 from lerobot_openspm.perception.observation import Observation
 
@@ -121,7 +121,7 @@ def _episodes(parts: Sequence[Sequence[Candidate]]) -> list[set[str]]:
         shown = {
             name for one in part if len(one.sources) == 1 for name in one.sources[0].source.split(SOURCES)
         }
-        counts = Counter(map(episode_of, shown))
+        counts = Counter(map(demonstration_of, shown))
         found.append({episode for episode, count in counts.items() if count >= times[part[0].asked]})
     return found
 

@@ -21,7 +21,7 @@ from lerobot_openspm.language.names import TABLE_NAMES
 from lerobot_openspm.memory.io import read_memory, write_memory
 from lerobot_openspm.memory.looks import UNKNOWN_LOOKS
 from lerobot_openspm.memory.memory import Memory
-from lerobot_openspm.memory.merging import episode_of
+from lerobot_openspm.memory.merging import demonstration_of
 from lerobot_openspm.modeling_openspm import OpenSPMPolicy
 from lerobot_openspm.perception.observation import Observation, split_batch
 from lerobot_openspm.workplaces import _knows, choose
@@ -142,7 +142,7 @@ def test_a_workplace_knows_what_its_things_looks_alone_let_it_do():
 
 @pytest.mark.parametrize("source", ["a/b#20", "a/b#20.2"])
 def test_what_is_done_a_second_time_is_of_the_same_demonstration(source):
-    assert episode_of(source) == "a/b#20"
+    assert demonstration_of(source) == "a/b#20"
 
 
 def test_workplaces_of_joined_policies_are_joined_too(

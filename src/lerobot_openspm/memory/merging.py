@@ -82,7 +82,7 @@ def _clusters(entries: Sequence[MemoryEntry], distance_m: float, angle_rad: floa
     return clusters
 
 
-def episode_of(source: str) -> str:
+def demonstration_of(source: str) -> str:
     """The demonstration of one source; what is done a second time in it has a number of its own behind it."""
     name, _, number = source.rpartition("#")
     return f"{name}#{number.partition('.')[0]}"

@@ -26,6 +26,8 @@ BOTTLE_IN_BASKET = np.array([0.0, 0.0, 0.175])
 SMALL_BOTTLE_IN_BASKET = np.array([0.0, 0.0, 0.160])
 # The cheese is flat: a hand straight above it has room beside the can when it is turned.
 BESIDE_CAN = -math.radians(25)
+# They look alike from everywhere, and people take them from one side or another.
+CANS = ("alphabet_soup", "tomato_sauce")
 # Above the basket's rim and the things that stand on the floor.
 FLOOR_CARRY_RISE = 0.20
 
@@ -69,10 +71,11 @@ SPATIAL = {
         "on_the_wooden_cabinet": _BOWL_ON_PLATE,
     }.items()
 }
-OBJECT = {f"pick_up_the_{name}_and_place_it_in_the_basket": into_basket(name) for name in INTO_BASKET}
-_CHEESE = "pick_up_the_cream_cheese_and_place_it_in_the_basket"
-OBJECT[_CHEESE] = replace(OBJECT[_CHEESE], turn=BESIDE_CAN)
-# Cans look alike from everywhere, and people take them from one side or another.
-for _can in ("alphabet_soup", "tomato_sauce"):
-    _task = f"pick_up_the_{_can}_and_place_it_in_the_basket"
-    OBJECT[_task] = replace(OBJECT[_task], other_turn=math.pi / 2)
+OBJECT = {
+    f"pick_up_the_{name}_and_place_it_in_the_basket": put
+    for name, put in {
+        **{name: into_basket(name) for name in INTO_BASKET},
+        **{can: replace(into_basket(can), other_turn=math.pi / 2) for can in CANS},
+        "cream_cheese": replace(into_basket("cream_cheese"), turn=BESIDE_CAN),
+    }.items()
+}

@@ -49,7 +49,7 @@ class Put:
         rise: How high to lift it.
         along: The fingers open along this object's x axis instead of the world's y.
         turn: By which angle the hand is turned about the vertical besides, radians.
-        other_turn: In half of the demonstrations it is turned by this angle, as people differ.
+        other_turn: In half of the demonstrations the hand is turned by this angle instead, as people differ.
         slant: Where from the goal, seen from above, the lowering begins (3,): it is lowered at a slant.
         like: It is put down with its axes along those of this object, not as it stood.
     """
