@@ -10,11 +10,13 @@ import pytest
 from benchmarks.guard import FALSE_ALARM, POWER, STANDARDS, GuardConfig, Standard
 from benchmarks.libero import evaluate as harness
 from scipy.stats import binom
+from tests.memory.memories import a_memory
 
 from benchmarks import guard
 from lerobot_openspm.cli import pipeline
 from lerobot_openspm.cli.pipeline import Episode, rate
 from lerobot_openspm.envs.seeds import TUNING_SEED_START
+from lerobot_openspm.memory.io import write_memory
 
 ROOT = Path(__file__).parents[2]
 STANDARD = Standard(expected=0.98, demos=1, episodes=8, seed=2_800_000)
@@ -133,7 +135,8 @@ def test_liberos_scenes_are_drawn_from_the_guards_own_seeds(monkeypatch: pytest.
     collected, jobs = [], []
     checkpoint = tmp_path / "trained"
     checkpoint.mkdir()
-    for name in ("model.safetensors", "memory.json", "config.json"):
+    write_memory(a_memory(), checkpoint)
+    for name in ("model.safetensors", "config.json"):
         (checkpoint / name).write_text(name)
 
     def run_one(config: harness.EvaluationConfig, task: str, state: int):
