@@ -157,6 +157,19 @@ def test_a_grasp_within_reach_stays_as_shown(panda):
     assert chosen(*scene(panda, 0.0))[0].turned == 0
 
 
+@pytest.mark.parametrize(
+    ("x", "turned", "stretched"), [(0.08, 0, False), (0.11, 90, False), (0.14, 30, True)]
+)
+def test_a_grasp_that_stretches_the_arm_out_is_turned_while_another_one_does_not(panda, x, turned, stretched):
+    context, poses, home = scene(panda, 0.0, x=x)
+    as_shown = replace(Plan(context.entries[0], poses, home), stance=find_stance(context.robot, home))
+    assert as_shown.is_stretched(context) == (x > 0.1)
+    plan, problems = chosen(context, poses, home)
+    assert problems == plan.followed(context)[1] == []
+    assert round(np.rad2deg(plan.turned)) == turned
+    assert plan.is_stretched(context) == stretched
+
+
 def test_what_is_out_of_reach_from_all_sides_is_refused(panda):
     context, poses, home = scene(panda, 0.0, x=0.9)
     assert chosen(context, poses, home)[1]

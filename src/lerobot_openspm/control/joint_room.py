@@ -3,6 +3,9 @@
 A key pose may be within reach and still be hard to pass: an arm that is folded up close to its own base has
 no way left to go, and a controller that moves the hand straight on gets stuck there. On its way down the hand
 goes as it was shown: the longer it is on its way so close to the base, the further the arm drifts.
+
+An arm that is stretched out has no room either: carried on a little further, its elbow turns over, and from
+there a pull inwards only presses the elbow against its limit.
 """
 
 from __future__ import annotations
@@ -21,6 +24,8 @@ from lerobot_openspm.geometry.se3 import Array
 ROOM_RAD = np.deg2rad(15)
 # For that the hand is led away from the base by the least of these, metres.
 OUT_M = tuple(np.arange(0.01, 0.125, 0.01).tolist())
+# An arm that cannot go on so far out from its base is stretched, metres: by half of that the hand overshoots.
+STRETCH_M = 0.045
 
 
 def ways_out(targets: Sequence[Target], arm: Arm, stance: Array) -> dict[int, Array]:
@@ -49,6 +54,17 @@ def ways_out(targets: Sequence[Target], arm: Arm, stance: Array) -> dict[int, Ar
     return out
 
 
+def is_stretched(targets: Sequence[Target], arm: Arm, stance: Array) -> bool:
+    """Whether the arm is stretched out where the hand takes hold of something; arguments as of ways_out."""
+    for target in targets:
+        if target.key_pose.phase == "grasp":
+            R, p = target.T_world_ee[:3, :3], target.T_world_ee[:3, 3]
+            further = se3.transform(R, p + _away(p - arm.base) * STRETCH_M)
+            if not _reaches(arm, further, arm.onwards(further, stance, stance)):
+                return True
+    return False
+
+
 def _are_rising(targets: Sequence[Target]) -> list[bool]:
     """Of each key pose, whether the hand, pointing down, passes by over the place of what it has grasped."""
     grasped: dict[int, str] = {}
@@ -64,9 +80,13 @@ def _are_rising(targets: Sequence[Target]) -> list[bool]:
 
 def _outwards(from_base: Array) -> list[Array]:
     """Ways ``(3,)`` further out for a hand that is ``(3,)`` from the base, the least first, metres."""
+    return [metres * _away(from_base) for metres in OUT_M]
+
+
+def _away(from_base: Array) -> Array:
+    """The level unit vector ``(3,)`` away from the base, of a hand that is ``(3,)`` from it."""
     x, y, _ = from_base
-    away = np.array([x, y, 0.0]) / max(float(np.hypot(x, y)), 1e-9)
-    return [metres * away for metres in OUT_M]
+    return np.array([x, y, 0.0]) / max(float(np.hypot(x, y)), 1e-9)
 
 
 def _reaches(arm: Arm, T_world_ee: Array, angles: Array) -> bool:

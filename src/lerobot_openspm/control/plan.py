@@ -10,6 +10,7 @@ import numpy as np
 
 from lerobot_openspm.control.feasibility import Miss, check_reach, check_transfer
 from lerobot_openspm.control.finger_room import shifted
+from lerobot_openspm.control.joint_room import is_stretched
 from lerobot_openspm.control.pushes import pushed_by_landmark
 from lerobot_openspm.control.putting import put_aside, put_turned
 from lerobot_openspm.control.transfer import (
@@ -195,6 +196,13 @@ class Plan:
         if arm is None or self.stance is None:
             return None
         return check_reach(targets, self.T_world_ee, arm, self.stance)
+
+    def is_stretched(self, context: PlanningContext) -> bool:
+        """Whether the arm is stretched out where it grasps, as far as is known."""
+        arm = context.robot.arm
+        if arm is None or self.stance is None:
+            return False
+        return is_stretched(self.targets(context), arm, self.stance)
 
     def backing_off(self, context: PlanningContext) -> tuple[Plan, Miss | None]:
         """The plan, backing off as far as the arm reaches, and the first key pose that it does not reach.

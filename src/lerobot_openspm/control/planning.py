@@ -160,7 +160,7 @@ class PlanningContext:
         first = Plan(ranked[0].entry, object_poses, T_world_ee, not_meant=not_meant or {})
         if any(name not in object_poses for name in first.entry.objects):
             return first, []
-        first = replace(first, stance=find_stance(self.robot, T_world_ee))
+        first, meant = replace(first, stance=find_stance(self.robot, T_world_ee)), first.entry.key.sub_tasks
         points, crowded = self._points(first), list[tuple[Plan, dict[str, int]]]()
         sought = set(self.points) if len(self.points) <= MOST_IN_A_SCENE else set[str]()
         if unseen := sorted(sought - set(points)):
@@ -171,7 +171,7 @@ class PlanningContext:
         for entry in tried:
             if any(name not in object_poses for name in entry.objects):
                 continue
-            if not self._mean_the_same(entry, first.entry):
+            if not means_the_same(entry.key.sub_tasks, meant, self.names.lexicon):
                 continue
             for is_half_turned in (False, True):
                 plan = replace(first, entry=entry, is_half_turned=is_half_turned)
@@ -205,9 +205,6 @@ class PlanningContext:
                 tried.append(entry)
         return tried, occupied
 
-    def _mean_the_same(self, entry: MemoryEntry, other: MemoryEntry) -> bool:
-        return means_the_same(entry.key.sub_tasks, other.key.sub_tasks, self.names.lexicon)
-
     def otherwise(self, plan: Plan) -> Plan:
         """A plan that grasps from another side, where the arm can follow it so; else the plan itself."""
         plan = replace(plan, shifts={})  # they lead a hand that grasps from another side elsewhere
@@ -224,7 +221,7 @@ class PlanningContext:
     ) -> tuple[Plan, dict[str, int]] | None:
         """The first of some plans that the arm can follow, unless the hand is in much less of others in one.
 
-        None where the arm can follow none.
+        One that stretches the arm out comes after others as clear. None where the arm can follow none.
 
         Args:
             turned: A plan with its grasps turned, see :meth:`Plan.turns`.
@@ -238,13 +235,18 @@ class PlanningContext:
             targets = plan.targets(self)
             if not plan.check(self, targets):
                 ways.append((plan, crowding(plan.entry, targets, points, self.hand_radius_m)))
+        stretched: tuple[Plan, dict[str, int]] | None = None
         for plan, inside in _clearest_first(ways):
+            if stretched and sum(inside.values()) > max(MUCH_MORE * _amount(stretched), FEW_POINTS):
+                break
             reaching, miss = plan.backing_off(self)
             if miss is None:
-                return reaching, inside
-            if miss.target.key_pose.sub_task not in plan.symmetric_grasps(self):
-                return None  # turning the grasps leaves it where it is
-        return None
+                if not reaching.is_stretched(self):
+                    return reaching, inside
+                stretched = stretched or (reaching, inside)
+            elif miss.target.key_pose.sub_task not in plan.symmetric_grasps(self):
+                break  # turning the grasps leaves it where it is
+        return stretched
 
     def _beside(
         self, plan: Plan, inside: Mapping[str, int], points: Mapping[str, Array]
@@ -273,10 +275,7 @@ class PlanningContext:
         return found
 
     def clear(self, plan: Plan) -> Plan:
-        """A plan whose ways are lifted over what stands about, and leave the arm's joints room.
-
-        Where the arm cannot follow such ways, the plan stays as it is, and that is said.
-        """
+        """A plan whose ways are lifted over what stands about and leave the joints room, where they can."""
         return self._with_room(self._with_finger_room(self._lifted(plan)))
 
     def _lifted(self, plan: Plan) -> Plan:
