@@ -302,6 +302,22 @@ def test_a_place_where_something_stands_already_is_refused_by_name(beside, is_ta
     assert plan.entry is shown
 
 
+@pytest.mark.parametrize(("scale", "is_taken"), [(0.3, True), (1.1, False)])
+def test_what_lies_flat_in_the_middle_of_a_place_takes_it_but_not_that_place_by_another_name(scale, is_taken):
+    context, poses, home = scene(None, 0.0)
+    shown = replace(context.entries[0], outcomes=(ON_PLATE,))
+    targets = Plan(shown, poses, home).targets(context)
+    (grasp,), (release,) = (
+        [t for t in targets if t.key_pose.phase == phase] for phase in ("grasp", "release")
+    )
+    T_end = release.T_world_ee @ se3.inverse(grasp.T_world_ee) @ poses["bowl"]
+    plate = 3 * disc() + se3.apply(se3.inverse(poses["plate"]), T_end[:3, 3])
+    points = {"bowl": disc(), "plate": plate, "cheese": scale * (plate - plate.mean(0)) + plate.mean(0)}
+    context = replace(context, entries=(shown,), points=points, hand_radius_m=RADIUS, symmetries={})
+    _, problems = chosen(context, poses | {"cheese": poses["plate"]}, home)
+    assert ("the plate is taken: the cheese stands where the bowl would" in problems) == is_taken
+
+
 def test_a_place_where_another_of_the_kind_stands_is_taken_and_the_next_entry_puts_it_elsewhere():
     context, poses, home = scene(None, 0.0)
     shown = context.entries[0]

@@ -47,8 +47,8 @@ FINGERS_MOVE = ("grasp", "release")
 # shares of the hand's radius, and from where to where they reach along z, metres. Fingers open along y.
 PARTS = ((0.45, 1.35, -0.16, -0.05), (0.2, 0.75, -0.05, -0.01))
 # Fewer points of an object than this inside the hand are noise, and what is this near to what is grasped,
-# metres, is the same thing by another name.
-NOISE_POINTS, SAME_THING_M = 5, 0.02
+# metres, is the same thing by another name; also at a place, if it is as large but for so much.
+NOISE_POINTS, SAME_THING_M, SAME_SIZE_M = 5, 0.02, 0.04
 # A place is taken where the middle of something else is at most this far beside it, metres.
 TAKEN_M = 0.03
 # Two things of a kind cannot stand closer together than this, as far as is known, metres.
@@ -237,7 +237,7 @@ def taken(
 ) -> list[str]:
     """Places that something is put on where something else stands already, in words.
 
-    In a basket or a drawer things may lie upon one another.
+    In what something is put into, things may lie upon one another.
 
     Args:
         entry: What is to be executed.
@@ -247,11 +247,11 @@ def taken(
         alike: By name, poses ``T_world_obj`` ``(4, 4)`` of others of a kind.
     """
     needed = {name for target in targets for name in target.key_pose.anchor.objects}
-    own = [points[name].mean(0) for name in needed & points.keys()]
+    own = [points[name] for name in needed & points.keys()]
     others = {
         name: points[name]
         for name in sorted(points.keys() - needed)
-        if all(np.linalg.norm(points[name].mean(0) - one) > SAME_THING_M for one in own)
+        if not any(_is_same_thing(points[name], one) for one in own)
     }
     found: list[str] = []
     grasp: Target | None = None
@@ -273,6 +273,12 @@ def taken(
                 if _stands_at(end, other.mean(0), TAKEN_M):
                     found.append(f"the {place} is taken: the {name} stands where the {load} would")
     return found
+
+
+def _is_same_thing(points: Array, other: Array) -> bool:
+    """Whether points ``(n, 3)`` and ``(m, 3)`` are of one thing with two names, by place and size."""
+    apart = float(np.linalg.norm(points.mean(0) - other.mean(0)))
+    return apart <= SAME_THING_M and bool((np.abs(np.ptp(points, 0) - np.ptp(other, 0)) <= SAME_SIZE_M).all())
 
 
 def _stands_at(point: Array, other: Array, metres: float) -> bool:
