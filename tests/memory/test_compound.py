@@ -221,6 +221,22 @@ def test_what_was_closed_is_opened_again_before_something_goes_in():
     assert operations("open the drawer and put the box in the top drawer", *known) == ["open", "put"]
 
 
+def test_what_is_put_into_a_drawer_that_was_shown_open_waits_until_one_that_was_closed_is_opened():
+    both = "put the bowl in the top drawer of the cabinet and close it"
+    poses = (*pick_and_place("bowl", "cabinet"), *opened(1))
+    known = entry(both, poses, {"bowl": np.eye(4), "cabinet": np.eye(4)}), BOX
+    opening = entry("open the top drawer of the cabinet", opened(), {"cabinet": np.eye(4)})
+    box = "put the box in the top drawer"
+    assert operations(box, *known) == ["put"]
+    for before in ("close the top drawer", both):
+        asked = f"{before} and {box}"
+        with pytest.raises(InstructionError, match=r"cannot be done once that is closed.*open the top drawer"):
+            planned(asked, known)
+        first = "put" if before == both else "close"
+        assert operations(asked, *known, opening) == [first, "open", "put"]
+    assert operations(f"close the top drawer, open it and {box}", *known, opening) == ["close", "open", "put"]
+
+
 def test_where_demonstrations_do_different_things_before_it_is_asked_back():
     other = drawer_entry(
         "close the top drawer of the cabinet and put the bowl in the top drawer of the cabinet"

@@ -128,9 +128,13 @@ def plan_parts(
                 f"{said!r} is a part of the instruction {instruction!r} that cannot be done: {error}"
             ) from error
         done = [sub_task for part in chain for sub_task in _likeliest(part).entry.key.sub_tasks]
-        needed = _condition(found, done, names)
+        needed = _condition(found, done, names) or _closed_before(found, done, names.lexicon)
         if needed is not None:
-            chain.append(_longest_run((needed,), phrase(needed), entries, names, looks))
+            try:
+                chain.append(_longest_run((needed,), phrase(needed), entries, names, looks))
+            except InstructionError as error:
+                why = f"{said!r} cannot be done once that is closed, unless something opens it"
+                raise InstructionError(f"{why}: {error}") from error
         chain.append(found)
         left = left[len(found[0].asked) :]
     return tuple(chain)
@@ -171,6 +175,14 @@ def _done_before(one: Candidate) -> SubTask | None:
     own = next((i for i, other in enumerate(shown) if _place(other) == _place(put)), 0)
     before = [other for other in shown[:own] if put.part and _place(put) == (other.target, other.part)]
     return before[-1] if before else None
+
+
+def _closed_before(found: Sequence[Candidate], done: Sequence[SubTask], lexicon: Lexicon) -> SubTask | None:
+    """The opening of what a part puts something into, where that is closed before; arguments as above."""
+    put = _likeliest(found).entry.key.sub_tasks[0]
+    opening = SubTask("open", put.landmark, put.part, target_where=put.landmark_where)
+    is_closed = _is_done(replace(opening, operation="close"), done, lexicon)
+    return opening if put.relation == "in" and is_closed else None
 
 
 def _is_done(needed: SubTask, done: Sequence[SubTask], lexicon: Lexicon) -> bool:
