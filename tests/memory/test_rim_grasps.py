@@ -11,6 +11,7 @@ from lerobot_openspm.errors import InstructionError
 from lerobot_openspm.geometry import se3
 from lerobot_openspm.language.instruction import read_task
 from lerobot_openspm.memory.compose import plan_parts
+from lerobot_openspm.memory.entry import Anchor
 from lerobot_openspm.memory.looks import Looks
 from lerobot_openspm.types import Symmetry
 
@@ -109,3 +110,26 @@ def test_what_is_not_known_to_be_round_has_no_rim():
             carried_out(by_the_rim(), looks)
     with pytest.raises(InstructionError, match="no demonstration takes hold of the plate"):
         planned("put the plate on the stove", [by_the_rim(), PUSHED])
+
+
+def test_of_two_round_things_that_fit_equally_it_is_asked_back_which():
+    pushes = [
+        entry(
+            f"push the {color} plate to the front of the stove",
+            tuple(
+                replace(one, anchor=Anchor(f"{color} plate", f"{color} plate"))
+                if one.anchor.place == "plate"
+                else one
+                for one in PUSHED.key_poses
+            ),
+            {f"{color} plate": PUSHED.object_poses["plate"], "stove": np.eye(4)},
+        )
+        for color in ("red", "white")
+    ]
+    names = {"bowl": "bowl", "red plate": "plate", "white plate": "plate"}
+    looks = Looks({name: LOOKS.points[one] for name, one in names.items()}, dict.fromkeys(names, ROUND))
+    known = [by_the_rim(), *pushes]
+    with pytest.raises(InstructionError, match="which one is meant, the red plate or the white plate"):
+        plan_parts("put the plate on the stove", ASKED, known, looks=looks)
+    ((one, *_),) = plan_parts("…", read_task("put the white plate on the stove"), known, looks=looks)
+    assert one.entry.key.sub_tasks[0].target == "white plate"

@@ -33,6 +33,8 @@ Part = tuple[MemoryEntry, MemoryEntry]
 def by_rim(asked: SubTask, parts: Sequence[Part], score: Score, least: float, looks: Looks) -> list[Part]:
     """Grasps of a round thing that was never grasped, by its rim, as another one was grasped by its own.
 
+    Of several things that fit equally well, those of each.
+
     Args:
         asked: What to do with the thing.
         parts: Entries of one sub-task.
@@ -42,16 +44,16 @@ def by_rim(asked: SubTask, parts: Sequence[Part], score: Score, least: float, lo
     """
     standing = {name: part.object_poses[name] for part, _ in parts for name in part.object_poses}
     fits = {name: score(asked, replace(asked, target=name)) for name in standing}
-    name = max(fits, key=lambda name: fits[name], default="")
-    rim = looks.rim(name)
-    if rim is None or fits[name] < least:
-        return []
-    T_world_rim = standing[name] @ rim.T_obj_rim
+    best = max(fits.values(), default=0.0)
     found: list[Part] = []
-    for part, source in parts:
-        own = _grasped_rim(part, looks)
-        if own is not None:
-            found.append((_at_other_rim(part, own, name, standing[name], T_world_rim, rim.radius), source))
+    for name, T in standing.items():
+        rim = looks.rim(name)
+        if rim is None or fits[name] < max(best, least):
+            continue
+        for part, source in parts:
+            own = _grasped_rim(part, looks)
+            if own is not None:
+                found.append((_at_other_rim(part, own, name, T, T @ rim.T_obj_rim, rim.radius), source))
     return found
 
 
