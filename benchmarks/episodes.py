@@ -62,6 +62,8 @@ class Episode:
     def told(self) -> Row:
         """What is kept of it."""
         state, targets = self.controller.state, self.controller.executor.targets
+        spent = (*state.spent, (state.attempts, self.controller.scene.time_s))
+        began = (0.0, *(ended for _, ended in spent))
         return {
             "steps": len(self.actions),
             "success": self.success,
@@ -70,7 +72,10 @@ class Episode:
             "key_pose": state.index,
             "phase": targets[state.index].key_pose.phase if targets else None,
             "attempts": state.attempts,
-            "parts": [{"attempts": attempts, "seconds": seconds} for attempts, seconds in state.spent],
+            "parts": [
+                {"attempts": attempts, "seconds": round(ended - start, 2)}
+                for (attempts, ended), start in zip(spent, began, strict=False)
+            ],
             "entry": " and ".join(one.source for one in state.used[-1]) if state.used else None,
         }
 

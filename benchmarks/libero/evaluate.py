@@ -128,7 +128,7 @@ def summary(episodes: list[Row], off_mm: Sequence[float] | None = None) -> dict[
     errors = [None] * len(episodes) if off_mm is None else off_mm
     failed = [
         {
-            **{key: e[key] for key in ("task", "state", "seed", "attempts")},
+            **{key: e[key] for key in ("task", "state", "seed", "attempts", "parts")},
             "reason": reason(e),
             "kind": failure_kind(e, off),
         }

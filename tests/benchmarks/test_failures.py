@@ -1,7 +1,11 @@
-"""Failed episodes are sorted by what was noted of them, the first rule that fits."""
+"""What is noted of episodes, and failed ones sorted by that, by the first rule that fits."""
 
+import numpy as np
 import pytest
+from benchmarks.episodes import Episode
 from benchmarks.libero.failures import KINDS, Grips, counts, failure_kind
+from tests.control.acting import HAND, Perception, controller, observe, watch
+from tests.memory.builders import entry
 
 PHASES = ["approach", "grasp", "lift", "place", "release"]
 
@@ -49,3 +53,14 @@ def test_all_grasps_of_the_present_part_have_to_hold():
     assert grips.told() is False
     grips.note(2, ["approach", "push"], 1)
     assert grips.told() is None
+
+
+def test_every_part_has_its_own_attempts_and_seconds_the_last_one_too():
+    one = controller()
+    observe(one, HAND, Perception(entry().object_poses))
+    one.state.attempts = 2
+    watch(one, Perception(entry().object_poses), HAND, 10)
+    one.state.begin_next_part(one.scene.time_s)
+    watch(one, Perception(entry().object_poses), HAND, 6)
+    parts = Episode(False, np.zeros((3, 7)), one).told()["parts"]
+    assert parts == [{"attempts": 2, "seconds": 0.5}, {"attempts": 0, "seconds": pytest.approx(0.3)}]

@@ -36,7 +36,7 @@ def suite(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("benchmarks.harness.folders", lambda checkpoint: [checkpoint])
 
 
-EPISODE = {"steps": 100, "status": "done", "phase": "retreat", "attempts": 0, "contacts": {}}
+EPISODE = {"steps": 100, "status": "done", "phase": "retreat", "attempts": 0, "parts": [], "contacts": {}}
 
 
 @pytest.fixture
@@ -48,6 +48,7 @@ def ran(monkeypatch: pytest.MonkeyPatch) -> list[tuple[str, int]]:
         found.append((task, state))
         success = state != 1
         told = {"steps": 100 + state, "success": success, "status": "done", "phase": "retreat", "attempts": 0}
+        told["parts"] = [{"attempts": 0, "seconds": 5.0}]
         contacts = {"plate": 12.0 * state} if task == "put_the_bowl" else {}
         return {"task": task, "state": state, "seed": harness.SEED + state, **told, "contacts": contacts}
 
@@ -128,6 +129,7 @@ def test_the_summary_counts_and_says_why(config, ran):
         (task, 1, harness.SEED + 1) for task in TASKS
     }
     assert "goal does not hold" in figures["failed"][0]["reason"]
+    assert figures["failed"][0]["parts"] == [{"attempts": 0, "seconds": 5.0}]
     assert {one["kind"] for one in figures["failed"]} == {"placing"}
     assert (figures["failures"]["grasp"], figures["failures"]["placing"]) == (0, 3)
 

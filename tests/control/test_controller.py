@@ -18,11 +18,14 @@ from tests.control.acting import (
 from tests.memory.builders import entry, robot
 
 from lerobot_openspm.control.controller import EpisodeController
+from lerobot_openspm.control.plan import Plan
 from lerobot_openspm.control.planning import PlanningContext
 from lerobot_openspm.control.state import Status
 from lerobot_openspm.geometry import se3
 from lerobot_openspm.geometry.arm import load_arm
 from lerobot_openspm.types import Fault, Hand
+
+BALL = np.random.default_rng(0).normal(size=(50, 3)) / 50
 
 
 def test_the_first_observation_makes_a_plan():
@@ -210,3 +213,19 @@ def test_noise_is_a_function_of_seed_episode_and_chunk_alone():
     assert_allclose(first.noise(shape), again.noise(shape), rtol=0)
     assert abs(float(controller().noise((100, 100)).mean())) < 0.05
     assert float(controller().noise((100, 100)).std()) == pytest.approx(1, abs=0.05)
+
+
+def test_a_place_that_something_takes_is_free_once_that_is_gone():
+    poses = entry().object_poses
+    context = planning_context(points={"bowl": BALL, "mug": BALL}, hand_radius_m=0.05)
+    one = EpisodeController(context, INSTRUCTION, 7, 0)
+    targets = Plan(entry(), poses, HAND.T_world_ee).targets(context)
+    at = {one.key_pose.phase: one.T_world_ee for one in targets}
+    mug = at["release"] @ se3.inverse(at["grasp"]) @ poses["bowl"]
+    perception = Perception({**poses, "mug": mug})
+    observe(one, HAND, perception)
+    assert one.state.status is Status.INFEASIBLE
+    assert one.state.refusal == "the plate is taken: the mug stands where the bowl would"
+    del perception.object_poses["mug"]
+    watch(one, perception, HAND, 16 * LOOK_AGAIN_STEPS)
+    assert (one.state.status, one.state.refusal) == (Status.RUNNING, "")

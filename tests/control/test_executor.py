@@ -366,3 +366,4 @@ def test_what_stops_a_closing_hand_half_way_is_no_end_of_the_way():
     run(executor, World(held=0.0, stuck=lambda T: bool(T[0, 3] > jammed and T[2, 3] < 0.12)), n_steps=600)
     assert executor.state.index == 1
     assert executor.state.status is Status.NO_PROGRESS
+    assert " does not close: it stays " in executor.state.refusal

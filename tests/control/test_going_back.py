@@ -8,6 +8,7 @@ from numpy.testing import assert_allclose
 from tests.control.acting import HAND, Perception, controller, observe, watch
 from tests.memory.builders import entry, hand_pose, key_pose, pick_and_place
 
+from lerobot_openspm.control.executor import MAX_ATTEMPTS
 from lerobot_openspm.control.scene import GIVE_UP_S
 from lerobot_openspm.control.state import Status
 from lerobot_openspm.geometry import se3
@@ -264,6 +265,85 @@ def test_what_was_put_down_is_seen_to_be_there_before_the_rest_is_done():
     assert attempts == 1
     assert 0 < seconds < one.scene.time_s
     assert {target.key_pose.anchor.place for target in one.executor.targets} == {"cabinet"}
+
+
+def finish(one, perception, at):
+    """The hand at the end of the present part, the bowl so far beside the plate's middle."""
+    last = len(one.executor.targets) - 1
+    one.executor.begin(one.executor.targets, HAND, last)
+    perception.object_poses["bowl"] = perception.object_poses["plate"] @ se3.from_yaw([at, 0.0, 0.0], 0.0)
+    watch(one, perception, Hand(one.executor.targets[last].T_world_ee, 0.08), 12)
+
+
+def test_what_a_later_part_knocked_away_is_put_back():
+    both = "put the bowl on the plate and open the top drawer"
+    memory = entry(outcomes=(ON_PLATE,)), handle(KINDS["slide"])
+    perception, one = Perception({**entry().object_poses, **CABINET}), controller(*memory, instruction=both)
+    observe(one, HAND, perception)
+    finish(one, perception, 0.0)
+    assert (one.state.part, one.state.verdicts) == (1, (True,))
+    finish(one, perception, 0.3)
+    assert (one.state.part, one.state.status, one.state.succeeded) == (2, Status.RUNNING, None)
+    assert {target.key_pose.anchor.place for target in one.executor.targets} == {"bowl", "plate"}
+    bowl = perception.object_poses["bowl"]
+    assert_allclose(one.executor.targets[0].T_world_ee, bowl @ entry().key_poses[0].T_obj_ee, atol=1e-9)
+    finish(one, perception, 0.0)
+    assert (one.state.status, one.state.succeeded) == (Status.DONE, True)
+    assert len(one.state.used) == len(one.state.parts) == 3
+
+
+def test_of_two_things_that_knock_each_other_away_each_is_put_back_once():
+    on_stove = replace(ON_PLATE, target="box", anchor=Anchor("stove", "stove"))
+    object_poses = {**entry().object_poses, **CABINET}
+    object_poses |= {name: se3.from_yaw([x, -0.1, 0.0], 0.0) for name, x in (("box", 0.1), ("stove", -0.2))}
+    put = "put the box on the stove"
+    memory = (
+        entry(outcomes=(ON_PLATE,)),
+        entry(put, pick_and_place("box", "stove"), object_poses, outcomes=(on_stove,)),
+        handle(KINDS["slide"]),
+    )
+    asked = f"put the bowl on the plate, {put} and open the top drawer"
+    perception, one = Perception(object_poses), controller(*memory, instruction=asked)
+    observe(one, HAND, perception)
+    plate, stove = object_poses["plate"], object_poses["stove"]
+    away = se3.from_yaw([0.3, 0.0, 0.0], 0.0)
+    for bowl, box, part in (
+        (plate, object_poses["box"], 1),
+        (plate, stove, 2),
+        (plate @ away, stove, 3),
+        (plate, stove @ away, 4),
+        (plate @ away, stove, 4),
+    ):
+        last = len(one.executor.targets) - 1
+        one.executor.begin(one.executor.targets, HAND, last)
+        perception.object_poses |= {"bowl": bowl, "box": box}
+        watch(one, perception, Hand(one.executor.targets[last].T_world_ee, 0.08), 12)
+        assert one.state.part == part
+    assert (one.state.status, one.state.succeeded) == (Status.DONE, False)
+
+
+def test_what_a_later_part_moves_on_is_not_put_back():
+    both = "put the bowl on the plate and put the bowl on the stove"
+    object_poses = {**entry().object_poses, "stove": se3.from_yaw([-0.2, -0.1, 0.0], 0.0)}
+    memory = (
+        entry(outcomes=(ON_PLATE,)),
+        entry("put the bowl on the stove", pick_and_place("bowl", "stove"), object_poses),
+    )
+    perception, one = Perception(object_poses), controller(*memory, instruction=both)
+    observe(one, HAND, perception)
+    finish(one, perception, 0.0)
+    finish(one, perception, 0.3)
+    assert (one.state.part, one.state.status) == (1, Status.DONE)
+
+
+def test_what_does_not_stay_where_it_is_put_is_named_at_last():
+    perception, one = Perception(entry().object_poses), controller(entry(outcomes=(ON_PLATE,)))
+    observe(one, HAND, perception)
+    for _ in range(MAX_ATTEMPTS + 1):
+        assert one.state.status is Status.RUNNING
+        finish(one, perception, 0.06)
+    assert (one.state.status, one.state.succeeded) == (Status.NO_PROGRESS, False)
+    assert one.state.refusal == "the bowl is not where it should be"
 
 
 def test_an_outcome_that_no_key_pose_leads_to_is_not_tried_again():

@@ -139,7 +139,7 @@ class EpisodeController:
     def _plan(self, hand: Hand) -> None:
         """Plan the present part, once its objects are found."""
         state, candidates = self.state, self.state.parts[self.state.part]
-        poses = self.scene.tracker.poses(hand.T_world_ee)
+        poses = self.scene.believed(hand, state.refused if state.status is Status.INFEASIBLE else None)
         if state.status is Status.INFEASIBLE and state.refused.is_same_scene(poses, hand.T_world_ee):
             return  # nor is it now
         state.ranked = self._context.rank(candidates, poses, hand.T_world_ee)
@@ -272,8 +272,7 @@ class EpisodeController:
     def _now_needed(self) -> list[str]:
         """Objects that the present key pose is relative to, unless the hand has touched them."""
         untouched = self.scene.untouched(self.state.plan, self.executor.targets, self.state.index)
-        anchor = self.executor.present.key_pose.anchor
-        return [name for name in anchor.objects if name in untouched]
+        return [name for name in self.executor.present.key_pose.anchor.objects if name in untouched]
 
     # Trying again.
 
@@ -307,22 +306,24 @@ class EpisodeController:
         if not self._is_tracking:
             return self._end_part(hand)
         state.followed |= self.executor.followed_sub_tasks()
-        names = dict.fromkeys(name for one in state.plan.entry.served_outcomes for name in one.objects)
-        if not names:
+        if not state.looked_at:
             state.judge(())
             return self._end_part(hand)
         state.looks_left -= 1
-        return scene.look([name for name in names if name not in scene.altered], hand)
+        return scene.look([name for name in state.looked_at if name not in scene.altered], hand)
 
     def _judge(self, hand: Hand) -> LookRequest | None:
         """Compare what is seen with the outcomes: go on if all are met, else go back to what can mend it."""
-        state, poses = self.state, self.scene.tracker.poses(hand.T_world_ee)
-        poses = state.plan.as_if_in_place(poses, self._context.symmetries)
-        missed = state.plan.entry.missed(poses, self.scene.recognised(), self._context.yaw_periods)
-        if missed is None:
-            return None if state.looks_left > 0 else self._end_part(hand)
-        state.judge(missed)
-        return self._mend(missed[0], hand) if missed else self._end_part(hand)
+        state = self.state
+        seen = self.scene.tracker.poses(hand.T_world_ee), self.scene.recognised(), self._context
+        if state.is_unsure(*seen) and state.looks_left > 0:
+            return None
+        if (missed := state.plan.missed(*seen)) is not None:
+            state.judge(missed)
+        if missed:
+            return self._mend(missed[0], hand)
+        state.take_up_again(*seen)
+        return self._end_part(hand)
 
     def _mend(self, missed: Outcome, hand: Hand) -> None:
         """Go back to a sub-task, and to where its target is now, if an attempt is left."""

@@ -280,10 +280,11 @@ class Executor:
     def try_again(self, why: str) -> bool:
         """Count another attempt at the present part; without one left there is no progress."""
         self.state.attempts += 1
-        phase = self.present.key_pose.phase
+        key_pose, is_at_end = self.present.key_pose, self.state.status is Status.DONE
+        phase = "close" if self.present.until_stopped else key_pose.phase
         if self.state.attempts > MAX_ATTEMPTS:
             self.stop(Status.NO_PROGRESS)
-            self.state.refusal = why_given_up(phase, self.present.key_pose.anchor.place, why)
+            self.state.refusal = why if is_at_end else why_given_up(phase, key_pose.anchor.place, why)
             logger.info("giving up at key pose %d: %s", self.state.index, self.state.refusal)
             return False
         logger.info("trying key pose %d (%s) again: %s", self.state.index, phase, why)

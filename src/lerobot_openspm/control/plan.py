@@ -171,6 +171,13 @@ class Plan:
         shown = as_shown(self.entry, object_poses, symmetries)
         return {name: back @ T if name in put else T for name, T in shown.items()}
 
+    def missed(
+        self, object_poses: Mapping[str, Array], recognised: Collection[str], context: PlanningContext
+    ) -> list[Outcome] | None:
+        """The outcomes that are seen not to be met, see :meth:`MemoryEntry.missed`."""
+        poses = self.as_if_in_place(object_poses, context.symmetries)
+        return self.entry.missed(poses, recognised, context.yaw_periods)
+
     @property
     def _puts(self) -> list[Outcome]:
         """The outcomes of what is grasped and put somewhere; what is pushed is put nowhere."""

@@ -21,6 +21,7 @@ FAILS = {
     "retreat": "the hand does not get away from the {}",
     "push": "the {} cannot be pushed",
     "open": "the {} does not open",
+    "close": "the {} does not close",
     "turn": "the {} does not turn",
 }
 
@@ -61,7 +62,7 @@ def why_given_up(phase: str, place: str, why: str) -> str:
     """What did not succeed although it was tried again.
 
     Args:
-        phase: In which phase.
+        phase: In which phase; "close" where a push shuts something.
         place: The object that the key pose is relative to.
         why: What was wrong at last.
     """

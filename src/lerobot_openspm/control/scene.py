@@ -171,6 +171,17 @@ class SceneState:
         """Those of some objects that have a status."""
         return [name for name in names if self.tracker.status(name) is status]
 
+    def believed(self, hand: Hand, refused: Plan | None = None) -> dict[str, Array]:
+        """Poses ``T_world_obj`` ``(4, 4)`` of all objects that were seen.
+
+        Where a plan was refused, without those that are gone by now, unless it needs them.
+        """
+        poses = self.tracker.poses(hand.T_world_ee)
+        if refused is None:
+            return poses
+        gone = set(self.those(TrackStatus.LOST, list(poses))) - set(refused.entry.objects)
+        return {name: T for name, T in poses.items() if name not in gone}
+
     def why_missing(self, names: Sequence[str], hand: Hand) -> str:
         """What is known of objects that the last look did not find, in words."""
         is_something_held = not self.tracker.held and are_around_something(hand, self._context.robot)

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from enum import StrEnum
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -13,6 +14,9 @@ from lerobot_openspm.geometry.se3 import Array
 from lerobot_openspm.memory.compose import Candidate
 from lerobot_openspm.memory.entry import MemoryEntry, Outcome
 from lerobot_openspm.memory.retrieval import Scored
+
+if TYPE_CHECKING:
+    from lerobot_openspm.control.planning import PlanningContext
 
 # After the last key pose the policy looks up to three times at what it moved. Then the outcome stays unknown.
 LOOKS_AT_OUTCOME = 3
@@ -74,6 +78,7 @@ class EpisodeState:
         refused: The plan that was last found to be infeasible.
         used: For each part that was begun, the entries of the memory that it was carried out by: one, or two
             that were put together.
+        ended: The plan of each part that was ended.
         verdicts: For each part that was ended, whether it is seen to be done; None where that is not known.
         spent: For each part that was ended, attempts beyond the first, and when it ended, seconds since the
             episode began.
@@ -95,6 +100,7 @@ class EpisodeState:
     plan: Plan = NO_PLAN
     refused: Plan = NO_PLAN
     used: tuple[tuple[MemoryEntry, ...], ...] = ()
+    ended: tuple[Plan, ...] = ()
     verdicts: tuple[bool | None, ...] = ()
     spent: tuple[tuple[int, float], ...] = ()
     index: int = 0
@@ -130,9 +136,26 @@ class EpisodeState:
         return [one for part in self.parts[self.part + 1 :] for one in part]
 
     @property
+    def looked_at(self) -> list[str]:
+        """The objects that are looked at at the end of a part: of what it did, at the last one of all."""
+        outcomes = [one for plan in (self.plan, *self._left) for one in plan.entry.served_outcomes]
+        return list(dict.fromkeys(name for one in outcomes for name in one.objects))
+
+    @property
+    def _left(self) -> list[Plan]:
+        """At the last part, the plans of those before, with the outcomes that no later one was to change."""
+        left: list[Plan] = []
+        for i, plan in enumerate(self.ended if self.is_last_part else ()):
+            later = (*self.ended[i + 1 :], self.plan)
+            moved = {sub_task.target for other in later for sub_task in other.entry.key.sub_tasks}
+            kept = tuple(one for one in plan.entry.outcomes if moved.isdisjoint(one.objects))
+            left.append(replace(plan, entry=replace(plan.entry, outcomes=kept)))
+        return left
+
+    @property
     def succeeded(self) -> bool | None:
         """Whether the instruction is seen to be done; None before the end and where it is not seen."""
-        if self.status is Status.NO_PROGRESS:
+        if self.status is Status.NO_PROGRESS or (self.status is Status.DONE and False in self.verdicts):
             return False
         is_known = self.status is Status.DONE and all(verdict is True for verdict in self.verdicts)
         return self.verdict if is_known else None
@@ -153,7 +176,7 @@ class EpisodeState:
 
     def begin_next_part(self, time_s: float) -> None:
         """Turn to the next part, which has attempts and looks of its own, so long after the episode began."""
-        self.verdicts = (*self.verdicts, self.verdict)
+        self.ended, self.verdicts = (*self.ended, self.plan), (*self.verdicts, self.verdict)
         self.spent = (*self.spent, (self.attempts, time_s))
         self.part += 1
         self.attempts, self.looks_left, self.verdict = 0, LOOKS_AT_OUTCOME, None
@@ -164,3 +187,29 @@ class EpisodeState:
         done = {one.sub_task for one in self.plan.entry.served_outcomes} | self.followed
         is_all_known = done >= set(range(len(self.plan.entry.key.sub_tasks)))
         self.verdict = False if missed else (is_all_known or None)
+
+    def is_unsure(
+        self, poses: Mapping[str, Array], recognised: Collection[str], context: PlanningContext
+    ) -> bool:
+        """Whether a look did not tell if all is as it should be; arguments as of :meth:`take_up_again`."""
+        return any(plan.missed(poses, recognised, context) is None for plan in (self.plan, *self._left))
+
+    def take_up_again(
+        self, poses: Mapping[str, Array], recognised: Collection[str], context: PlanningContext
+    ) -> None:
+        """At the end of the last part, do one once more of which something is not where it was put any more.
+
+        A part that was done once more already has failed then.
+
+        Args:
+            poses: Where the objects are, ``T_world_obj`` ``(4, 4)`` by name.
+            recognised: Those that the last look recognised.
+            context: What is known of them.
+        """
+        for i, plan in enumerate(self._left):
+            if not plan.missed(poses, recognised, context):
+                continue
+            if sum(part is self.parts[i] for part in self.parts) == 1:
+                self.parts = (*self.parts, self.parts[i])
+                return
+            self.verdicts = (*self.verdicts[:i], False, *self.verdicts[i + 1 :])

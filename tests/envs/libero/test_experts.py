@@ -6,14 +6,13 @@ import pytest
 from lerobot_openspm.envs.libero.experts import EXPERTS, expert_actions
 from lerobot_openspm.envs.libero.long_tasks import LONG
 from lerobot_openspm.envs.libero.picks import OBJECT, SPATIAL
-from lerobot_openspm.envs.libero.simulator import LiberoSimulator, tasks
+from lerobot_openspm.envs.libero.simulator import MAX_STEPS, LiberoSimulator, tasks
 from lerobot_openspm.envs.seeds import TUNING_SEED_START
 from lerobot_openspm.geometry.se3 import yaw_of
 
 pytest.importorskip("libero.libero", reason="needs lerobot[libero]")
 pytestmark = pytest.mark.libero
 
-MAX_STEPS = 280
 # Five scenes of each goal task, which take two minutes in all.
 SEEDS = range(TUNING_SEED_START, TUNING_SEED_START + 5)
 
@@ -35,9 +34,10 @@ def steps_to_success(simulator: LiberoSimulator, seed: int) -> int | None:
 
 GOAL_TASKS = [task for task in EXPERTS if task not in {**SPATIAL, **OBJECT, **LONG}]
 # Of each other suite one in one scene; more take minutes.
-FIRST_PICKS = [next(iter(suite)) for suite in (SPATIAL, OBJECT)]
-PICKS = [
-    pytest.param(task, marks=() if task in FIRST_PICKS else pytest.mark.slow) for task in (*SPATIAL, *OBJECT)
+OTHERS = SPATIAL, OBJECT, LONG
+FIRST = [next(iter(suite)) for suite in OTHERS]
+OTHER_TASKS = [
+    pytest.param(task, marks=() if task in FIRST else pytest.mark.slow) for suite in OTHERS for task in suite
 ]
 
 
@@ -48,12 +48,12 @@ def test_every_task_has_an_expert():
     assert set(LONG) == set(tasks("libero_10"))
 
 
-@pytest.mark.parametrize("task", PICKS)
+@pytest.mark.parametrize("task", OTHER_TASKS)
 def test_expert_solves_a_scene_of_another_suite(task):
     simulator = make_simulator(task)
     steps = steps_to_success(simulator, TUNING_SEED_START)
     assert steps is not None
-    assert steps < MAX_STEPS
+    assert steps < simulator.max_steps
     simulator.close()
 
 
@@ -62,7 +62,7 @@ def test_expert_solves_its_task(task):
     simulator = make_simulator(task)
     steps = {seed: steps_to_success(simulator, seed) for seed in SEEDS}
     simulator.close()
-    slow = {seed: n for seed, n in steps.items() if n is None or n >= MAX_STEPS}
+    slow = {seed: n for seed, n in steps.items() if n is None or n >= MAX_STEPS["libero_goal"]}
     assert not slow, f"{task}: steps {slow}"
 
 
