@@ -68,7 +68,7 @@ def run(executor, world, n_steps=600, until=lambda _: False, flow=toward):
             left[passed] = world.T
         if again:
             retries += 1
-            executor.begin(executor.targets, world.hand, executor.contact_index())
+            executor.begin(executor.targets, world.hand, executor.contact_index(world.hand))
         if executor.state.status is not Status.RUNNING or until(executor):
             if executor.state.status is Status.DONE:
                 left[executor.state.index] = world.T
@@ -231,16 +231,28 @@ def test_a_hand_that_swings_about_a_key_pose_is_not_blocked():
         assert approach.is_blocked == is_blocked
 
 
-def test_a_retry_begins_at_the_first_approach_of_the_same_contact():
-    second = [key_pose("plate", hand_pose(0, 0, z), "approach") for z in (0.2, 0.1)]
+def test_a_retry_begins_on_the_approach_of_the_same_contact_where_the_hand_is_nearest():
+    second = [key_pose("plate", hand_pose(x, 0, z), "approach") for x, z in ((0.3, 0.4), (0, 0.2), (0, 0.12))]
     second.append(key_pose("plate", hand_pose(0, 0, 0.1), "grasp", closed=True))
     second.append(key_pose("plate", hand_pose(0, 0, 0.2), "place", closed=True))
     executor = make(key_poses=[*entry().key_poses, *second])
-    found = []
-    for index in range(12):
+    far, above, at = (Hand(executor.targets[i].T_world_ee, OPEN_WIDTH) for i in (8, 9, 11))
+    for index in range(13):
         executor.begin(executor.targets, Hand(HOME, OPEN_WIDTH), index)
-        found.append(executor.contact_index())
-    assert found == [0] * 8 + [8] * 4
+        found = [executor.contact_index(hand) for hand in (far, above, at)]
+        if index < 8:
+            assert set(found) <= {0, 1}
+        elif index < 10:  # it has not got to the grasp yet
+            assert found == [8, 8, 8]
+        else:  # the last key pose of the approach leaves no room to come down
+            assert found == [8, 9, 9]
+
+
+def test_a_retry_of_a_push_begins_at_its_first_approach():
+    poses = [key_pose("bowl", hand_pose(-0.1 * i, 0, 0.2 - 0.05 * i), "approach") for i in range(3)]
+    executor = make(key_poses=[*poses, key_pose("bowl", hand_pose(0.2, 0, 0.1), "push")])
+    executor.begin(executor.targets, Hand(HOME, OPEN_WIDTH), 3)
+    assert executor.contact_index(Hand(executor.targets[2].T_world_ee, 0.0)) == 0
 
 
 def test_the_open_loop_never_looks_at_the_hand():

@@ -54,8 +54,9 @@ def test_what_belongs_to_the_grasp_is_in_nobodys_way():
 
 
 def test_the_hand_is_back_where_it_was_shown_once_it_has_taken_hold():
-    moved = shifted(TARGETS, {0: 0.01})
+    moved = shifted(TARGETS, {0: 0.01}, {0: 0.004})
     apart = [se3.inverse(a.T_world_ee) @ b.T_world_ee for a, b in zip(TARGETS, moved, strict=True)]
     for target, T in zip(TARGETS, apart, strict=True):
         before = target.key_pose.phase in ("approach", "grasp")
-        assert np.allclose(T[:3, 3], [0.0, 0.01 if before else 0.0, 0.0])
+        depth = 0.004 if target.key_pose.phase == "grasp" else 0.0
+        assert np.allclose(T[:3, 3], [0.0, 0.01 if before else 0.0, depth])

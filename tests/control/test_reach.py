@@ -11,7 +11,7 @@ from tests.memory.builders import entry, hand_pose, key_pose, robot
 
 from lerobot_openspm.control import feasibility
 from lerobot_openspm.control.feasibility import MAX_JUMP_RAD, TransferLimits, find_stance
-from lerobot_openspm.control.plan import Plan
+from lerobot_openspm.control.plan import DEEPER_M, Plan
 from lerobot_openspm.control.transfer import RETREAT_M, transfer
 from lerobot_openspm.geometry import se3
 from lerobot_openspm.geometry.arm import load_arm
@@ -284,7 +284,7 @@ def test_a_grasp_that_the_hand_is_kept_from_is_tried_again_from_another_side(tur
     assert_allclose(np.rad2deg(turned), expected, atol=1e-4)
 
 
-def test_a_grasp_that_missed_is_tried_again_as_it_was():
+def test_what_slipped_out_is_grasped_again_as_it_was_but_deeper():
     shown = entry()
     perception = Perception(shown.object_poses)
     one = controller(shown, symmetries={"bowl": Symmetry(np.zeros(2), 0.0)})
@@ -294,4 +294,19 @@ def test_a_grasp_that_missed_is_tried_again_as_it_was():
     one.executor.begin(one.executor.targets, HAND, grasp + 1)
     watch(one, perception, Hand(before, 0.0), 1)
     assert one.state.attempts == 1
-    assert_allclose(one.executor.targets[grasp].T_world_ee, before, atol=1e-9)
+    deeper = before @ se3.transform(np.eye(3), [0.0, 0.0, DEEPER_M])
+    assert_allclose(one.executor.targets[grasp].T_world_ee, deeper, atol=1e-9)
+    as_shown = Plan(shown, shown.object_poses, HAND.T_world_ee)
+    lift = as_shown.targets(planning_context())[grasp + 1]
+    assert_allclose(one.executor.targets[grasp + 1].T_world_ee, lift.T_world_ee, atol=1e-9)
+
+
+def test_nothing_is_grasped_deeper_than_the_hand_may_go():
+    plan, context = Plan(entry(), entry().object_poses, HAND.T_world_ee), planning_context()
+    lowest = min(target.T_world_ee[2, 3] for target in plan.targets(context))
+    low, high = context.robot.workspace
+    own = replace(context.robot, workspace=np.array([[*low[:2], lowest], high]))
+    context = replace(context, robot=own, limits=TransferLimits(min_clearance_m=0.006))
+    once = plan.deepened(0, context)
+    assert once.deeper == {0: DEEPER_M}
+    assert once.deepened(0, context) is once

@@ -200,9 +200,7 @@ class EpisodeController:
     def _is_time_to_look(self, index_before: int) -> bool:
         target, scene = self.executor.target, self.scene
         is_paused = self.state.status is Status.PAUSED
-        if not self._is_tracking or target is None:
-            return False
-        if target.key_pose.dwell and not is_paused:
+        if not self._is_tracking or target is None or (target.key_pose.dwell and not is_paused):
             return False  # the fingers hide what they are around
         if scene.detections.faults:
             return True
@@ -226,7 +224,7 @@ class EpisodeController:
             is_pushing = target is not None and target.key_pose.phase == "push"
             if is_pushing and not executor.try_again("what is pushed was left behind"):
                 return
-            index = executor.contact_index()
+            index = executor.contact_index(hand)
             self._follow_objects(plan.objects(index, scene.altered), hand)
             self._begin(index, hand)
         elif changed := self._follow_objects([n for n in look.names if n not in look.held], hand):
@@ -281,18 +279,19 @@ class EpisodeController:
         state, executor, tracker = self.state, self.executor, self.scene.tracker
         executor.note_travel(hand)
         # With the object still in the hand only the way to its place is gone again.
-        is_carrying = bool(tracker.held) and executor.present.key_pose.phase == "place"
-        is_in_hand = is_carrying and not executor.has_lost_grip(hand)
-        index = executor.way_index() if is_in_hand else executor.contact_index()
+        present, has_slipped = executor.present.key_pose, executor.has_lost_grip(hand)
+        is_in_hand = bool(tracker.held) and present.phase == "place" and not has_slipped
+        index = executor.way_index() if is_in_hand else executor.contact_index(hand)
         state.plan = replace(state.plan, T_world_ee=hand.T_world_ee)
         if executor.was_kept_from_grasping(hand):
             state.plan = self._context.otherwise(state.plan)
+        elif has_slipped:
+            state.plan = state.plan.deepened(present.sub_task, self._context)
         if not self._is_tracking:
             self._begin(index, hand)
             return None
         # What should be in the hand is not, or what was to be met is not there: it may be anywhere.
-        attempted = executor.targets[index : state.index + 1]
-        places = {target.key_pose.anchor.place for target in attempted}
+        places = {one.key_pose.anchor.place for one in executor.targets[index : state.index + 1]}
         tracker.doubt(places - self.scene.altered, hand.T_world_ee)
         return self.scene.look(state.plan.objects(index, self.scene.altered), hand, back_to=index)
 

@@ -25,6 +25,8 @@ logger = logging.getLogger(__name__)
 
 # Corrections per key pose, and attempts beyond the first in a part of the instruction.
 MAX_CORRECTIONS, MAX_ATTEMPTS = 8, 3
+# A hand that is so far from where it takes hold of something can come down to it, metres.
+CLEAR_M = 0.04
 # An opening below this share of the demonstrated one, or this much less, metres, means that the fingers hold
 # nothing, or something else.
 HELD_SHARE, OTHER_OPENING_M = 0.4, 0.012
@@ -300,14 +302,27 @@ class Executor:
             index -= 1
         return index
 
-    def contact_index(self) -> int:
-        """The first key pose of the approach that the present one depends on."""
-        index = self.state.index
-        while index > 0 and self.targets[index].key_pose.phase != "approach":
-            index -= 1
-        while index > 0 and self.targets[index - 1].key_pose.phase == "approach":
-            index -= 1
-        return index
+    def contact_index(self, hand: Hand) -> int:
+        """The key pose of the approach that the present one depends on from which it is taken up again.
+
+        That is the first one; of the approach to a grasp the one that is nearest to the hand, of those that
+        leave the hand room to come down from.
+        """
+        contact = self.state.index
+        while contact > 0 and self.targets[contact].key_pose.phase != "approach":
+            contact -= 1
+        first = contact
+        while first > 0 and self.targets[first - 1].key_pose.phase == "approach":
+            first -= 1
+        grasp = self.targets[min(contact + 1, len(self.targets) - 1)]
+        if grasp.key_pose.phase != "grasp":
+            return first
+
+        def apart(i: int, T: Array) -> float:
+            return float(se3.distances(self.targets[i].T_world_ee, T)[0])
+
+        clear = [i for i in range(first, contact + 1) if apart(i, grasp.T_world_ee) > CLEAR_M]
+        return min(clear, key=lambda i: apart(i, hand.T_world_ee), default=first)
 
     def note_travel(self, hand: Hand) -> None:
         """Take in how far a drawer or a knob has moved that has to be taken hold of again."""

@@ -65,16 +65,19 @@ def _in_fingers(points: Array, shift: float, open_width: float) -> int:
     return int(((x < HALF_WIDTH_M) & (y < open_width / 2 + THICKNESS_M) & (z > FROM_M) & (z < TO_M)).sum())
 
 
-def shifted(targets: Sequence[Target], shifts: Mapping[int, float]) -> tuple[Target, ...]:
-    """The same key poses, with the hand to one side until it takes hold."""
+def shifted(
+    targets: Sequence[Target], shifts: Mapping[int, float], deeper: Mapping[int, float]
+) -> tuple[Target, ...]:
+    """The same key poses, with the hand to one side until it takes hold, and deeper as it does; metres."""
     taken: set[int] = set()
     found: list[Target] = []
     for target in targets:
-        pose = target.key_pose
-        if pose.sub_task in shifts and pose.sub_task not in taken and pose.phase in ("approach", "grasp"):
-            step = se3.transform(np.eye(3), np.array([0.0, shifts[pose.sub_task], 0.0]))
+        number, phase = target.key_pose.sub_task, target.key_pose.phase
+        if number not in taken and phase in ("approach", "grasp"):
+            depth = deeper.get(number, 0.0) if phase == "grasp" else 0.0
+            step = se3.transform(np.eye(3), np.array([0.0, shifts.get(number, 0.0), depth]))
             target = replace(target, T_world_ee=target.T_world_ee @ step)
-        if pose.phase == "grasp":
-            taken.add(pose.sub_task)
+        if phase == "grasp":
+            taken.add(number)
         found.append(target)
     return tuple(found)

@@ -43,6 +43,8 @@ RETREATS_M = (RETREAT_M, RETREAT_M / 2, 0.0)
 # Where something overhangs the place of what is carried, it is put down beside it by one of
 # these, metres, in one of so many directions; as long as the place has not moved by so much.
 ASIDE_M, ASIDE_DIRECTIONS, ASIDE_KEPT_M = (0.01, 0.02, 0.03), 12, 0.03
+# What slipped out of the fingers is taken hold of again so much deeper, metres.
+DEEPER_M = 0.004
 # Where an object is that was never seen.
 NOWHERE = se3.transform(np.eye(3), np.full(3, np.inf))
 
@@ -67,6 +69,7 @@ class Plan:
         around: How far it is turned where it is put on or in something round, radians.
         out: How far ``(3,)`` beside key poses the hand passes by, by their index, in the world, metres.
         shifts: How far the hand goes to one side as it takes hold, by sub-task, along its y axis, metres.
+        deeper: How much further the hand goes as it takes hold, by sub-task, along its z axis, metres.
         not_meant: By name, poses ``T_world_obj`` ``(4, 4)`` of others of its kind, which stand about.
     """
 
@@ -82,6 +85,7 @@ class Plan:
     around: float = 0.0
     out: Mapping[int, Array] = field(default_factory=dict[int, Array])
     shifts: Mapping[int, float] = field(default_factory=dict[int, float])
+    deeper: Mapping[int, float] = field(default_factory=dict[int, float])
     not_meant: Mapping[str, Sequence[Array]] = field(default_factory=dict[str, Sequence[Array]])
 
     def targets(
@@ -106,7 +110,7 @@ class Plan:
         if self.out:
             targets = tuple(_beside(target, self.out.get(i)) for i, target in enumerate(targets))
         targets = half_turned(targets) if self.is_half_turned else targets
-        return shifted(targets, self.shifts)
+        return shifted(targets, self.shifts, self.deeper)
 
     def symmetric_grasps(self, context: PlanningContext) -> dict[int, str]:
         """What is grasped to be carried and turns into itself, by sub-task; a handle is on one side only."""
@@ -161,6 +165,14 @@ class Plan:
         if any(metres >= ASIDE_KEPT_M for metres in went):
             plan = replace(plan, aside=(0.0, 0.0), around=0.0)
         return plan
+
+    def deepened(self, sub_task: int, context: PlanningContext) -> Plan:
+        """The plan that takes hold deeper of a load that slipped out, where the hand may go there."""
+        if sub_task not in self.entry.carried:
+            return self  # a handle is where it is
+        depth = self.deeper.get(sub_task, 0.0) + DEEPER_M
+        plan = replace(self, deeper={**self.deeper, sub_task: depth})
+        return self if plan.check(context, plan.targets(context)) else plan
 
     def as_if_in_place(
         self, object_poses: Mapping[str, Array], symmetries: Mapping[str, Symmetry]
