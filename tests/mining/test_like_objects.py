@@ -24,7 +24,7 @@ RIM = np.column_stack([0.05 * np.cos(ANGLES), 0.05 * np.sin(ANGLES), np.full(40,
 BOWL = replace(model("bowl"), points=RIM.astype(np.float32))
 NEAR, FAR = se3.from_yaw([0.1, -0.2, 0.0], 0.3), se3.from_yaw([0.1, 0.1, 0.0], 0.0)
 ELSEWHERE = se3.from_yaw([0.4, 0.4, 0.0], 0.0)
-BELOW = se3.from_yaw([0.1, -0.2, -0.04], 0.3)
+BELOW, LESS_BELOW = se3.from_yaw([0.1, -0.2, -0.04], 0.3), se3.from_yaw([0.1, -0.2, -0.035], 0.3)
 
 
 def seen(*places, status=None):
@@ -66,6 +66,8 @@ def test_other_objects_touches_tell_nothing():
         (seen(FAR), seen(FAR, NEAR), "grasp", (FAR, NEAR)),  # the hand went to another one
         (seen(NEAR), seen(FAR, NEAR), "grasp", (NEAR,)),
         (seen(BELOW), seen(NEAR), "grasp", (NEAR,)),  # it stands on something
+        (seen(FAR), seen(FAR, BELOW), "grasp", (FAR, BELOW)),  # it is grasped by a knob that is not known
+        (seen(BELOW), seen(LESS_BELOW), "grasp", (BELOW,)),  # hardly nearer
         (seen(FAR), seen(ELSEWHERE, FAR), "grasp", (FAR,)),  # there is none where the hand went
         (seen(FAR), seen(NEAR, status="not_found"), "grasp", (FAR,)),
         (seen(FAR, status="not_found"), seen(NEAR), "grasp", (NEAR,)),

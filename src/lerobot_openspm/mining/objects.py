@@ -47,8 +47,8 @@ FILMED_PER_TASK, FILMED, FILM_STEP = 10, 30, 4
 FRAMES_BEFORE_CONTACT = 4
 # What the hand takes hold of or pushes has its surface within this distance of the hand.
 TOUCH_M = 0.08
-# What is seen farther than this from where the hand grasped may be another one of the kind, or stand on
-# something else than it seems to, metres.
+# What is seen farther than this from where the hand grasped may be another of the kind, or stand on something
+# else; one that is nearer by as much is meant, metres.
 ASTRAY_M = 0.015
 # Where one of these is said, the hand lets go above the landmark.
 UPON = ("on", "in", "at")
@@ -187,7 +187,7 @@ def _of_several(sub_tasks: Sequence[Sequence[SubTask]]) -> set[str]:
 def detect_touched(
     scene: DemonstrationScene, objects: Mapping[str, KnownObject], segmenter: Segmenter | None = None
 ) -> dict[str, PoseEstimate]:
-    """Find objects in a first frame; where the hand grasped elsewhere, the one of the kind that stands there.
+    """Find objects in a first frame; where the hand grasped elsewhere, the one of the kind that is nearer.
 
     Args:
         scene: A demonstration, and where it touched what.
@@ -197,15 +197,16 @@ def detect_touched(
     first = {cue.name: cue for cue in reversed(scene.cues)}
     grasped = {name: cue for name, cue in first.items() if cue.kind == "grasp"}
 
-    def is_there(name: str, one: PoseEstimate) -> bool:
+    def off_m(name: str, one: PoseEstimate) -> float:
         gaps_m = _gaps_m(objects[name], _places(one), grasped[name])
-        return one.status != "not_found" and min(gaps_m) <= ASTRAY_M
+        return np.inf if one.status == "not_found" else min(gaps_m)
 
     estimates = detect(scene.views, objects, segmenter)
     told = {name: one for name, one in estimates.items() if name in grasped and len(objects[name].points)}
-    astray = [name for name, one in told.items() if not is_there(name, one)]
-    again = detect(scene.views, objects, segmenter, astray) if astray else {}
-    return {**estimates, **{name: again[name] for name in astray if is_there(name, again[name])}}
+    astray = {name: off_m(name, one) for name, one in told.items() if off_m(name, one) > ASTRAY_M}
+    again = detect(scene.views, objects, segmenter, list(astray)) if astray else {}
+    near = {name: max(ASTRAY_M, metres - ASTRAY_M) for name, metres in astray.items()}
+    return {**estimates, **{name: again[name] for name in astray if off_m(name, again[name]) <= near[name]}}
 
 
 def _ends(
