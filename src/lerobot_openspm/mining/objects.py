@@ -303,9 +303,8 @@ def simulator_poses(
     """
     found, ends, names = [], [], ()
     for item in mined:
-        first, last = (
-            demonstrations.simulator_poses(item.episode, frame) for frame in (0, len(item.episode) - 1)
-        )
+        frames = 0, len(item.episode) - 1
+        first, last = (demonstrations.simulator_poses(item.episode, frame) for frame in frames)
         names = tuple(first)
         nouns = sorted({name for sub_task in item.sub_tasks for name in sub_task.objects})
         targets = sorted({sub_task.target for sub_task in item.sub_tasks})
