@@ -183,6 +183,9 @@ FIGURES: dict[str, Figure] = {
     "memory": _figure("memory", MEMORY),
     "measurement_noise": _figure("measurement_noise", (*TABLETOP, *NOISE)),
     "measurement_noise_libero": _figure("measurement_noise", (*LIBERO, *NOISE), ON_LIBERO),
+    "libero_experts": _figure(
+        "libero.experts", (*RECORDING["libero"], *STAGES, *_benchmarks("libero/experts"))
+    ),
     **{name: _libero("run", *ERRORS, options=WHOLE_SUITE) for name in ("libero_goal", "libero_accuracy")},
     **{
         suite: _with(_libero("run", *ERRORS, options=f"--suite={suite} {WHOLE_SUITE}"), ARM)

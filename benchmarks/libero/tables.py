@@ -30,6 +30,10 @@ OTHERS = """# On LIBERO's other suites
 The same with at most 280 steps in libero_spatial and libero_object, and at most 520 in libero_10. What is
 called the same looks otherwise in each of the nine scenes of libero_10, and cameras and robot stand elsewhere
 in some: each scene is learned by itself, and one policy is joined of them."""
+DEMONSTRATIONS = """# LIBERO's demonstrations
+
+Of all scenes that were tried until ten demonstrations of each task were kept. One in which the expert does
+not reach the goal within the steps that LIBERO allows is not kept, and another scene is drawn."""
 HARNESS = """# The harness against lerobot-eval
 
 Episodes by LeRobot's own rollout and by the harness, which renders only when the policy looks, from the
@@ -108,7 +112,13 @@ def libero_sections() -> list[str]:
         section("From three demonstrations a task", [f"{one}_few_shot_3" for one in OTHER_SUITES], _by_suite),
     ]
     equal = section("The four suites", [f"{suite}_equality" for suite in SUITES], _equality)
-    return [*on_goal, *chapter(OTHERS, on_others), *chapter(HARNESS, [equal])]
+    shown = section("The experts", "libero_experts", _experts)
+    return [
+        *on_goal,
+        *chapter(OTHERS, on_others),
+        *chapter(DEMONSTRATIONS, [shown]),
+        *chapter(HARNESS, [equal]),
+    ]
 
 
 def _variant(result: Quoted) -> str:
@@ -255,6 +265,10 @@ def _accuracy(result: Quoted) -> str:
     tasks = zip(result["tasks"].items(), PAPER_MM, strict=True)
     rows = {task: {**row, "paper": mm} for (task, row), mm in tasks}
     return f"{objects}\n\n{grid(rows, {**columns, 'Paper, mm': 'paper'}, 'Task')}\n\n{note}"
+
+
+def _experts(result: Quoted) -> str:
+    return grid({**result["per_task"], "**all**": result}, STEPS, "Task")
 
 
 def _few_shot(results: list[Quoted]) -> str:
