@@ -41,6 +41,7 @@ OTHER_SIMULATOR = {
 # What a figure imports for types alone, or of which it uses only what keeps its folder, or reads a dataset.
 OF_FIGURE = {
     "keyposes_": (f"{PACKAGE}/cli/",),
+    "libero_experts": (f"{PACKAGE}/cli/",),
     "language": (f"{PACKAGE}/flow/", f"{PACKAGE}/perception/", f"{PACKAGE}/cli/"),
     "memory": (f"{PACKAGE}/perception/",),
     "calibration": (

@@ -27,11 +27,8 @@ def test_scenes_that_the_expert_did_not_solve_count(tmp_path: Path, monkeypatch:
     monkeypatch.setattr(experts, "dataset", dataset)
     monkeypatch.setattr(experts, "write", lambda _, told: told)
     told = experts.main(ExpertsConfig())
-    assert sorted(path.name for path in tmp_path.iterdir()) == [
-        "one_0,one_1,one_2",
-        "other_0,other_1",
-        "other_2",
-    ]
+    folders = sorted(path.name for path in tmp_path.iterdir())
+    assert folders == ["one_0,one_1,one_2", "other_0,other_1", "other_2"]
     assert list(told["per_task"]) == [f"{suite}_{i}" for suite in ("one", "other") for i in range(3)]
     assert (told["n"], told["success"], told["seed"]) == (6 * 3 + 3, 15 / 21, 5)
     first, last = told["per_task"]["one_0"], told["per_task"]["other_1"]
