@@ -34,6 +34,7 @@ NEAR_M = 0.05
 COMMON = (
     "input_features", "output_features", "state_layout", "action_layout", "rotation", "control_hz",
     "hand_radius_m", "perception", "segmenter", "name_embeddings", "lexicon", "conditioning", "chunk_size",
+    "n_action_steps", "num_inference_steps", "execution", "tracking", "reach_margin_m", "min_clearance_m",
 )  # fmt: skip
 
 

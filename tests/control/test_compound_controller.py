@@ -15,6 +15,8 @@ from tests.control.acting import (
     watch,
 )
 from tests.memory.builders import entry, hand_pose, key_pose
+from tests.memory.test_compound import BOX as BOX_IN_DRAWER
+from tests.memory.test_compound import drawer_entry
 
 from lerobot_openspm.control.controller import EpisodeController
 from lerobot_openspm.control.state import Status
@@ -177,6 +179,56 @@ def test_an_opened_drawer_looks_different_and_is_not_looked_for_again():
     assert not any("cabinet" in names for names in perception.asked)
     place = next(target for target in one.executor.targets if target.key_pose.phase == "place")
     assert_allclose(place.T_world_ee, cabinet @ place.key_pose.T_obj_ee)
+
+
+@pytest.mark.parametrize(
+    ("instruction", "n_parts"),
+    [
+        ("put the bowl in the top drawer, close the top drawer and put the box in the top drawer", 5),
+        ("close the top drawer, open the top drawer and close the top drawer", 3),
+        ("put the bowl on the plate, put the bowl on the box and put the bowl on the plate", 3),
+    ],
+)
+def test_what_was_done_already_is_done_to_the_same_thing_again(instruction: str, n_parts: int):
+    perception = Perception({**LAYOUT, "cabinet": se3.from_yaw([0.2, 0.2, 0.0], 0.3)})
+    closing, on_box = opening("close the top drawer of the cabinet"), entry("put the bowl on the box")
+    known = drawer_entry(), BOX_IN_DRAWER, closing, PLATE, on_box
+    one, hand = controller(*known, instruction=instruction), HAND
+    observe(one, HAND, perception)
+    assert len(one.state.parts) == n_parts
+    for _ in range(n_parts):
+        hand = finish_part(one, perception, hand)
+    assert one.state.status is Status.DONE, one.state.refusal
+
+
+def test_both_of_two_are_put_one_after_the_other():
+    class TwoBowls(Perception):
+        """Sees another bowl too."""
+
+        other = se3.from_yaw([-0.2, -0.2, 0.0], 0.0)
+
+        def _estimate(self, name):
+            estimate = super()._estimate(name)
+            return replace(estimate, others=(self.other,)) if name == "bowl" else estimate
+
+    beside = entry(
+        "put the bowl on the plate",
+        [
+            replace(pose, T_obj_ee=shifted(pose.T_obj_ee, 0.1)) if pose.anchor.place == "plate" else pose
+            for pose in PLATE.key_poses
+        ],
+        source="local/demos#3",
+    )
+    perception, one = TwoBowls(LAYOUT), controller(PLATE, beside, instruction="put both bowls on the plate")
+    observe(one, HAND, perception)
+    hand = finish_part(one, perception, HAND)
+    put, left = perception.object_poses["bowl"], perception.other
+    perception.object_poses["bowl"], perception.other = left, put
+    watch(one, perception, hand, LOOK_AGAIN_STEPS)
+    assert one.state.part == 1
+    assert_allclose(one.state.plan.object_poses["bowl"], left, atol=1e-6)
+    finish_part(one, perception, hand)
+    assert one.state.status is Status.DONE
 
 
 def test_what_an_opened_drawer_hides_is_not_lost():

@@ -182,7 +182,7 @@ def test_what_cannot_be_met_is_corrected_then_tried_again_then_given_up(monkeypa
     assert executor.state.status is Status.NO_PROGRESS
     assert executor.state.refusal.startswith("the hand does not get to the bowl: it stays ")
     assert retries == 2
-    assert executor.state.attempts == 3
+    assert executor.state.attempts == 2
     assert executor.next_action(world.hand)[:6].tolist() == [0.0] * 6
 
 

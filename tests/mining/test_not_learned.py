@@ -1,7 +1,9 @@
 """A contact is anchored to what it belongs to, or to nothing."""
 
+from collections.abc import Iterable
 from dataclasses import replace
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -76,13 +78,30 @@ def test_demonstrations_may_show_that_it_goes_along_with_another_object():
     assert consensus(beside_the_plate(6, 0.002), SUB_TASKS) == {}  # where nothing moves nothing is shown
 
 
+def episodes(numbers: Iterable[int]) -> tuple[Any, ...]:
+    """Demonstrations that are parts of the episodes with these numbers."""
+    said = "put the bowl on the plate"
+    return tuple(
+        SimpleNamespace(sub_tasks=SUB_TASKS, episode=SimpleNamespace(task=said, index=i)) for i in numbers
+    )
+
+
+def test_a_demonstration_of_two_things_is_one():
+    made = without("bowl", demonstrations(6))
+    task = MinedTask(episodes([0, 0, 1, 1, 2, 2]), tuple(made), consensus(made, SUB_TASKS), (), (), ())
+    mined = SimpleNamespace(tasks=[task], object_poses=[one.object_poses for one in made], surfaces=(),
+                            unlearned={"bowl": "it is grey"}, objects={}, simulator_objects=())  # fmt: skip
+    bowl, instruction = list_not_learned(mined)
+    assert str(bowl).startswith("'bowl' is handled in 3 demonstrations and could not be learned: it is grey")
+    assert str(instruction).startswith("'put the bowl on the plate' is not learned: none of its 3 demonstr")
+
+
 @pytest.mark.parametrize(
     ("n", "words"), [(6, "kept relative to the plate, with which it goes along"), (2, "")]
 )
 def test_it_is_said_what_a_contact_is_kept_relative_to_instead(n: int, words: str):
     made = beside_the_plate(n, 0.2)
-    episode = SimpleNamespace(sub_tasks=SUB_TASKS, episode=SimpleNamespace(task="put the bowl on the plate"))
-    task = MinedTask((episode,), tuple(made), consensus(made, SUB_TASKS), (), (), ())
+    task = MinedTask(episodes(range(n)), tuple(made), consensus(made, SUB_TASKS), (), (), ())
     mined = SimpleNamespace(tasks=[task], object_poses=[one.object_poses for one in made], surfaces=(),
                             unlearned={"bowl": "it is grey"}, objects={}, simulator_objects=())  # fmt: skip
     (bowl, *_) = list_not_learned(mined)
@@ -92,8 +111,7 @@ def test_it_is_said_what_a_contact_is_kept_relative_to_instead(n: int, words: st
 
 def test_it_is_said_of_what_the_hand_never_touched_too():
     made = beside_the_plate(6, 0.2)
-    episode = SimpleNamespace(sub_tasks=SUB_TASKS, episode=SimpleNamespace(task="put the bowl on the plate"))
-    task = MinedTask((episode,), tuple(made), consensus(made, SUB_TASKS), (), (), ())
+    task = MinedTask(episodes(range(6)), tuple(made), consensus(made, SUB_TASKS), (), (), ())
     mined = SimpleNamespace(tasks=[task], object_poses=[one.object_poses for one in made], surfaces=(),
                             unlearned={}, objects={}, simulator_objects=())  # fmt: skip
     (bowl,) = list_not_learned(mined)
@@ -105,9 +123,8 @@ def test_it_is_said_of_what_the_hand_never_touched_too():
 @pytest.mark.parametrize("n_found", [2, 5])
 def test_demonstrations_that_do_not_show_what_is_known_are_told_as_left_out(n_found: int):
     made = without("bowl", demonstrations(6), n_found)
-    episode = SimpleNamespace(sub_tasks=SUB_TASKS, episode=SimpleNamespace(task="put the bowl on the plate"))
     anchors = consensus(demonstrations(6), SUB_TASKS)
-    task = MinedTask((episode,), tuple(made), anchors, (), (), ())
+    task = MinedTask(episodes(range(6)), tuple(made), anchors, (), (), ())
     mined = SimpleNamespace(tasks=[task], object_poses=[one.object_poses for one in made], surfaces=(),
                             unlearned={}, objects={"bowl": object()}, simulator_objects=())  # fmt: skip
     (told,) = list_not_learned(mined)

@@ -183,6 +183,8 @@ def test_what_cannot_be_joined_is_named_and_nothing_is_written(checkpoint: Path,
         ("hand_radius_m", 0.05),
         ("lexicon", '{"synonyms": {"bowl": ["tureen"]}}'),
         ("name_embeddings", "somebody/model"),
+        ("execution", "open_loop"),
+        ("tracking", False),
     ):
         other = Path(shutil.copytree(checkpoint, tmp_path / name))
         (other / "config.json").write_text(json.dumps({**config, name: value}))

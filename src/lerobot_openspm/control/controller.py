@@ -131,7 +131,7 @@ class EpisodeController:
             except InstructionError as error:
                 return self._refuse(error)
             state.T_start = hand.T_world_ee
-            scene.ground(state.parts[0], state.ahead)
+            scene.ground(state.parts[0], state.next_part)
         ahead = [one.entry for part in state.parts[state.part :] for one in part]
         names = dict.fromkeys([*context.objects_of_interest(ahead), *scene.grounding.landmarks])
         return scene.look([name for name in names if name not in scene.altered], hand)
@@ -344,6 +344,6 @@ class EpisodeController:
             return None
         self.executor.stop(Status.WAITING)
         state.begin_next_part(self.scene.time_s)
-        self.scene.ground(state.parts[state.part], state.ahead, hand)
+        self.scene.ground(state.parts[state.part], state.next_part, hand)
         logger.info("%r: part %d of %d", self.instruction, state.part + 1, len(state.parts))
         return self._look_for_plan(hand)

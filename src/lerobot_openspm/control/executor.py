@@ -281,14 +281,14 @@ class Executor:
 
     def try_again(self, why: str) -> bool:
         """Count another attempt at the present part; without one left there is no progress."""
-        self.state.attempts += 1
         key_pose, is_at_end = self.present.key_pose, self.state.status is Status.DONE
         phase = "close" if self.present.until_stopped else key_pose.phase
-        if self.state.attempts > MAX_ATTEMPTS:
+        if self.state.attempts == MAX_ATTEMPTS:
             self.stop(Status.NO_PROGRESS)
             self.state.refusal = why if is_at_end else why_given_up(phase, key_pose.anchor.place, why)
             logger.info("giving up at key pose %d: %s", self.state.index, self.state.refusal)
             return False
+        self.state.attempts += 1
         logger.info("trying key pose %d (%s) again: %s", self.state.index, phase, why)
         return True
 

@@ -80,13 +80,17 @@ class SceneState:
         self.tracker.predict(self._context.step_s)
 
     def ground(
-        self, candidates: Sequence[Candidate], ahead: Sequence[Candidate] = (), hand: Hand | None = None
+        self,
+        candidates: Sequence[Candidate],
+        following: Sequence[Candidate] = (),
+        hand: Hand | None = None,
     ) -> None:
         """Take in which of several like objects a part of the instruction is about.
 
         Args:
             candidates: What the part can be carried out by.
-            ahead: What the parts after it can be.
+            following: What the part after it can be. Where both ask for the same, as of "both bowls", there
+                are several of what they are about.
             hand: Where the hand is, at the end of the part before; None where there is none.
         """
         targets = {one.entry.key.sub_tasks[0].target for one in candidates}
@@ -98,7 +102,7 @@ class SceneState:
         alike = {
             known.target
             for one in candidates
-            for other in ahead
+            for other in following
             for asked, known in zip(one.asked, one.entry.key.sub_tasks, strict=False)
             if asked in other.asked and not asked.words
         }

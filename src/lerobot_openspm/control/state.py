@@ -131,9 +131,9 @@ class EpisodeState:
         return self.part + 1 >= len(self.parts)
 
     @property
-    def ahead(self) -> list[Candidate]:
-        """What the parts after the present one can be carried out by."""
-        return [one for part in self.parts[self.part + 1 :] for one in part]
+    def next_part(self) -> tuple[Candidate, ...]:
+        """What the part after the present one can be carried out by; nothing after the last one."""
+        return () if self.is_last_part else self.parts[self.part + 1]
 
     @property
     def looked_at(self) -> list[str]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections import Counter, defaultdict
+from collections import defaultdict
 
 from lerobot_openspm.memory.not_learned import MAX_RECORDS, NotLearned, not_learned
 from lerobot_openspm.mining.anchors import Demonstration, contact_roles, roles, suggested_anchor
@@ -29,23 +29,28 @@ def list_not_learned(mined: MinedDataset) -> tuple[NotLearned, ...]:
 
     At most :data:`MAX_RECORDS` of them.
     """
-    handled, lost, instructions = Counter[str](), Counter[str](), list[NotLearned]()
-    stand_ins = defaultdict[str, set[str]](set)
+    # By object, numbers of the episodes: one that puts two things is two demonstrations here, see `divided`.
+    handled, lost = defaultdict[str, set[int]](set), defaultdict[str, set[int]](set)
+    stand_ins, instructions = defaultdict[str, set[str]](set), list[NotLearned]()
     for task in mined.tasks:
+        numbers = [one.episode.index for one in task.episodes]
         missing = [missing_objects(one, task) for one in task.aligned]
-        for demonstration, own in zip(task.aligned, missing, strict=True):
+        for number, demonstration, own in zip(numbers, task.aligned, missing, strict=True):
             anchors = _anchors_of_handled(demonstration, task)
-            handled.update(anchors.keys() | own)
-            lost.update(own)
+            for name in anchors.keys() | own:
+                handled[name].add(number)
+            for name in own:
+                lost[name].add(number)
             for name, places in anchors.items():
                 stand_ins[name] |= places - {name}
         if all(missing):
             named = " and ".join(map(repr, sorted(frozenset[str]().union(*missing))))
             why = f"what they handle is not known: {named}"
-            instructions.append(not_learned("instruction", task.episodes[0].episode.task, len(missing), why))
+            said, count = task.episodes[0].episode.task, len(set(numbers))
+            instructions.append(not_learned("instruction", said, count, why))
     found = frozenset[str]().union(*mined.object_poses)
     objects: list[NotLearned] = []
-    for name, count in sorted(handled.items()):
+    for name, episodes in sorted(handled.items()):
         if name in mined.surfaces:
             continue
         is_known = name in mined.objects or bool(mined.simulator_objects)
@@ -53,12 +58,12 @@ def list_not_learned(mined: MinedDataset) -> tuple[NotLearned, ...]:
             why = mined.unlearned.get(name, UNTOUCHED)
             if marks := " and the ".join(sorted(stand_ins[name])):
                 why += f"; what the hand does there is kept relative to the {marks}, with which it goes along"
-            objects.append(not_learned("object", name, count, why))
-        elif lost[name] and not is_known:
-            objects.append(not_learned("object", name, count, UNTOUCHED))
-        elif lost[name]:
+            objects.append(not_learned("object", name, len(episodes), why))
+        elif name in lost and not is_known:
+            objects.append(not_learned("object", name, len(episodes), UNTOUCHED))
+        elif name in lost:
             why = "the first picture does not show it clearly"
-            objects.append(not_learned("demonstrations", name, lost[name], why))
+            objects.append(not_learned("demonstrations", name, len(lost[name]), why))
     return (*objects, *instructions)[:MAX_RECORDS]
 
 
