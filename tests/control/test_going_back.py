@@ -283,6 +283,13 @@ def test_what_a_later_part_knocked_away_is_put_back():
     finish(one, perception, 0.0)
     assert (one.state.part, one.state.verdicts) == (1, (True,))
     finish(one, perception, 0.3)
+    assert (one.state.part, one.state.status, one.state.index) == (
+        1,
+        Status.RUNNING,
+        len(one.executor.targets) - 1,
+    )
+    assert one.executor.present.T_world_ee[2, 3] == HAND.T_world_ee[2, 3], "first the hand rises"
+    finish(one, perception, 0.3)
     assert (one.state.part, one.state.status, one.state.succeeded) == (2, Status.RUNNING, None)
     assert {target.key_pose.anchor.place for target in one.executor.targets} == {"bowl", "plate"}
     bowl = perception.object_poses["bowl"]
@@ -310,7 +317,9 @@ def test_of_two_things_that_knock_each_other_away_each_is_put_back_once():
     for bowl, box, part in (
         (plate, object_poses["box"], 1),
         (plate, stove, 2),
+        (plate @ away, stove, 2),  # the hand rises
         (plate @ away, stove, 3),
+        (plate, stove @ away, 3),
         (plate, stove @ away, 4),
         (plate @ away, stove, 4),
     ):

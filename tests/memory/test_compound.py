@@ -207,6 +207,21 @@ def test_which_of_two_drawers_a_box_goes_into_is_asked_back_before_one_is_opened
     assert drawers == ("middle drawer", "middle drawer")
 
 
+def test_a_microwave_is_opened_before_something_goes_in_and_a_stove_is_not_turned_on():
+    T = hand_pose(0.15, 0.0, 0.1)
+    for thing, done, phase, relation, expected in (
+        ("microwave", "open", "open", "in", ["open", "put"]),
+        ("stove", "turn on", "turn", "on", ["put"]),
+    ):
+        phases = ((phase, True), ("release", False), ("retreat", False))
+        first = [key_pose(thing, T, "grasp", True), *(key_pose(thing, T, *one) for one in phases)]
+        second = [replace(pose, sub_task=1) for pose in pick_and_place("mug", thing)]
+        said = f"put the mug {relation} the {thing}"
+        poses = {"mug": np.eye(4), thing: np.eye(4)}
+        whole = entry(f"{done} the {thing} and {said}", [*first, *second], poses)
+        assert operations(said, whole) == expected
+
+
 def test_what_was_closed_is_opened_again_before_something_goes_in():
     known = (
         drawer_entry(),

@@ -125,13 +125,13 @@ class EpisodeController:
         state, scene, context = self.state, self.scene, self._context
         if not state.parts:
             try:
-                asked = read_instruction(self.instruction, context.entries, context.names)
-                rest = context.entries, context.names, context.looks
-                state.parts = plan_parts(self.instruction, asked, *rest)
+                known = context.entries, context.names
+                asked = read_instruction(self.instruction, *known)
+                state.parts = plan_parts(self.instruction, asked, *known, context.looks)
             except InstructionError as error:
                 return self._refuse(error)
             state.T_start = hand.T_world_ee
-            scene.ground(state.parts[0], state.next_part)
+            scene.ground(state.parts, 0)
         ahead = [one.entry for part in state.parts[state.part :] for one in part]
         names = dict.fromkeys([*context.objects_of_interest(ahead), *scene.grounding.landmarks])
         return scene.look([name for name in names if name not in scene.altered], hand)
@@ -171,9 +171,8 @@ class EpisodeController:
 
     def _targets(self) -> tuple[Target, ...]:
         """The key poses of the plan in the scene."""
-        state = self.state
-        targets = state.plan.targets(self._context, state.gone)
-        return targets if state.is_last_part else (*targets, *rise(targets[-1], state.T_start))
+        targets = self.state.plan.targets(self._context, self.state.gone)
+        return targets if self.state.is_last_part else (*targets, *rise(targets[-1], self.state.T_start))
 
     # Following the plan.
 
@@ -322,6 +321,9 @@ class EpisodeController:
         if missed:
             return self._mend(missed[0], hand)
         state.take_up_again(*seen)
+        n_passed, targets = len(self.executor.targets), self._targets()
+        if len(targets) > n_passed:  # it is the last part no more
+            return self.executor.begin(targets, hand, n_passed)
         return self._end_part(hand)
 
     def _mend(self, missed: Outcome, hand: Hand) -> None:
@@ -331,8 +333,7 @@ class EpisodeController:
         if not self.executor.try_again(f"the {missed.target} is not where it should be"):
             return
         state.looks_left, state.verdict = LOOKS_AT_OUTCOME, None
-        poses = state.plan.entry.key_poses
-        index = next(i for i, pose in enumerate(poses) if pose.sub_task == missed.sub_task)
+        index = state.plan.begin_of(missed.sub_task)
         self._follow_objects(state.plan.objects(index, self.scene.altered), hand)
         self._begin(index, hand)
 
@@ -344,6 +345,6 @@ class EpisodeController:
             return None
         self.executor.stop(Status.WAITING)
         state.begin_next_part(self.scene.time_s)
-        self.scene.ground(state.parts[state.part], state.next_part, hand)
+        state.rename(self.scene.ground(state.parts, state.part, hand))
         logger.info("%r: part %d of %d", self.instruction, state.part + 1, len(state.parts))
         return self._look_for_plan(hand)

@@ -40,6 +40,17 @@ def references(candidate: Candidate, object_meant: Callable[[str], str]) -> dict
     return said
 
 
+def asked_of_both(candidates: Sequence[Candidate], *others: Sequence[Candidate]) -> frozenset[str]:
+    """Names of the objects that a part of the instruction and another one ask the same of."""
+    return frozenset(
+        known.target
+        for one in candidates
+        for other in (one for part in others for one in part)
+        for asked, known in zip(one.asked, one.entry.key.sub_tasks, strict=True)
+        if asked in other.asked and not asked.words
+    )
+
+
 def demonstrations(
     candidates: Sequence[Candidate], object_meant: Callable[[str], str], known: Collection[str]
 ) -> dict[str, tuple[Mapping[str, Array], ...]]:
@@ -84,6 +95,9 @@ class Grounding:
         not_meant: By name, poses ``T_world_obj`` ``(4, 4)`` of the others of its kind.
         several: Names of which the instruction is about several: any of them will do, each once.
         done: By such a name, poses ``T_world_obj`` ``(4, 4)`` of those that were seen to already.
+        words: What all parts of the instruction say of where objects are.
+        instances: By name, poses ``T_world_obj`` ``(4, 4)`` of all that were there when words without a
+            landmark told them from each other, where they are now as far as that is known.
     """
 
     said: Mapping[str, Reference] = field(default_factory=dict[str, Reference])
@@ -96,6 +110,9 @@ class Grounding:
     not_meant: dict[str, tuple[Array, ...]] = field(default_factory=dict[str, tuple[Array, ...]])
     several: frozenset[str] = frozenset()
     done: dict[str, list[Array]] = field(default_factory=dict[str, list[Array]])
+    words: frozenset[tuple[str, Reference]] = frozenset()
+    instances: dict[str, list[Array]] = field(default_factory=dict[str, list[Array]])
+    _which: dict[tuple[str, Reference], int] = field(default_factory=dict[tuple[str, Reference], int])
     _told: set[str] = field(default_factory=set[str])
 
     @property
@@ -104,22 +121,45 @@ class Grounding:
         marks = [name for one in self.said.values() for name in one.landmarks]
         return tuple(dict.fromkeys([*marks, *(k for own in self.shown.values() for one in own for k in one)]))
 
+    @property
+    def told_apart(self) -> frozenset[str]:
+        """Names of the objects that the instruction tells from others of their kind."""
+        ahead = {name for name, where in self.words if not where.landmarks}
+        return self.several | self.said.keys() | ahead
+
     def hear(
-        self, said: Mapping[str, Reference], shown: Mapping[str, Sequence[Mapping[str, Array]]] | None = None
+        self,
+        said: Mapping[str, Reference],
+        shown: Mapping[str, Sequence[Mapping[str, Array]]] | None = None,
+        object_poses: Mapping[str, Array] | None = None,
     ) -> frozenset[str]:
         """Take in what a part of the instruction says; the names that mean another object from now on.
 
         Args:
             said: By name, where the instruction says that the object is.
             shown: As :func:`demonstrations` gives it.
+            object_poses: Where those that were meant so far are by now, ``T_world_obj`` ``(4, 4)`` by name.
         """
         changed = frozenset(name for name in said if name in self.said and self.said[name] != said[name])
+        left: Mapping[str, Array] = object_poses or {}
+        for name in changed & left.keys():
+            if (number := self._which.get((name, self.said[name]))) is not None:
+                self.instances[name][number] = left[name]
         self.said = {**self.said, **said}
         kept = {name: one for name, one in self.shown.items() if name not in said}
         self.shown = {**kept, **(shown or {})}
         self.not_meant = {name: T for name, T in self.not_meant.items() if name not in changed}
+        for name in changed:
+            if (number := self._which.get((name, said[name]))) is not None:
+                places = self.instances[name]
+                self.not_meant[name] = (*places[:number], *places[number + 1 :])
         self._told -= changed
         return changed
+
+    def first_of(self, name: str) -> None:
+        """Several are meant from now on, and none of them was seen to."""
+        self.done.pop(name, None)
+        self.not_meant.pop(name, None)
 
     def next_of(self, name: str, T_world_obj: Array) -> None:
         """One of several has been seen to and is where it was left ``(4, 4)``; another one is meant now."""
@@ -155,6 +195,7 @@ class Grounding:
         if estimate.status == "not_found" or not estimate.others:
             return self._unless_elsewhere(name, estimate, known, still)
         candidates = (estimate.T_world_obj, *estimate.others)
+        self._tell_apart(name, candidates)
         index = self._told_from(name, candidates, known, still)
         if index is None:
             where = self.said.get(name, "nothing")
@@ -176,6 +217,16 @@ class Grounding:
             return replace(estimate, status="not_found")
         self.not_meant[name] = (*done, *left[1:])
         return replace(estimate, status="found", T_world_obj=left[0], others=())
+
+    def _tell_apart(self, name: str, candidates: Sequence[Array]) -> None:
+        """Settle which one each part means by words that need no landmark: later they stand otherwise."""
+        if name in self.instances:
+            return
+        standing = [self._foot(name, T) for T in candidates]
+        for said in (where for other, where in self.words if other == name and not where.landmarks):
+            if (number := choose(said, standing, {})) is not None:
+                self.instances[name] = list(candidates)
+                self._which[name, said] = number
 
     def _told_from(
         self, name: str, candidates: Sequence[Array], known: Mapping[str, Array], still: Mapping[str, Array]

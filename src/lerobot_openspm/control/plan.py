@@ -279,6 +279,10 @@ class Plan:
         own = [pose for pose in ahead if pose.sub_task == ahead[0].sub_task]
         return {pose.anchor.place for pose in own if pose.phase in ("approach", "grasp")}
 
+    def begin_of(self, sub_task: int) -> int:
+        """The first key pose of a sub-task."""
+        return next(i for i, pose in enumerate(self.entry.key_poses) if pose.sub_task == sub_task)
+
     def sub_task(self, pose: MemoryKeyPose) -> SubTask:
         """The sub-task that a key pose serves."""
         return self.entry.key.sub_tasks[pose.sub_task]

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from lerobot_openspm.control.grounding import Grounding, demonstrations, references
+from lerobot_openspm.control.grounding import Grounding, asked_of_both, demonstrations, references
 from lerobot_openspm.control.plan import Plan
 from lerobot_openspm.control.planning import PlanningContext
 from lerobot_openspm.control.reasons import are_around_something, why_missing
@@ -23,6 +23,8 @@ LOOK_AGAIN_S = 0.25
 SECOND_LOOK_S = 0.15
 # Without a sound picture of every camera the hand goes on for BLIND_S, then holds still, then gives up.
 BLIND_S, GIVE_UP_S = 0.5, 2.0
+# Of what is opened or turned, a drawer, a door or a knob goes along with the hand, and the rest stays.
+PART_MOVES = frozenset({"open", "close", "turn on", "turn off"})
 # A hand that has gone this far beyond where it meets what it pushes has lost it. Where that point is not
 # known: a hand that has moved this much further than the object, and this much away from it.
 LEFT_BEHIND_M, OUTRUN_M = 0.025, 0.06
@@ -60,7 +62,7 @@ class SceneState:
         tracker: Follows every object that was looked for.
         grounding: Which of several like objects is meant.
         detections: What the last look brought of the objects that are meant.
-        altered: Objects that were opened or turned: they look different now, and stand still.
+        altered: Objects that were opened, closed or turned: they look different now, and stand still.
     """
 
     def __init__(self, context: PlanningContext):
@@ -80,39 +82,37 @@ class SceneState:
         self.tracker.predict(self._context.step_s)
 
     def ground(
-        self,
-        candidates: Sequence[Candidate],
-        following: Sequence[Candidate] = (),
-        hand: Hand | None = None,
-    ) -> None:
+        self, parts: Sequence[Sequence[Candidate]], number: int, hand: Hand | None = None
+    ) -> frozenset[str]:
         """Take in which of several like objects a part of the instruction is about.
 
+        Two parts that follow each other and ask for the same, as those of "both bowls" do, are about several.
+
         Args:
-            candidates: What the part can be carried out by.
-            following: What the part after it can be. Where both ask for the same, as of "both bowls", there
-                are several of what they are about.
+            parts: What each part of the instruction can be carried out by.
+            number: The part that is turned to, from 0.
             hand: Where the hand is, at the end of the part before; None where there is none.
+
+        Returns:
+            Names that mean another object from now on.
         """
-        targets = {one.entry.key.sub_tasks[0].target for one in candidates}
-        if hand is not None:
-            poses = self.tracker.poses(hand.T_world_ee)
-            for name in targets & self.grounding.several & poses.keys():
-                self.grounding.next_of(name, poses[name])
-                self.tracker.forget(frozenset({name}))
-        alike = {
-            known.target
-            for one in candidates
-            for other in following
-            for asked, known in zip(one.asked, one.entry.key.sub_tasks, strict=False)
-            if asked in other.asked and not asked.words
-        }
-        self.grounding.several |= alike
-        meant = self._context.object_meant
-        said = {k: where for one in candidates for k, where in references(one, meant).items()}
+        candidates, grounding, meant = parts[number], self.grounding, self._context.object_meant
+        poses = {} if hand is None else self.tracker.poses(hand.T_world_ee)
+        again = asked_of_both(candidates, parts[number - 1]) if number else frozenset[str]()
+        first = asked_of_both(candidates, *parts[number + 1 : number + 2]) - again
+        grounding.several = again | first
+        for name in again & poses.keys():
+            grounding.next_of(name, poses[name])
+        for name in first:
+            grounding.first_of(name)
+        told = [[references(one, meant) for one in part] for part in parts]
+        grounding.words = frozenset(said for part in told for own in part for said in own.items())
+        said = {name: where for own in told[number] for name, where in own.items()}
         known = set(self._context.yaw_periods) - set(self._context.surfaces)
-        others = self.grounding.hear(said, demonstrations(candidates, meant, known))
-        self.tracker.forget(others)
+        others = grounding.hear(said, demonstrations(candidates, meant, known), poses)
+        self.tracker.forget(others | grounding.several)
         self.altered -= others
+        return others
 
     @property
     def time_s(self) -> float:
@@ -123,7 +123,7 @@ class SceneState:
         """A look for some objects, now."""
         expected = self.tracker.poses(hand.T_world_ee)
         held = self.tracker.held & frozenset(names)
-        told_apart = (frozenset(self.grounding.said) | self.grounding.several) & frozenset(names)
+        told_apart = self.grounding.told_apart & frozenset(names)
         displaced = frozenset(self.tracker.displaced)
         is_unknown = not self.tracker.held and not expected.keys() >= frozenset(names)
         is_loaded = is_unknown and are_around_something(hand, self._context.robot)
@@ -202,7 +202,11 @@ class SceneState:
         if is_carried:
             self.tracker.hold(pose.anchor.place, hand.T_world_ee)
         elif is_pushed:
-            self.tracker.hold(plan.sub_task(after.key_pose).target, hand.T_world_ee)
+            pushing = plan.sub_task(after.key_pose)
+            if pushing.operation in PART_MOVES:
+                self.altered.add(pushing.target)
+            else:
+                self.tracker.hold(pushing.target, hand.T_world_ee)
         elif pose.phase == "release" or pose.phase == "push" != phase_after:
             self.tracker.release(self.tracker.held, hand.T_world_ee)
         elif pose.phase in ("open", "turn"):

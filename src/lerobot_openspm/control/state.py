@@ -58,6 +58,12 @@ TRANSITIONS: dict[Status, frozenset[Status]] = {
 }
 
 
+def _without_outcomes(plan: Plan, names: Collection[str]) -> Plan:
+    """A plan without the outcomes that are about some objects."""
+    kept = tuple(one for one in plan.entry.outcomes if not set(names).intersection(one.objects))
+    return replace(plan, entry=replace(plan.entry, outcomes=kept))
+
+
 @dataclass
 class EpisodeState:
     """What is being done in one episode. The controller and its executor change it, and keep no copies.
@@ -131,11 +137,6 @@ class EpisodeState:
         return self.part + 1 >= len(self.parts)
 
     @property
-    def next_part(self) -> tuple[Candidate, ...]:
-        """What the part after the present one can be carried out by; nothing after the last one."""
-        return () if self.is_last_part else self.parts[self.part + 1]
-
-    @property
     def looked_at(self) -> list[str]:
         """The objects that are looked at at the end of a part: of what it did, at the last one of all."""
         outcomes = [one for plan in (self.plan, *self._left) for one in plan.entry.served_outcomes]
@@ -143,14 +144,23 @@ class EpisodeState:
 
     @property
     def _left(self) -> list[Plan]:
-        """At the last part, the plans of those before, with the outcomes that no later one was to change."""
-        left: list[Plan] = []
+        """At the last part, the plans of those before, with the outcomes that no later one was to change.
+
+        What is done once more changes nothing but its own: what was put upon it has to be there again.
+        """
+        left, plans = list[Plan](), (*self.ended, self.plan)
         for i, plan in enumerate(self.ended if self.is_last_part else ()):
-            later = (*self.ended[i + 1 :], self.plan)
+            later = [
+                plans[j]
+                for j in range(i + 1, len(plans))
+                if self.parts[j] is self.parts[i] or not self._is_done_once_more(j)
+            ]
             moved = {sub_task.target for other in later for sub_task in other.entry.key.sub_tasks}
-            kept = tuple(one for one in plan.entry.outcomes if moved.isdisjoint(one.objects))
-            left.append(replace(plan, entry=replace(plan.entry, outcomes=kept)))
+            left.append(_without_outcomes(plan, moved))
         return left
+
+    def _is_done_once_more(self, part: int) -> bool:
+        return any(self.parts[part] is one for one in self.parts[:part])
 
     @property
     def succeeded(self) -> bool | None:
@@ -182,6 +192,10 @@ class EpisodeState:
         self.attempts, self.looks_left, self.verdict = 0, LOOKS_AT_OUTCOME, None
         self.gone, self.followed = {}, set()
 
+    def rename(self, others: Collection[str]) -> None:
+        """Names mean other objects from now on: of these nobody can tell any more where parts left them."""
+        self.ended = tuple(_without_outcomes(plan, others) for plan in self.ended)
+
     def judge(self, missed: Sequence[Outcome]) -> None:
         """Take in which outcomes are missed. The others, and handles that went all the way, are done."""
         done = {one.sub_task for one in self.plan.entry.served_outcomes} | self.followed
@@ -210,6 +224,6 @@ class EpisodeState:
             if not plan.missed(poses, recognised, context):
                 continue
             if sum(part is self.parts[i] for part in self.parts) == 1:
-                self.parts = (*self.parts, self.parts[i])
+                self.parts, self.looks_left = (*self.parts, self.parts[i]), LOOKS_AT_OUTCOME
                 return
             self.verdicts = (*self.verdicts[:i], False, *self.verdicts[i + 1 :])

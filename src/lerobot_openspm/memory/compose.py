@@ -173,7 +173,9 @@ def _done_before(one: Candidate) -> SubTask | None:
     """What the demonstration of a candidate did last with the place where it puts something."""
     put, shown = one.entry.key.sub_tasks[0], one.sources[-1].key.sub_tasks
     own = next((i for i, other in enumerate(shown) if _place(other) == _place(put)), 0)
-    before = [other for other in shown[:own] if put.part and _place(put) == (other.target, other.part)]
+    there = [other for other in shown[:own] if _place(put) == (other.target, other.part)]
+    # A stove that was turned on is not needed for what is put there, a microwave that was opened is.
+    before = [other for other in there if put.part or other.operation == "open"]
     return before[-1] if before else None
 
 
@@ -242,7 +244,7 @@ def _longest_run(
         run = tuple(asked[:n_sub_tasks])
         with suppress(InstructionError):
             found = candidates_for(run, said, entries, names)
-            return tuple(Candidate(one, score, (one,), run) for one, score in found)
+            return tuple(Candidate(one, score, (one,), _as_done(run, one, names)) for one, score in found)
     sources = [(part, entry) for entry in entries for part in parts(entry)]
     source_of = {id(part): entry for part, entry in sources}
     try:
@@ -250,6 +252,17 @@ def _longest_run(
     except InstructionError as error:
         return _put_together(asked[0], sources, names, looks, error)
     return tuple(Candidate(one, score, (source_of[id(one)],), tuple(asked[:1])) for one, score in found)
+
+
+def _as_done(asked: tuple[SubTask, ...], entry: MemoryEntry, names: NameSimilarity) -> tuple[SubTask, ...]:
+    """What is asked, in the order in which an entry does it, which may be another than it is said in."""
+    if len(asked) == 1:
+        return asked
+    left, ordered = list(asked), list[SubTask]()
+    for known in entry.key.sub_tasks:
+        scores = [semantic_score((one,), (known,), names) for one in left]
+        ordered.append(left.pop(scores.index(max(scores))))
+    return tuple(ordered)
 
 
 def _put_together(
