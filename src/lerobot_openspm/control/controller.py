@@ -289,9 +289,8 @@ class EpisodeController:
         if not self._is_tracking:
             self._begin(index, hand)
             return None
-        # What should be in the hand is not, or what was to be met is not there: it may be anywhere.
         places = {one.key_pose.anchor.place for one in executor.targets[index : state.index + 1]}
-        tracker.doubt(places - self.scene.altered, hand.T_world_ee)
+        self.scene.doubt(places, hand)
         return self.scene.look(state.plan.objects(index, self.scene.altered), hand, back_to=index)
 
     # The end of a part.

@@ -95,7 +95,10 @@ class Grounding:
         not_meant: By name, poses ``T_world_obj`` ``(4, 4)`` of the others of its kind.
         several: Names of which the instruction is about several: any of them will do, each once.
         done: By such a name, poses ``T_world_obj`` ``(4, 4)`` of those that were seen to already.
-        words: What all parts of the instruction say of where objects are.
+        done_before: Likewise of those that were seen to for parts that asked for something else. They come
+            last.
+        named: Names of the objects of the parts so far.
+        words: What the parts of the instruction say of where objects are.
         instances: By name, poses ``T_world_obj`` ``(4, 4)`` of all that were there when words without a
             landmark told them from each other, where they are now as far as that is known.
     """
@@ -110,9 +113,13 @@ class Grounding:
     not_meant: dict[str, tuple[Array, ...]] = field(default_factory=dict[str, tuple[Array, ...]])
     several: frozenset[str] = frozenset()
     done: dict[str, list[Array]] = field(default_factory=dict[str, list[Array]])
+    done_before: dict[str, list[Array]] = field(default_factory=dict[str, list[Array]])
+    named: frozenset[str] = frozenset()
     words: frozenset[tuple[str, Reference]] = frozenset()
     instances: dict[str, list[Array]] = field(default_factory=dict[str, list[Array]])
     _which: dict[tuple[str, Reference], int] = field(default_factory=dict[tuple[str, Reference], int])
+    # By name, the instance that is meant since the words have changed, until it is seen.
+    _due: dict[str, int] = field(default_factory=dict[str, int])
     _told: set[str] = field(default_factory=set[str])
 
     @property
@@ -140,26 +147,32 @@ class Grounding:
             shown: As :func:`demonstrations` gives it.
             object_poses: Where those that were meant so far are by now, ``T_world_obj`` ``(4, 4)`` by name.
         """
-        changed = frozenset(name for name in said if name in self.said and self.said[name] != said[name])
+        changed = frozenset(name for name in said.keys() & self.named if self.said.get(name) != said[name])
         left: Mapping[str, Array] = object_poses or {}
-        for name in changed & left.keys():
+        for name in changed & left.keys() & self.said.keys():
             if (number := self._which.get((name, self.said[name]))) is not None:
                 self.instances[name][number] = left[name]
         self.said = {**self.said, **said}
         kept = {name: one for name, one in self.shown.items() if name not in said}
         self.shown = {**kept, **(shown or {})}
         self.not_meant = {name: T for name, T in self.not_meant.items() if name not in changed}
-        for name in changed:
-            if (number := self._which.get((name, said[name]))) is not None:
-                places = self.instances[name]
-                self.not_meant[name] = (*places[:number], *places[number + 1 :])
+        which = {name: self._which.get((name, said[name])) for name in changed}
+        self._due = {name: number for name, number in which.items() if number is not None}
+        self.several -= said.keys()
+        self.named |= said.keys()
         self._told -= changed
         return changed
 
-    def first_of(self, name: str) -> None:
-        """Several are meant from now on, and none of them was seen to."""
-        self.done.pop(name, None)
-        self.not_meant.pop(name, None)
+    def first_of(self, name: str, T_world_obj: Array | None) -> None:
+        """Several are meant from now on, for something else than the one that was left at a pose."""
+        if name in self.done and T_world_obj is not None:
+            self.done[name].append(T_world_obj)
+        self.done_before.setdefault(name, []).extend(self.done.pop(name, []))
+        self.several |= {name}
+        self.said = {other: said for other, said in self.said.items() if other != name}
+        self._which = {key: number for key, number in self._which.items() if key[0] != name}
+        for known in (self.not_meant, self.instances):
+            known.pop(name, None)
 
     def next_of(self, name: str, T_world_obj: Array) -> None:
         """One of several has been seen to and is where it was left ``(4, 4)``; another one is meant now."""
@@ -189,9 +202,11 @@ class Grounding:
         self, name: str, estimate: PoseEstimate, known: Mapping[str, Array], still: Mapping[str, Array]
     ) -> PoseEstimate:
         if name in self.not_meant:
-            return self._unless_another(name, estimate)
+            return self._unless_another(name, estimate, known)
         if name in self.several:
             return self._any(name, estimate)
+        if name in self._due and estimate.status != "not_found":
+            return self._due_one(name, estimate, known, still)
         if estimate.status == "not_found" or not estimate.others:
             return self._unless_elsewhere(name, estimate, known, still)
         candidates = (estimate.T_world_obj, *estimate.others)
@@ -211,12 +226,31 @@ class Grounding:
             return estimate
         done = self.done.get(name, [])
         places = (estimate.T_world_obj, *estimate.others)
-        left = [T for T in places if not any(_is_same_place(T, other) for other in done)]
+        left = [T for T in places if not _is_one_of(T, done)]
         if not left:
             self.elsewhere[name] = "has been seen to already"
             return replace(estimate, status="not_found")
+        left.sort(key=lambda T: _is_one_of(T, self.done_before.get(name, ())))
         self.not_meant[name] = (*done, *left[1:])
         return replace(estimate, status="found", T_world_obj=left[0], others=())
+
+    def _due_one(
+        self, name: str, estimate: PoseEstimate, known: Mapping[str, Array], still: Mapping[str, Array]
+    ) -> PoseEstimate:
+        """The one that the words meant when all were first seen. Where it has gone, none of the others."""
+        places, candidates = self.instances[name], (estimate.T_world_obj, *estimate.others)
+        own, others = places[self._due[name]], [T for i, T in enumerate(places) if i != self._due[name]]
+        there = [T for T in candidates if _is_same_place(T, own)]
+        left = there[:1] or [T for T in candidates if not _is_one_of(T, others)]
+        if not left:
+            self.elsewhere[name] = "is another one"
+            return replace(estimate, status="not_found")
+        index = 0 if len(left) == 1 else self._told_from(name, left, known, still)
+        if index is None:
+            return replace(estimate, status="ambiguous")
+        del self._due[name]
+        self.not_meant[name] = (*others, *(T for T in candidates if T is not left[index]))
+        return replace(estimate, status="found", T_world_obj=left[index], others=())
 
     def _tell_apart(self, name: str, candidates: Sequence[Array]) -> None:
         """Settle which one each part means by words that need no landmark: later they stand otherwise."""
@@ -268,11 +302,13 @@ class Grounding:
             return estimate
         return replace(estimate, status="not_found")
 
-    def _unless_another(self, name: str, estimate: PoseEstimate) -> PoseEstimate:
-        """The estimate, unless it is of one that is not meant; then that of the place that is left."""
+    def _unless_another(self, name: str, estimate: PoseEstimate, known: Mapping[str, Array]) -> PoseEstimate:
+        """The estimate, unless it is of one that is not meant; then of what is left nearest to its place."""
         left = [T for T in (estimate.T_world_obj, *estimate.others) if not self._is_another(name, T)]
         if estimate.status == "not_found" or not left:
             return replace(estimate, status="not_found")
+        if name in known:
+            left.sort(key=lambda T: float(np.linalg.norm(T[:3, 3] - known[name][:3, 3])))
         status = "ambiguous" if len(left) > 1 and estimate.status == "ambiguous" else "found"
         return replace(estimate, status=status, T_world_obj=left[0], others=tuple(left[1:]))
 
@@ -284,7 +320,11 @@ class Grounding:
         return {name: self._foot(name, T) for name, T in object_poses.items()}
 
     def _is_another(self, name: str, T_world_obj: Array) -> bool:
-        return any(_is_same_place(T, T_world_obj) for T in self.not_meant[name])
+        return _is_one_of(T_world_obj, self.not_meant[name])
+
+
+def _is_one_of(T: Array, others: Sequence[Array]) -> bool:
+    return any(_is_same_place(T, other) for other in others)
 
 
 def _is_same_place(T: Array, other: Array) -> bool:

@@ -71,6 +71,7 @@ class SceneState:
         self.grounding = Grounding(surfaces=frozenset(context.surfaces), feet=context.feet)
         self.detections = Detections({}, {})
         self.altered: set[str] = set()
+        self._shutting = ""  # what a push that has begun shuts
         self._step = -1
         self._looked_at_step = -self._steps(LOOK_AGAIN_S)
 
@@ -97,22 +98,51 @@ class SceneState:
             Names that mean another object from now on.
         """
         candidates, grounding, meant = parts[number], self.grounding, self._context.object_meant
-        poses = {} if hand is None else self.tracker.poses(hand.T_world_ee)
-        again = asked_of_both(candidates, parts[number - 1]) if number else frozenset[str]()
-        first = asked_of_both(candidates, *parts[number + 1 : number + 2]) - again
-        grounding.several = again | first
-        for name in again & poses.keys():
-            grounding.next_of(name, poses[name])
-        for name in first:
-            grounding.first_of(name)
         told = [[references(one, meant) for one in part] for part in parts]
-        grounding.words = frozenset(said for part in told for own in part for said in own.items())
         said = {name: where for own in told[number] for name, where in own.items()}
+        named = {name for one in candidates for asked in one.entry.key.sub_tasks for name in asked.objects}
+        # What this part names without such words is the one that was shown, whatever a later one says.
+        words = {one for part in told for own in part for one in own.items()}
+        grounding.words = frozenset(
+            (name, where) for name, where in words if name in said or name not in named
+        )
+        poses = {} if hand is None else self.tracker.poses(hand.T_world_ee)
+        next_ones = self._next_ones(parts, number, said.keys(), poses)
         known = set(self._context.yaw_periods) - set(self._context.surfaces)
         others = grounding.hear(said, demonstrations(candidates, meant, known), poses)
-        self.tracker.forget(others | grounding.several)
+        grounding.named |= named
+        self.tracker.forget(others | next_ones)
         self.altered -= others
         return others
+
+    def _next_ones(
+        self,
+        parts: Sequence[Sequence[Candidate]],
+        number: int,
+        said: Set[str],
+        object_poses: Mapping[str, Array],
+    ) -> set[str]:
+        """Turn to the next one of several, or to the first one; their names.
+
+        Args:
+            parts: As of :meth:`ground`, like `number`.
+            number: The part.
+            said: Names of which it says where the object is: words mean one, not any.
+            object_poses: Where objects are at its beginning, ``T_world_obj`` ``(4, 4)`` by name.
+        """
+        candidates, grounding = parts[number], self.grounding
+        first = asked_of_both(candidates, *parts[number + 1 : number + 2])
+        if number:
+            first -= asked_of_both(candidates, parts[number - 1])
+        targets = {one.entry.key.sub_tasks[0].target for one in candidates}
+        following = (grounding.several & targets & object_poses.keys()) - first - said
+        if any(parts[number] is one for one in parts[:number]):  # it is done once more, to the same one
+            following = frozenset[str]()
+        for name in following:
+            grounding.next_of(name, object_poses[name])
+        for name in first:
+            grounding.first_of(name, object_poses.get(name))
+        return {*following, *first}
 
     @property
     def time_s(self) -> float:
@@ -191,6 +221,12 @@ class SceneState:
         is_something_held = not self.tracker.held and are_around_something(hand, self._context.robot)
         return why_missing(names, self.detections.estimates, self.grounding.elsewhere, is_something_held)
 
+    def doubt(self, names: Set[str], hand: Hand) -> None:
+        """What should be in the hand, or was to be met or shut, is not there: it may be anywhere."""
+        self.altered.discard(self._shutting)
+        self._shutting = ""
+        self.tracker.doubt(names - self.altered, hand.T_world_ee)
+
     # What goes along with the hand.
 
     def pass_key_pose(self, plan: Plan, passed: Target, after: Target, hand: Hand) -> None:
@@ -203,11 +239,13 @@ class SceneState:
             self.tracker.hold(pose.anchor.place, hand.T_world_ee)
         elif is_pushed:
             pushing = plan.sub_task(after.key_pose)
-            if pushing.operation in PART_MOVES:
-                self.altered.add(pushing.target)
-            else:
+            if pushing.operation not in PART_MOVES:
                 self.tracker.hold(pushing.target, hand.T_world_ee)
+            elif pushing.target not in self.altered:
+                self._shutting = pushing.target
+                self.altered.add(pushing.target)
         elif pose.phase == "release" or pose.phase == "push" != phase_after:
+            self._shutting = ""
             self.tracker.release(self.tracker.held, hand.T_world_ee)
         elif pose.phase in ("open", "turn"):
             self.altered.add(pose.anchor.place)

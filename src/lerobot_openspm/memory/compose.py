@@ -133,7 +133,7 @@ def plan_parts(
             try:
                 chain.append(_longest_run((needed,), phrase(needed), entries, names, looks))
             except InstructionError as error:
-                why = f"{said!r} cannot be done once that is closed, unless something opens it"
+                why = f"{said!r} cannot be done unless it comes after {phrase(needed)!r}"
                 raise InstructionError(f"{why}: {error}") from error
         chain.append(found)
         left = left[len(found[0].asked) :]
@@ -174,9 +174,9 @@ def _done_before(one: Candidate) -> SubTask | None:
     put, shown = one.entry.key.sub_tasks[0], one.sources[-1].key.sub_tasks
     own = next((i for i, other in enumerate(shown) if _place(other) == _place(put)), 0)
     there = [other for other in shown[:own] if _place(put) == (other.target, other.part)]
-    # A stove that was turned on is not needed for what is put there, a microwave that was opened is.
-    before = [other for other in there if put.part or other.operation == "open"]
-    return before[-1] if before else None
+    # What is put on a stove does not need that it was turned on; what goes into a microwave, that it is open.
+    is_needed = bool(there) and (put.part or (put.relation == "in" and there[-1].operation == "open"))
+    return there[-1] if is_needed else None
 
 
 def _closed_before(found: Sequence[Candidate], done: Sequence[SubTask], lexicon: Lexicon) -> SubTask | None:
