@@ -35,8 +35,9 @@ def steps_to_success(simulator: LiberoSimulator, seed: int) -> int | None:
 
 
 GOAL_TASKS = [task for task in EXPERTS if task not in {**SPATIAL, **OBJECT, **LONG}]
-# Of each other suite one; more take minutes. An expert may fail in a scene: then another one is recorded.
-SCENES = range(TUNING_SEED_START, TUNING_SEED_START + 3)
+# The butter's expert tips it in some scenes, this first one among them, and collecting draws another.
+BUTTER = "LIVING_ROOM_SCENE2_put_both_the_cream_cheese_box_and_the_butter_in_the_basket"
+# Of each other suite one in one scene; more take minutes.
 OTHERS = SPATIAL, OBJECT, LONG
 FIRST = [next(iter(suite)) for suite in OTHERS]
 OTHER_TASKS = [
@@ -54,7 +55,9 @@ def test_every_task_has_an_expert():
 @pytest.mark.parametrize("task", OTHER_TASKS)
 def test_expert_solves_a_scene_of_another_suite(task):
     simulator = make_simulator(task)
-    tried = (steps_to_success(simulator, seed) for seed in SCENES)
+    n_scenes = 3 if task == BUTTER else 1
+    seeds = range(TUNING_SEED_START, TUNING_SEED_START + n_scenes)
+    tried = (steps_to_success(simulator, seed) for seed in seeds)
     steps = next((steps for steps in tried if steps is not None), None)
     simulator.close()
     assert steps is not None
