@@ -180,6 +180,9 @@ def evaluate_one(config: EvaluationConfig, task: str, state: int) -> Row:
     if config.tuning:
         simulator.reset(seed)
         move_hand(simulator, np.random.default_rng(seed))
+        # The benchmark's states hold no fixtures: these are drawn anew, and stand elsewhere than they stood
+        # when the things were put on or into them.
+        simulator.reset_to(seed + 1, simulator.sim.get_state().flatten())
     else:
         simulator.reset_to(seed, variant_states(config.suite, task)[state])
     sub_tasks = parse_instruction(simulator.instruction)

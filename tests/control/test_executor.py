@@ -8,7 +8,7 @@ from numpy.testing import assert_allclose
 from tests.memory.builders import OPEN_WIDTH, entry, hand_pose, key_pose, robot
 
 from lerobot_openspm.control import executor as executing
-from lerobot_openspm.control.executor import Executor
+from lerobot_openspm.control.executor import BLOCKED_CORRECTIONS, Executor
 from lerobot_openspm.control.state import EpisodeState, Status
 from lerobot_openspm.control.strategies import CORRECTION_STEPS, RESIDUAL_M, RESIDUAL_RAD, Approach
 from lerobot_openspm.control.transfer import SHUT_M, transfer
@@ -253,6 +253,14 @@ def test_a_retry_of_a_push_begins_at_its_first_approach():
     executor = make(key_poses=[*poses, key_pose("bowl", hand_pose(0.2, 0, 0.1), "push")])
     executor.begin(executor.targets, Hand(HOME, OPEN_WIDTH), 3)
     assert executor.contact_index(Hand(executor.targets[2].T_world_ee, 0.0)) == 0
+
+
+def test_a_hand_that_something_keeps_from_going_down_to_a_grasp_does_not_push_on():
+    executor, corrections = make(), list[int]()
+    world = World(stuck=blocked_at_the_bowl(executor))
+    run(executor, world, until=lambda e: corrections.append(e.approach.corrections) or e.state.attempts == 1)
+    assert executor.state.attempts == 1
+    assert max(corrections) <= BLOCKED_CORRECTIONS + 1 < executing.MAX_CORRECTIONS
 
 
 def test_the_open_loop_never_looks_at_the_hand():

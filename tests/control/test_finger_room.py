@@ -7,7 +7,7 @@ import pytest
 from tests.control.test_clearance import HOME
 from tests.memory.builders import OPEN_WIDTH, entry
 
-from lerobot_openspm.control.finger_room import LEAST_ROOM_M, finger_room, shifted
+from lerobot_openspm.control.finger_room import LEAST_ROOM_M, finger_room, fingers_elsewhere, shifted
 from lerobot_openspm.control.transfer import transfer
 from lerobot_openspm.geometry import se3
 
@@ -60,3 +60,25 @@ def test_the_hand_is_back_where_it_was_shown_once_it_has_taken_hold():
         before = target.key_pose.phase in ("approach", "grasp")
         depth = 0.004 if target.key_pose.phase == "grasp" else 0.0
         assert np.allclose(T[:3, 3], [0.0, 0.01 if before else 0.0, depth])
+
+
+def around(radius, degrees):
+    """The hand as it takes hold of the rim of something round, turned about its middle."""
+    middle = se3.transform(np.eye(3), [0.0, radius, 0.0])
+    turn = se3.from_yaw(np.zeros(3), np.deg2rad(degrees))
+    return replace(GRASP, T_world_ee=GRASP.T_world_ee @ middle @ turn @ se3.inverse(middle))
+
+
+@pytest.mark.parametrize(("radius", "order"), [(0.06, [180, 120, 90]), (0.0, [90])])
+def test_what_was_in_a_fingers_way_is_kept_furthest_from(radius, order):
+    degrees = [30, 90, 120, 180]
+    grasps = [around(radius, one) for one in degrees]
+    found = fingers_elsewhere(GRASP, grasps, HOME, OPEN_WIDTH)
+    assert [degrees[i] for i in found if degrees[i] in (90, 120, 180)][: len(order)] == order
+
+
+def test_of_two_ways_round_the_hand_takes_the_one_that_it_turns_less_for():
+    there = around(0.06, 180)
+    back = replace(there, T_world_ee=there.T_world_ee @ se3.from_yaw(np.zeros(3), np.pi))
+    for hand, expected in ((there, [0, 1]), (back, [1, 0])):
+        assert fingers_elsewhere(GRASP, [there, back], hand.T_world_ee, OPEN_WIDTH) == expected

@@ -9,6 +9,7 @@ from tests.control.test_executor import HOME, ROBOT, World, make, run
 from tests.memory.builders import OPEN_WIDTH, entry, hand_pose, key_pose, pick_and_place
 
 from lerobot_openspm.control.state import Status
+from lerobot_openspm.control.strategies import LIFT_STEPS
 from lerobot_openspm.geometry import se3
 from lerobot_openspm.types import Hand
 
@@ -128,3 +129,36 @@ def test_closed_fingers_that_push_after_something_was_put_down_hold_nothing_that
         assert not executor.has_lost_grip(fist), phases[index]
     executor.begin(executor.targets, fist, phases.index("lift"))
     assert executor.has_lost_grip(fist)
+
+
+def test_fingers_that_close_do_not_push_the_hand_back_but_lead_it_sideways():
+    executor = make()
+    grasp = next(one for one in executor.targets if one.key_pose.phase == "grasp")
+    T = grasp.T_world_ee
+    metres, along = 0.005, T[:3, 2]
+    for i, expected in enumerate((0.2, 0.2, 1.0)):  # the share of the way back that a step goes
+        off = se3.transform(T[:3, :3], T[:3, 3] + metres * T[:3, i])
+        action = executor.strategy.grip(grasp, off)
+        back = -action[:3] * ROBOT.metres_per_action
+        assert_allclose(back, expected * metres * T[:3, i], atol=1e-9)
+    far = se3.transform(T[:3, :3], T[:3, 3] - 0.1 * along)
+    assert np.abs(executor.strategy.grip(grasp, far)[:6]).max() <= 1 + 1e-12
+
+
+def test_a_lift_comes_up_to_speed_slowly_and_nothing_else_does():
+    executor, world = make(), World()
+    speeds: dict[str, list[float]] = {"lift": [], "pre-place": []}
+    for _ in range(600):
+        if executor.state.status is not Status.RUNNING or executor.advance(world.hand):
+            break
+        if (action := executor.next_action(world.hand)) is None:
+            executor.push_chunk(np.tile([1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0], (5, 1)))
+            action = executor.next_action(world.hand)
+        phase = executor.present.key_pose.phase
+        if phase in speeds and not executor.approach.corrections:
+            speeds[phase].append(float(action[0]))
+        world.step(action)
+    assert len(speeds["lift"]) > 3
+    assert_allclose(np.diff(speeds["lift"]), speeds["lift"][0], atol=1e-9)
+    assert speeds["lift"][0] == pytest.approx(1 / LIFT_STEPS)
+    assert set(speeds["pre-place"]) == {1.0}

@@ -78,7 +78,7 @@ def test_where_the_joints_have_room_or_are_not_known_nothing_changes(panda):
 def test_a_grasp_from_another_side_is_led_out_anew(panda):
     context, plan = planned(panda, NEAR)
     led = context.clear(plan)
-    other = context.otherwise(replace(led, shifts={0: 0.012}))
+    other = context.otherwise(replace(led, shifts={0: 0.012}), 0)
     assert other.shifts == {}
     assert other.turned != led.turned
     assert other.out

@@ -11,6 +11,7 @@ from tests.memory.builders import entry, hand_pose, key_pose, robot
 
 from lerobot_openspm.control import feasibility
 from lerobot_openspm.control.feasibility import MAX_JUMP_RAD, TransferLimits, find_stance
+from lerobot_openspm.control.joint_room import FURTHER_M
 from lerobot_openspm.control.plan import DEEPER_M, Plan
 from lerobot_openspm.control.transfer import RETREAT_M, transfer
 from lerobot_openspm.geometry import se3
@@ -158,16 +159,31 @@ def test_a_grasp_within_reach_stays_as_shown(panda):
 
 
 @pytest.mark.parametrize(
-    ("x", "turned", "stretched"), [(0.08, 0, False), (0.11, 90, False), (0.14, 30, True)]
+    ("x", "turned", "stretched"), [(0.08, 0, False), (0.11, 90, False), (0.14, 120, True)]
 )
 def test_a_grasp_that_stretches_the_arm_out_is_turned_while_another_one_does_not(panda, x, turned, stretched):
     context, poses, home = scene(panda, 0.0, x=x)
     as_shown = replace(Plan(context.entries[0], poses, home), stance=find_stance(context.robot, home))
-    assert as_shown.is_stretched(context) == (x > 0.1)
+    assert (as_shown.reach_left(context) < FURTHER_M[0]) == (x > 0.1)
     plan, problems = chosen(context, poses, home)
     assert problems == plan.followed(context)[1] == []
     assert round(np.rad2deg(plan.turned)) == turned
-    assert plan.is_stretched(context) == stretched
+    assert (plan.reach_left(context) < FURTHER_M[0]) == stretched
+    assert plan.reach_left(context) >= as_shown.reach_left(context)
+
+
+def test_an_arm_that_is_stretched_on_its_way_to_a_grasp_is_stretched(panda):
+    context, poses, home = scene(panda, 0.0, x=0.04)
+    plan = replace(Plan(context.entries[0], poses, home), stance=find_stance(context.robot, home))
+    assert plan.reach_left(context) == FURTHER_M[0]
+    further = se3.from_yaw([0.06, 0.0, 0.0], 0.0)
+    poses_out = [
+        replace(one, T_obj_ee=further @ one.T_obj_ee) if i == 1 else one
+        for i, one in enumerate(plan.entry.key_poses)
+    ]
+    assert poses_out[1].phase == "approach"
+    out = replace(plan, entry=replace(plan.entry, key_poses=tuple(poses_out)))
+    assert 0 <= out.reach_left(context) < FURTHER_M[0]
 
 
 def test_what_is_out_of_reach_from_all_sides_is_refused(panda):
@@ -299,14 +315,60 @@ def test_what_slipped_out_is_grasped_again_as_it_was_but_deeper():
     as_shown = Plan(shown, shown.object_poses, HAND.T_world_ee)
     lift = as_shown.targets(planning_context())[grasp + 1]
     assert_allclose(one.executor.targets[grasp + 1].T_world_ee, lift.T_world_ee, atol=1e-9)
+    # What slips out again is grasped from another side.
+    one.executor.begin(one.executor.targets, HAND, grasp + 1)
+    watch(one, perception, Hand(before, 0.0), 1)
+    assert one.state.attempts == 2
+    turned = float(se3.distances(one.executor.targets[grasp].T_world_ee, before)[1])
+    assert_allclose(np.rad2deg(turned), 90, atol=1e-4)
 
 
-def test_nothing_is_grasped_deeper_than_the_hand_may_go():
+def test_nothing_is_grasped_deeper_than_the_hand_may_go_nor_twice():
     plan, context = Plan(entry(), entry().object_poses, HAND.T_world_ee), planning_context()
     lowest = min(target.T_world_ee[2, 3] for target in plan.targets(context))
     low, high = context.robot.workspace
     own = replace(context.robot, workspace=np.array([[*low[:2], lowest], high]))
-    context = replace(context, robot=own, limits=TransferLimits(min_clearance_m=0.006))
-    once = plan.deepened(0, context)
+    tight, wide = (
+        replace(context, robot=own, limits=TransferLimits(min_clearance_m=metres))
+        for metres in (0.004, 0.012)
+    )
+    assert plan.deepened(0, tight) is plan
+    once = plan.deepened(0, wide)
+    assert once is not None
     assert once.deeper == {0: DEEPER_M}
-    assert once.deepened(0, context) is once
+    assert once.deepened(0, wide) is None
+
+
+# The demonstrated opening leaves so much room that the hand may go aside by 2 cm.
+@pytest.mark.parametrize(
+    ("pushed", "middle", "expected"),
+    [
+        (0.012, None, 0.02),
+        (-0.012, 0.05, -0.02),
+        (0.002, None, None),
+        (0.002, 0.01, None),
+        (0.002, -0.05, -0.02),
+    ],
+)
+def test_a_hand_that_one_finger_keeps_off_goes_a_little_aside_once(pushed, middle, expected):
+    context = planning_context()
+    if middle is not None:  # of the bowl, that far from the hand along the axis over which the fingers open
+        T_ee_bowl = se3.inverse(
+            Plan(entry(), entry().object_poses, HAND.T_world_ee).grasp(0, context).T_world_ee
+        )
+        T_ee_bowl = T_ee_bowl @ entry().object_poses["bowl"]
+        (own,) = se3.apply(se3.inverse(T_ee_bowl), np.array([[0.0, middle, T_ee_bowl[2, 3]]]))
+        context = planning_context(symmetries={"bowl": Symmetry(own[:2], 0.0)})
+    plan = Plan(entry(), entry().object_poses, HAND.T_world_ee)
+    aside = plan.dodging(0, pushed, context)
+    assert (aside is None) == (expected is None)
+    if aside is None:
+        return
+    before, after = plan.targets(context), aside.targets(context)
+    for i, target in enumerate(before):
+        y = (se3.inverse(target.T_world_ee) @ after[i].T_world_ee)[1, 3]
+        is_aside = target.key_pose.phase in ("approach", "grasp")
+        assert y == pytest.approx(expected if is_aside else 0.0, abs=2e-3)
+    assert aside.dodging(0, pushed, context) is None
+    # Objects that are seen a little elsewhere leave it so.
+    assert aside.following({"bowl": plan.object_poses["bowl"]}).dodges == aside.dodges

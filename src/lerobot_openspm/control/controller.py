@@ -275,23 +275,24 @@ class EpisodeController:
 
     def _try_again(self, hand: Hand) -> LookRequest | None:
         """Look for the objects of the remaining key poses again, to go back to where this contact begins."""
-        state, executor, tracker = self.state, self.executor, self.scene.tracker
+        state, executor, context = self.state, self.executor, self._context
         executor.note_travel(hand)
         # With the object still in the hand only the way to its place is gone again.
         present, has_slipped = executor.present.key_pose, executor.has_lost_grip(hand)
-        is_in_hand = bool(tracker.held) and present.phase == "place" and not has_slipped
+        is_in_hand = bool(self.scene.tracker.held) and present.phase == "place" and not has_slipped
         index = executor.way_index() if is_in_hand else executor.contact_index(hand)
-        state.plan = replace(state.plan, T_world_ee=hand.T_world_ee)
+        own, plan = present.sub_task, replace(state.plan, T_world_ee=hand.T_world_ee)
         if executor.was_kept_from_grasping(hand):
-            state.plan = self._context.otherwise(state.plan)
+            plan = plan.dodging(own, executor.pushed_aside(hand), context) or context.otherwise(plan, own)
         elif has_slipped:
-            state.plan = state.plan.deepened(present.sub_task, self._context)
+            plan = plan.deepened(own, context) or context.otherwise(plan, own)
+        state.plan = plan
         if not self._is_tracking:
             self._begin(index, hand)
             return None
         places = {one.key_pose.anchor.place for one in executor.targets[index : state.index + 1]}
         self.scene.doubt(places, hand)
-        return self.scene.look(state.plan.objects(index, self.scene.altered), hand, back_to=index)
+        return self.scene.look(plan.objects(index, self.scene.altered), hand, back_to=index)
 
     # The end of a part.
 

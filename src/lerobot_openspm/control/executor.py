@@ -34,7 +34,7 @@ HELD_SHARE, OTHER_OPENING_M = 0.4, 0.012
 HOLDING_SHARE = 0.03
 # What is carried is held up from below where the hand is so far above its place, from and to, at most so far
 # beside it, metres, and turned by at most so much, radians, after more than so many corrections.
-RISEN_M, DROP_M, BESIDE_M, LEANING_RAD, HELD_UP_CORRECTIONS = 0.012, 0.06, 0.02, 0.3, 3
+RISEN_M, DROP_M, BESIDE_M, LEANING_RAD, BLOCKED_CORRECTIONS = 0.012, 0.06, 0.02, 0.3, 3
 # A handle that has come along for less than this share of its way was not in the fingers.
 LEAST_TRAVEL = 0.05
 
@@ -163,7 +163,8 @@ class Executor:
             self._enter(self.state.index + 1, hand)
             self._approach_target(replace(self.present, T_world_ee=hand.T_world_ee))
             return False
-        if not is_used_up:
+        is_kept_off = approach.is_blocked and approach.corrections > BLOCKED_CORRECTIONS
+        if not (is_used_up or (is_kept_off and self.was_kept_from_grasping(hand))):
             return False
         metres, radians = se3.distances(hand.T_world_ee, self.present.T_world_ee)
         return self.try_again(f"it stays {1000 * metres:.1f} mm and {radians:.3f} rad away")
@@ -173,7 +174,7 @@ class Executor:
         approach, present = self.approach, self.present
         if present.key_pose.phase != "place" or not approach.is_blocked or self.has_lost_grip(hand):
             return False
-        if approach.corrections <= HELD_UP_CORRECTIONS or self.state.index + 1 == len(self.targets):
+        if approach.corrections <= BLOCKED_CORRECTIONS or self.state.index + 1 == len(self.targets):
             return False
         if float(se3.distances(hand.T_world_ee, present.T_world_ee)[1]) > LEANING_RAD:
             return False
@@ -187,7 +188,7 @@ class Executor:
             return self.hold()
         target, approach = self.present, self.approach
         if target.key_pose.dwell:
-            action = self.strategy.toward(target, self._here(hand))
+            action = self.strategy.grip(target, self._here(hand))
         elif self._queue:
             action = self.strategy.from_chunk(self._queue.popleft(), target, approach, hand)
         elif (action := self.strategy.correct(target, approach, hand)) is None:
@@ -260,6 +261,10 @@ class Executor:
         ahead = (one.key_pose for one in self.targets[self.state.index :])
         is_to_grasp = any(one.phase == "grasp" and one.sub_task == present.sub_task for one in ahead)
         return is_to_grasp and present.phase == "approach" and not self.has_lost_grip(hand)
+
+    def pushed_aside(self, hand: Hand) -> float:
+        """How far the hand is from the present key pose along its y axis, metres; the fingers open so."""
+        return float((se3.inverse(self.present.T_world_ee) @ hand.T_world_ee)[1, 3])
 
     def followed_sub_tasks(self) -> set[int]:
         """The sub-tasks whose drawer or knob went all the way, once the plan is done.

@@ -24,8 +24,8 @@ from lerobot_openspm.geometry.se3 import Array
 ROOM_RAD = np.deg2rad(15)
 # For that the hand is led away from the base by the least of these, metres.
 OUT_M = tuple(np.arange(0.01, 0.125, 0.01).tolist())
-# An arm that cannot go on so far out from its base is stretched, metres: by half of that the hand overshoots.
-STRETCH_M = 0.045
+# An arm that cannot go on by the first of these is stretched, metres: by half of that the hand overshoots.
+FURTHER_M = (0.045, 0.035, 0.025, 0.015, 0.005)
 
 
 def ways_out(targets: Sequence[Target], arm: Arm, stance: Array) -> dict[int, Array]:
@@ -54,15 +54,21 @@ def ways_out(targets: Sequence[Target], arm: Arm, stance: Array) -> dict[int, Ar
     return out
 
 
-def is_stretched(targets: Sequence[Target], arm: Arm, stance: Array) -> bool:
-    """Whether the arm is stretched out where the hand takes hold of something; arguments as of ways_out."""
+def reach_left(targets: Sequence[Target], arm: Arm, stance: Array) -> float:
+    """How much further out from its base the arm could go on its way to and from a grasp, metres.
+
+    At most the first of FURTHER_M, which is enough; arguments as of ways_out.
+    """
+    left = FURTHER_M[0]
     for target in targets:
-        if target.key_pose.phase == "grasp":
+        if target.key_pose.phase in ("approach", "grasp", "lift"):
             R, p = target.T_world_ee[:3, :3], target.T_world_ee[:3, 3]
-            further = se3.transform(R, p + _away(p - arm.base) * STRETCH_M)
-            if not _reaches(arm, further, arm.onwards(further, stance, stance)):
-                return True
-    return False
+            for metres in (metres for metres in (*FURTHER_M, 0.0) if metres <= left):
+                left = metres
+                further = se3.transform(R, p + _away(p - arm.base) * metres)
+                if _reaches(arm, further, arm.onwards(further, stance, stance)):
+                    break
+    return left
 
 
 def _are_rising(targets: Sequence[Target]) -> list[bool]:

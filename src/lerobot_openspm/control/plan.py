@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from lerobot_openspm.control.feasibility import Miss, check_reach, check_transfer
-from lerobot_openspm.control.finger_room import shifted
-from lerobot_openspm.control.joint_room import is_stretched
+from lerobot_openspm.control.finger_room import dodged, shifted
+from lerobot_openspm.control.joint_room import FURTHER_M, reach_left
 from lerobot_openspm.control.pushes import pushed_by_landmark
 from lerobot_openspm.control.putting import put_aside, put_turned
 from lerobot_openspm.control.transfer import (
@@ -44,7 +44,7 @@ RETREATS_M = (RETREAT_M, RETREAT_M / 2, 0.0)
 # these, metres, in one of so many directions; as long as the place has not moved by so much.
 ASIDE_M, ASIDE_DIRECTIONS, ASIDE_KEPT_M = (0.01, 0.02, 0.03), 12, 0.03
 # What slipped out of the fingers is taken hold of again so much deeper, metres.
-DEEPER_M = 0.004
+DEEPER_M = 0.008
 # Where an object is that was never seen.
 NOWHERE = se3.transform(np.eye(3), np.full(3, np.inf))
 
@@ -69,6 +69,7 @@ class Plan:
         around: How far it is turned where it is put on or in something round, radians.
         out: How far ``(3,)`` beside key poses the hand passes by, by their index, in the world, metres.
         shifts: How far the hand goes to one side as it takes hold, by sub-task, along its y axis, metres.
+        dodges: The same, from what kept the hand from going down there before.
         deeper: How much further the hand goes as it takes hold, by sub-task, along its z axis, metres.
         not_meant: By name, poses ``T_world_obj`` ``(4, 4)`` of others of its kind, which stand about.
     """
@@ -85,6 +86,7 @@ class Plan:
     around: float = 0.0
     out: Mapping[int, Array] = field(default_factory=dict[int, Array])
     shifts: Mapping[int, float] = field(default_factory=dict[int, float])
+    dodges: Mapping[int, float] = field(default_factory=dict[int, float])
     deeper: Mapping[int, float] = field(default_factory=dict[int, float])
     not_meant: Mapping[str, Sequence[Array]] = field(default_factory=dict[str, Sequence[Array]])
 
@@ -110,7 +112,13 @@ class Plan:
         if self.out:
             targets = tuple(_beside(target, self.out.get(i)) for i, target in enumerate(targets))
         targets = half_turned(targets) if self.is_half_turned else targets
-        return shifted(targets, self.shifts, self.deeper)
+        aside = {i: self.shifts.get(i, 0.0) + self.dodges.get(i, 0.0) for i in (*self.shifts, *self.dodges)}
+        return shifted(targets, aside, self.deeper)
+
+    def grasp(self, sub_task: int, context: PlanningContext) -> Target:
+        """The key pose in the scene at which a sub-task takes hold of something; it has one."""
+        poses = (target for target in self.targets(context) if target.key_pose.sub_task == sub_task)
+        return next(target for target in poses if target.key_pose.phase == "grasp")
 
     def symmetric_grasps(self, context: PlanningContext) -> dict[int, str]:
         """What is grasped to be carried and turns into itself, by sub-task; a handle is on one side only."""
@@ -166,13 +174,38 @@ class Plan:
             plan = replace(plan, aside=(0.0, 0.0), around=0.0)
         return plan
 
-    def deepened(self, sub_task: int, context: PlanningContext) -> Plan:
-        """The plan that takes hold deeper of a load that slipped out, where the hand may go there."""
+    def deepened(self, sub_task: int, context: PlanningContext) -> Plan | None:
+        """The plan that takes hold deeper of a load that slipped out, where the hand may go there.
+
+        None for a load that slipped out before.
+        """
         if sub_task not in self.entry.carried:
             return self  # a handle is where it is
-        depth = self.deeper.get(sub_task, 0.0) + DEEPER_M
-        plan = replace(self, deeper={**self.deeper, sub_task: depth})
+        if sub_task in self.deeper:
+            return None
+        plan = replace(self, deeper={**self.deeper, sub_task: DEEPER_M})
         return self if plan.check(context, plan.targets(context)) else plan
+
+    def dodging(self, sub_task: int, pushed_m: float, context: PlanningContext) -> Plan | None:
+        """The plan that takes hold of a load a little aside of what was in the way of one finger.
+
+        None where it is not known of which, or the hand went aside before.
+
+        Args:
+            sub_task: In which the hand did not get down.
+            pushed_m: How far it was pushed aside there, along its y axis, metres.
+            context: What all environments share.
+        """
+        name, grasp = self.entry.carried.get(sub_task), self.grasp(sub_task, context)
+        if name is None or sub_task in self.dodges:
+            return None
+        middle = 0.0
+        if name in context.symmetries and name in self.object_poses:
+            own = np.array([[*context.symmetries[name].middle, 0.0]])
+            middle = float(se3.apply(se3.inverse(grasp.T_world_ee) @ self.object_poses[name], own)[0, 1])
+        metres = dodged(grasp, pushed_m, middle, context.robot.open_width)
+        plan = replace(self, dodges={**self.dodges, sub_task: metres})
+        return plan if metres and not plan.followed(context)[1] else None
 
     def as_if_in_place(
         self, object_poses: Mapping[str, Array], symmetries: Mapping[str, Symmetry]
@@ -216,12 +249,12 @@ class Plan:
             return None
         return check_reach(targets, self.T_world_ee, arm, self.stance)
 
-    def is_stretched(self, context: PlanningContext) -> bool:
-        """Whether the arm is stretched out where it grasps, as far as is known."""
+    def reach_left(self, context: PlanningContext) -> float:
+        """How much further out the arm could go as it grasps, see :func:`reach_left`; metres."""
         arm = context.robot.arm
         if arm is None or self.stance is None:
-            return False
-        return is_stretched(self.targets(context), arm, self.stance)
+            return FURTHER_M[0]
+        return reach_left(self.targets(context), arm, self.stance)
 
     def backing_off(self, context: PlanningContext) -> tuple[Plan, Miss | None]:
         """The plan, backing off as far as the arm reaches, and the first key pose that it does not reach.

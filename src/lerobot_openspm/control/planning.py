@@ -11,8 +11,8 @@ import numpy as np
 
 from lerobot_openspm.control.clearance import crowding, lifted, taken
 from lerobot_openspm.control.feasibility import TransferLimits, find_stance, geometric_score
-from lerobot_openspm.control.finger_room import finger_room
-from lerobot_openspm.control.joint_room import ways_out
+from lerobot_openspm.control.finger_room import finger_room, fingers_elsewhere
+from lerobot_openspm.control.joint_room import FURTHER_M, ways_out
 from lerobot_openspm.control.plan import Plan
 from lerobot_openspm.control.pushes import pushed_by_landmark
 from lerobot_openspm.control.transfer import as_shown, half_turned
@@ -34,8 +34,6 @@ MAX_TRIED = 3
 # A hand that is in so few points of other objects is clear of them. Else it is in much more of them in one
 # plan than in another if it is in so many times as many points.
 FEW_POINTS, MUCH_MORE = 10, 2
-# A grasp that the hand was kept from is tried again turned by this much at least, radians.
-OTHERWISE_RAD = np.deg2rad(85)
 # A memory that knows more objects than this knows several scenes, and not all objects are looked for.
 MOST_IN_A_SCENE = 20
 # An object usually stands at one place if so many demonstrations at least show it, all of them this near to
@@ -205,15 +203,14 @@ class PlanningContext:
                 tried.append(entry)
         return tried, occupied
 
-    def otherwise(self, plan: Plan) -> Plan:
-        """A plan that grasps from another side, where the arm can follow it so; else the plan itself."""
-        plan = replace(plan, shifts={})  # they lead a hand that grasps from another side elsewhere
-        ways = [
-            way
-            for way in plan.turns(self)
-            if abs(float(se3.wrap_angle(way.turned - plan.turned))) > OTHERWISE_RAD
-        ]
-        found = self._clearest([replace(way, out=self._ways_out(way)) for way in ways], self._points(plan))
+    def otherwise(self, plan: Plan, sub_task: int) -> Plan:
+        """A plan that takes hold from another side, the furthest that the arm can follow; else the plan."""
+        plan = replace(plan, shifts={}, dodges={})  # they lead a hand that grasps from another side elsewhere
+        ways = [replace(way, is_half_turned=half) for way in plan.turns(self) for half in (False, True)]
+        kept_from, *grasps = (way.grasp(sub_task, self) for way in (plan, *ways))
+        order = fingers_elsewhere(kept_from, grasps, plan.T_world_ee, self.robot.open_width)
+        out = [replace(ways[i], out=self._ways_out(ways[i])) for i in order]
+        found = self._clearest(out, self._points(plan))
         return self._with_finger_room(plan if found is None else found[0])
 
     def _clearest(
@@ -221,7 +218,8 @@ class PlanningContext:
     ) -> tuple[Plan, dict[str, int]] | None:
         """The first of some plans that the arm can follow, unless the hand is in much less of others in one.
 
-        One that stretches the arm out comes after others as clear. None where the arm can follow none.
+        One that stretches the arm out comes after others as clear, the more it does. None where the arm can
+        follow none.
 
         Args:
             turned: A plan with its grasps turned, see :meth:`Plan.turns`.
@@ -235,15 +233,16 @@ class PlanningContext:
             targets = plan.targets(self)
             if not plan.check(self, targets):
                 ways.append((plan, crowding(plan.entry, targets, points, self.hand_radius_m)))
-        stretched: tuple[Plan, dict[str, int]] | None = None
+        stretched, most = None, -1.0
         for plan, inside in _clearest_first(ways):
             if stretched and sum(inside.values()) > max(MUCH_MORE * _amount(stretched), FEW_POINTS):
                 break
             reaching, miss = plan.backing_off(self)
             if miss is None:
-                if not reaching.is_stretched(self):
+                if (left := reaching.reach_left(self)) == FURTHER_M[0]:
                     return reaching, inside
-                stretched = stretched or (reaching, inside)
+                if left > most:
+                    stretched, most = (reaching, inside), left
             elif miss.target.key_pose.sub_task not in plan.symmetric_grasps(self):
                 break  # turning the grasps leaves it where it is
         return stretched

@@ -26,6 +26,8 @@ SHUT_LEFT_M = 0.05
 # Each step of a correction makes good this share of the residual, and five steps are one correction. Every
 # further correction adds the same share again, because friction stops a hand that asks for millimetres.
 CORRECTION_SHARE, CORRECTION_STEPS = 0.2, 5
+# A lift comes up to speed within so many steps: a jerk pulls what is held by its rim out of the fingers.
+LIFT_STEPS = 16
 
 
 @dataclass
@@ -93,6 +95,18 @@ class ClosedLoop:
         motion = motion / max(1.0, float(np.abs(motion).max()))
         return np.append(motion, self._robot.command(target.key_pose.closed))
 
+    def grip(self, target: Target, here: Array) -> Array:
+        """An action ``(7,)`` while the fingers open or close.
+
+        Sideways the hand yields to what the fingers meet. Along its approach axis it does not: fingers that
+        close on a slope push it back, and off what they hold.
+        """
+        along = here[:3, 2]
+        back = float(along @ (here[:3, 3] - target.T_world_ee[:3, 3]))
+        firm = here.copy()
+        firm[:3, 3] += (1 / CORRECTION_SHARE - 1) * back * along
+        return self.toward(target, firm)
+
     def _is_near(self, target: Target, approach: Approach, hand: Hand) -> bool:
         metres, radians = se3.distances(hand.T_world_ee, target.T_world_ee)
         if target.until_stopped and approach.is_blocked and metres <= SHUT_LEFT_M:
@@ -126,9 +140,15 @@ class ClosedLoopTRC(ClosedLoop):
         return self._is_near(target, approach, hand)
 
     def from_chunk(self, action: Array, target: Target, approach: Approach, hand: Hand) -> Array:
-        """The flow model's action, kept on the path of a push."""
-        is_pushing = target.key_pose.phase == "push"
-        return self._kept_on_way(action, target, approach, hand) if is_pushing else action
+        """The flow model's action, kept on the path of a push, and slow where a lift begins."""
+        match target.key_pose.phase:
+            case "push":
+                return self._kept_on_way(action, target, approach, hand)
+            case "lift":
+                share = min(1.0, (approach.steps + 1) / LIFT_STEPS)
+                return np.append(share * action[:6], action[6])
+            case _:
+                return action
 
     def correct(self, target: Target, approach: Approach, hand: Hand) -> Array | None:
         """Make good what the flow model has left of the way, once its time is up."""
