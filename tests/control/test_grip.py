@@ -158,7 +158,7 @@ def test_a_lift_comes_up_to_speed_slowly_and_nothing_else_does():
         if phase in speeds and not executor.approach.corrections:
             speeds[phase].append(float(action[0]))
         world.step(action)
-    assert len(speeds["lift"]) > 3
-    assert_allclose(np.diff(speeds["lift"]), speeds["lift"][0], atol=1e-9)
-    assert speeds["lift"][0] == pytest.approx(1 / LIFT_STEPS)
+    steps = np.arange(1, len(speeds["lift"]) + 1)
+    assert len(steps) > 10
+    assert_allclose(speeds["lift"], np.minimum(steps / LIFT_STEPS, 1.0), atol=1e-9)
     assert set(speeds["pre-place"]) == {1.0}

@@ -277,7 +277,7 @@ def test_a_drawer_that_cannot_be_opened_all_the_way_is_refused(panda):
     assert "(open at cabinet)" in problem
 
 
-# By half a turn the hand would turn further than is allowed at once.
+# A bowl that is held over its middle has the fingers furthest from where they were after a quarter.
 @pytest.mark.parametrize(
     ("turn", "tracking", "expected"),
     [(0.0, True, 90), (0.0, False, 90), (np.pi / 2, True, 90), (np.pi, True, 0), (None, True, 0)],
@@ -332,7 +332,7 @@ def test_nothing_is_grasped_deeper_than_the_hand_may_go_nor_twice():
         replace(context, robot=own, limits=TransferLimits(min_clearance_m=metres))
         for metres in (0.004, 0.012)
     )
-    assert plan.deepened(0, tight) is plan
+    assert plan.deepened(0, tight) is None
     once = plan.deepened(0, wide)
     assert once is not None
     assert once.deeper == {0: DEEPER_M}
@@ -370,5 +370,11 @@ def test_a_hand_that_one_finger_keeps_off_goes_a_little_aside_once(pushed, middl
         is_aside = target.key_pose.phase in ("approach", "grasp")
         assert y == pytest.approx(expected if is_aside else 0.0, abs=2e-3)
     assert aside.dodging(0, pushed, context) is None
-    # Objects that are seen a little elsewhere leave it so.
-    assert aside.following({"bowl": plan.object_poses["bowl"]}).dodges == aside.dodges
+    # Objects that are seen a little elsewhere leave it so; what stood in the way is not beside one that is gone.
+    for metres, dodges in ((0.01, aside.dodges), (0.1, {})):
+        bowl = se3.from_yaw([metres, 0.0, 0.0], 0.0) @ plan.object_poses["bowl"]
+        assert aside.following({"bowl": bowl}).dodges == dodges
+    # It goes aside from where it was shown, and nowhere else.
+    shifted = replace(plan, shifts={0: 0.012}).dodging(0, pushed, context)
+    assert shifted is not None
+    assert shifted.shifts == {}

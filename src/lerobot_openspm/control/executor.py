@@ -11,7 +11,7 @@ import numpy as np
 
 from lerobot_openspm.control.reasons import why_given_up
 from lerobot_openspm.control.state import EpisodeState, Status
-from lerobot_openspm.control.strategies import STRATEGIES, Approach
+from lerobot_openspm.control.strategies import LIFT_STEPS, STRATEGIES, Approach
 from lerobot_openspm.control.transfer import Target
 from lerobot_openspm.errors import OpenSPMError
 from lerobot_openspm.flow.condition import Query, progress
@@ -32,9 +32,11 @@ CLEAR_M = 0.04
 HELD_SHARE, OTHER_OPENING_M = 0.4, 0.012
 # Where the demonstration's fingers stood further apart than this share of open, they held something.
 HOLDING_SHARE = 0.03
-# What is carried is held up from below where the hand is so far above its place, from and to, at most so far
-# beside it, metres, and turned by at most so much, radians, after more than so many corrections.
-RISEN_M, DROP_M, BESIDE_M, LEANING_RAD, BLOCKED_CORRECTIONS = 0.012, 0.06, 0.02, 0.3, 3
+# A hand that more corrections than so many brought no closer is kept off. What is carried is held up from
+# below where the hand is so far above its place, from and to, at most so far beside it, metres, and turned
+# by at most so much, radians.
+BLOCKED_CORRECTIONS = 3
+RISEN_M, DROP_M, BESIDE_M, LEANING_RAD = 0.012, 0.06, 0.02, 0.3
 # A handle that has come along for less than this share of its way was not in the fingers.
 LEAST_TRAVEL = 0.05
 
@@ -103,7 +105,9 @@ class Executor:
         if target.axis is not None:
             # What slides or turns does so from where the hand took hold of it, be that a little off.
             target = replace(target, T_world_ee=target.axis.follow(start))
-        self.approach = Approach(start)
+        before = self.targets[index - 1].key_pose.phase if index and self.strategy.feels_fingers else ""
+        is_lifting = before == "grasp" and target.key_pose.phase in ("lift", "pre-place")
+        self.approach = Approach(start, is_lifting=is_lifting)
         self._approach_target(target)
         self._queue.clear()
 
@@ -116,6 +120,7 @@ class Executor:
             length = float(se3.distance(approach.start, target.T_world_ee))
             steps = int(np.ceil(length / self._robot.metres_per_step))
             approach.nominal_steps = max(approach.nominal_steps, steps)
+            approach.nominal_steps += LIFT_STEPS // 2 if approach.is_lifting else 0
 
     # Following it.
 

@@ -74,7 +74,8 @@ def dodged(grasp: Target, pushed_m: float, middle_m: float, open_width: float) -
         open_width: Of the gripper, metres.
     """
     side = pushed_m if abs(pushed_m) >= PUSHED_M else middle_m if abs(middle_m) >= RIM_M else 0.0
-    return float(np.sign(side)) * min(DODGE_M, _most_aside(grasp.key_pose, open_width))
+    metres = min(DODGE_M, _most_aside(grasp.key_pose, open_width))
+    return float(np.copysign(metres, side)) if side and metres >= PUSHED_M else 0.0
 
 
 def _most_aside(grasp: MemoryKeyPose, open_width: float) -> float:

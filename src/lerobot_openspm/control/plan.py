@@ -69,7 +69,7 @@ class Plan:
         around: How far it is turned where it is put on or in something round, radians.
         out: How far ``(3,)`` beside key poses the hand passes by, by their index, in the world, metres.
         shifts: How far the hand goes to one side as it takes hold, by sub-task, along its y axis, metres.
-        dodges: The same, from what kept the hand from going down there before.
+        dodges: The same, instead, from what kept the hand from going down there before.
         deeper: How much further the hand goes as it takes hold, by sub-task, along its z axis, metres.
         not_meant: By name, poses ``T_world_obj`` ``(4, 4)`` of others of its kind, which stand about.
     """
@@ -112,8 +112,7 @@ class Plan:
         if self.out:
             targets = tuple(_beside(target, self.out.get(i)) for i, target in enumerate(targets))
         targets = half_turned(targets) if self.is_half_turned else targets
-        aside = {i: self.shifts.get(i, 0.0) + self.dodges.get(i, 0.0) for i in (*self.shifts, *self.dodges)}
-        return shifted(targets, aside, self.deeper)
+        return shifted(targets, {**self.shifts, **self.dodges}, self.deeper)
 
     def grasp(self, sub_task: int, context: PlanningContext) -> Target:
         """The key pose in the scene at which a sub-task takes hold of something; it has one."""
@@ -165,31 +164,36 @@ class Plan:
     def following(self, moved: Mapping[str, Array]) -> Plan:
         """The plan with some objects elsewhere, at poses ``T_world_obj`` ``(4, 4)``, led aside nowhere yet.
 
-        Beside a place that has moved, things may stand otherwise.
+        Beside a place that has moved, things may stand otherwise. What a hand dodged is still there where
+        the object has hardly moved.
         """
-        ends = {name for one in self._puts for name in one.anchor.objects} & moved.keys()
-        went = [se3.distances(moved[name], self.object_poses.get(name, NOWHERE))[0] for name in ends]
-        plan = replace(self, object_poses={**self.object_poses, **moved}, out={}, shifts={})
-        if any(metres >= ASIDE_KEPT_M for metres in went):
+        far = {
+            name for name, T in moved.items()
+            if se3.distances(T, self.object_poses.get(name, NOWHERE))[0] >= ASIDE_KEPT_M
+        }  # fmt: skip
+        dodges = {i: metres for i, metres in self.dodges.items() if self.entry.carried.get(i) not in far}
+        poses = {**self.object_poses, **moved}
+        plan = replace(self, object_poses=poses, out={}, shifts={}, dodges=dodges)
+        if far & {name for one in self._puts for name in one.anchor.objects}:
             plan = replace(plan, aside=(0.0, 0.0), around=0.0)
         return plan
 
     def deepened(self, sub_task: int, context: PlanningContext) -> Plan | None:
-        """The plan that takes hold deeper of a load that slipped out, where the hand may go there.
+        """The plan that takes hold deeper of a load that slipped out.
 
-        None for a load that slipped out before.
+        None for one that slipped out before, and where the hand may not go deeper.
         """
         if sub_task not in self.entry.carried:
             return self  # a handle is where it is
         if sub_task in self.deeper:
             return None
         plan = replace(self, deeper={**self.deeper, sub_task: DEEPER_M})
-        return self if plan.check(context, plan.targets(context)) else plan
+        return None if plan.check(context, plan.targets(context)) else plan
 
     def dodging(self, sub_task: int, pushed_m: float, context: PlanningContext) -> Plan | None:
         """The plan that takes hold of a load a little aside of what was in the way of one finger.
 
-        None where it is not known of which, or the hand went aside before.
+        None where it is not known of which, the hand went aside before, or the arm cannot follow.
 
         Args:
             sub_task: In which the hand did not get down.
@@ -204,7 +208,8 @@ class Plan:
             own = np.array([[*context.symmetries[name].middle, 0.0]])
             middle = float(se3.apply(se3.inverse(grasp.T_world_ee) @ self.object_poses[name], own)[0, 1])
         metres = dodged(grasp, pushed_m, middle, context.robot.open_width)
-        plan = replace(self, dodges={**self.dodges, sub_task: metres})
+        shifts = {i: m for i, m in self.shifts.items() if i != sub_task}
+        plan = replace(self, shifts=shifts, dodges={**self.dodges, sub_task: metres})
         return plan if metres and not plan.followed(context)[1] else None
 
     def as_if_in_place(
@@ -254,7 +259,9 @@ class Plan:
         arm = context.robot.arm
         if arm is None or self.stance is None:
             return FURTHER_M[0]
-        return reach_left(self.targets(context), arm, self.stance)
+        # Turning the grasps leaves the hand where it is at a handle.
+        carrying = [one for one in self.targets(context) if one.key_pose.sub_task in self.entry.carried]
+        return reach_left(carrying, arm, self.stance)
 
     def backing_off(self, context: PlanningContext) -> tuple[Plan, Miss | None]:
         """The plan, backing off as far as the arm reaches, and the first key pose that it does not reach.

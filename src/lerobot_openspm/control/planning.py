@@ -204,22 +204,22 @@ class PlanningContext:
         return tried, occupied
 
     def otherwise(self, plan: Plan, sub_task: int) -> Plan:
-        """A plan that takes hold from another side, the furthest that the arm can follow; else the plan."""
-        plan = replace(plan, shifts={}, dodges={})  # they lead a hand that grasps from another side elsewhere
-        ways = [replace(way, is_half_turned=half) for way in plan.turns(self) for half in (False, True)]
+        """A plan that takes hold from another side, the furthest as clear; itself if the arm follows none."""
+        straight = replace(plan, shifts={}, dodges={})  # they would lead the hand elsewhere there
+        ways = [replace(way, is_half_turned=half) for way in straight.turns(self) for half in (False, True)]
         kept_from, *grasps = (way.grasp(sub_task, self) for way in (plan, *ways))
         order = fingers_elsewhere(kept_from, grasps, plan.T_world_ee, self.robot.open_width)
-        out = [replace(ways[i], out=self._ways_out(ways[i])) for i in order]
-        found = self._clearest(out, self._points(plan))
-        return self._with_finger_room(plan if found is None else found[0])
+        allowed = (ways[i] for i in order if not ways[i].check(self, ways[i].targets(self)))
+        led = [replace(way, out=self._ways_out(way)) for way in allowed]
+        found = self._clearest(led, self._points(plan))
+        return plan if found is None else self._with_finger_room(found[0])
 
     def _clearest(
         self, turned: Sequence[Plan], points: Mapping[str, Array]
     ) -> tuple[Plan, dict[str, int]] | None:
         """The first of some plans that the arm can follow, unless the hand is in much less of others in one.
 
-        One that stretches the arm out comes after others as clear, the more it does. None where the arm can
-        follow none.
+        One that stretches the arm out comes after others as clear, the more the later. None if none can be.
 
         Args:
             turned: A plan with its grasps turned, see :meth:`Plan.turns`.
@@ -228,40 +228,41 @@ class PlanningContext:
         Returns:
             The plan, and how much of what the hand is in, see :func:`crowding`.
         """
-        ways = list[tuple[Plan, dict[str, int]]]()
-        for plan in turned:
-            targets = plan.targets(self)
-            if not plan.check(self, targets):
-                ways.append((plan, crowding(plan.entry, targets, points, self.hand_radius_m)))
-        stretched, most = None, -1.0
-        for plan, inside in _clearest_first(ways):
-            if stretched and sum(inside.values()) > max(MUCH_MORE * _amount(stretched), FEW_POINTS):
+        stretched, most, limit, hopeless = None, -1.0, np.inf, set[bool]()
+        for plan, inside in _clearest_first(self._crowded(turned, points)):
+            if sum(inside.values()) > limit:
                 break
+            if plan.is_half_turned in hopeless:
+                continue
             reaching, miss = plan.backing_off(self)
             if miss is None:
                 if (left := reaching.reach_left(self)) == FURTHER_M[0]:
                     return reaching, inside
+                limit = min(limit, max(MUCH_MORE * sum(inside.values()), FEW_POINTS))
                 if left > most:
                     stretched, most = (reaching, inside), left
             elif miss.target.key_pose.sub_task not in plan.symmetric_grasps(self):
-                break  # turning the grasps leaves it where it is
+                hopeless.add(plan.is_half_turned)  # turning the grasps leaves it where it is
         return stretched
 
     def _beside(
         self, plan: Plan, inside: Mapping[str, int], points: Mapping[str, Array]
     ) -> list[tuple[Plan, dict[str, int]]]:
         """The plan that puts things down turned or a little beside their place, if that is much clearer."""
-        ways = list[tuple[Plan, dict[str, int]]]()
-        for way in plan.otherwise_put(self):
-            targets = way.targets(self)
-            if not way.check(self, targets):
-                ways.append((way, crowding(way.entry, targets, points, self.hand_radius_m)))
-        for way in sorted(ways, key=_amount):
+        for way in sorted(self._crowded(plan.otherwise_put(self), points), key=_amount):
             if MUCH_MORE * _amount(way) >= sum(inside.values()):
                 break
             if way[0].miss(self, way[0].targets(self)) is None:
                 return [way]
         return []
+
+    def _crowded(
+        self, plans: Sequence[Plan], points: Mapping[str, Array]
+    ) -> list[tuple[Plan, dict[str, int]]]:
+        """Of some plans those within the limits of transfer, each with how much of what the hand is in."""
+        allowed = [plan for plan in plans if not plan.check(self, plan.targets(self))]
+        radius = self.hand_radius_m
+        return [(one, crowding(one.entry, one.targets(self), points, radius)) for one in allowed]
 
     def _points(self, plan: Plan) -> dict[str, Array]:
         """Points ``(n, 3)`` in the world of the objects that were found and whose shape is known."""
@@ -305,7 +306,8 @@ class PlanningContext:
 
     def _with_finger_room(self, plan: Plan) -> Plan:
         """A plan that takes hold beside what stands close, where the arm can follow it so."""
-        shifts = finger_room(plan.entry, plan.targets(self), self._points(plan), self.robot.open_width)
+        room = finger_room(plan.entry, plan.targets(self), self._points(plan), self.robot.open_width)
+        shifts = {i: metres for i, metres in room.items() if i not in plan.dodges}
         aside = replace(plan, shifts=shifts)
         return plan if not shifts or aside.followed(self)[1] else aside
 

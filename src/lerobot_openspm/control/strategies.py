@@ -44,6 +44,7 @@ class Approach:
         corrected_at: Where the hand was then, ``T_world_ee`` ``(4, 4)``.
         is_blocked: Whether that correction brought the hand no closer, and it stands still.
         travelled: How far a drawer or a knob has followed the hand, metres or radians.
+        is_lifting: Whether something was just taken hold of, and is lifted off where it stood.
     """
 
     start: Array
@@ -55,6 +56,12 @@ class Approach:
     corrected_at: Array | None = None
     is_blocked: bool = False
     travelled: float = 0.0
+    is_lifting: bool = False
+
+    @property
+    def speed(self) -> float:
+        """The share of its speed that the hand goes at: a lift comes up to it slowly."""
+        return min(1.0, (self.steps + 1) / LIFT_STEPS) if self.is_lifting else 1.0
 
     @property
     def is_time_up(self) -> bool:
@@ -66,7 +73,7 @@ class ClosedLoop:
     """Every chunk is planned from where the hand is; a key pose is met when it is near or its time is up."""
 
     measures = True  # whether the hand and the scene are looked at once there is a plan
-    feels_fingers = False  # whether a grip that was lost is noticed
+    feels_fingers = False  # whether a grip that was lost is noticed, and a lift begins slowly
 
     def __init__(self, robot: RobotModel):
         self._robot = robot
@@ -101,6 +108,8 @@ class ClosedLoop:
         Sideways the hand yields to what the fingers meet. Along its approach axis it does not: fingers that
         close on a slope push it back, and off what they hold.
         """
+        if not target.key_pose.closed:
+            return self.toward(target, here)
         along = here[:3, 2]
         back = float(along @ (here[:3, 3] - target.T_world_ee[:3, 3]))
         firm = here.copy()
@@ -141,14 +150,9 @@ class ClosedLoopTRC(ClosedLoop):
 
     def from_chunk(self, action: Array, target: Target, approach: Approach, hand: Hand) -> Array:
         """The flow model's action, kept on the path of a push, and slow where a lift begins."""
-        match target.key_pose.phase:
-            case "push":
-                return self._kept_on_way(action, target, approach, hand)
-            case "lift":
-                share = min(1.0, (approach.steps + 1) / LIFT_STEPS)
-                return np.append(share * action[:6], action[6])
-            case _:
-                return action
+        if target.key_pose.phase == "push":
+            return self._kept_on_way(action, target, approach, hand)
+        return np.append(approach.speed * action[:6], action[6])
 
     def correct(self, target: Target, approach: Approach, hand: Hand) -> Array | None:
         """Make good what the flow model has left of the way, once its time is up."""
@@ -162,7 +166,7 @@ class ClosedLoopTRC(ClosedLoop):
             approach.is_blocked = is_still and left > STUCK_SHARE * approach.left
             approach.left, approach.corrected_at = left, hand.T_world_ee
         approach.late_steps += 1
-        share = min(1.0, CORRECTION_SHARE * approach.corrections)
+        share = approach.speed * min(1.0, CORRECTION_SHARE * approach.corrections)
         return self.toward(target, hand.T_world_ee, share)
 
     def _kept_on_way(self, action: Array, target: Target, approach: Approach, hand: Hand) -> Array:
