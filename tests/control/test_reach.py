@@ -5,21 +5,21 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
-from tests.control.acting import HAND, Perception, controller, observe, planning_context, watch
+from tests.control.acting import planning_context
 from tests.geometry.test_arm import LIBERO
 from tests.memory.builders import entry, hand_pose, key_pose, robot
 
 from lerobot_openspm.control import feasibility
 from lerobot_openspm.control.feasibility import MAX_JUMP_RAD, TransferLimits, find_stance
 from lerobot_openspm.control.joint_room import FURTHER_M
-from lerobot_openspm.control.plan import DEEPER_M, Plan
+from lerobot_openspm.control.plan import Plan
 from lerobot_openspm.control.transfer import RETREAT_M, transfer
 from lerobot_openspm.geometry import se3
 from lerobot_openspm.geometry.arm import load_arm
 from lerobot_openspm.memory.compose import Candidate
 from lerobot_openspm.memory.entry import WORLD, Anchor, Axis
 from lerobot_openspm.memory.retrieval import Scored
-from lerobot_openspm.types import Hand, Symmetry
+from lerobot_openspm.types import Symmetry
 
 
 @pytest.fixture
@@ -275,106 +275,3 @@ def test_a_drawer_that_cannot_be_opened_all_the_way_is_refused(panda):
     context, _, _ = scene(panda, 0.0)
     _, (problem,) = chosen(replace(context, entries=(shown,)), poses, hand_pose(-0.22, -0.01, 1.177))
     assert "(open at cabinet)" in problem
-
-
-# A bowl that is held over its middle has the fingers furthest from where they were after a quarter.
-@pytest.mark.parametrize(
-    ("turn", "tracking", "expected"),
-    [(0.0, True, 90), (0.0, False, 90), (np.pi / 2, True, 90), (np.pi, True, 0), (None, True, 0)],
-)
-def test_a_grasp_that_the_hand_is_kept_from_is_tried_again_from_another_side(turn, tracking, expected):
-    shown, symmetries = entry(), {} if turn is None else {"bowl": Symmetry(np.zeros(2), turn)}
-    perception = Perception(shown.object_poses)
-    one = controller(shown, symmetries=symmetries, tracking=tracking)
-    observe(one, HAND, perception)
-    grasp = next(i for i, target in enumerate(one.executor.targets) if target.key_pose.phase == "grasp")
-    before = one.executor.targets[grasp].T_world_ee
-    held_up = se3.transform(before[:3, :3], before[:3, 3] + [0.0, 0.0, 0.03])
-    one.executor.begin(one.executor.targets, HAND, grasp - 1)
-    for _ in range(300):
-        watch(one, perception, Hand(held_up, HAND.opening), 1)
-        if one.state.attempts:
-            break
-    assert one.state.attempts == 1
-    turned = float(se3.distances(one.executor.targets[grasp].T_world_ee, before)[1])
-    assert_allclose(np.rad2deg(turned), expected, atol=1e-4)
-
-
-def test_what_slipped_out_is_grasped_again_as_it_was_but_deeper():
-    shown = entry()
-    perception = Perception(shown.object_poses)
-    one = controller(shown, symmetries={"bowl": Symmetry(np.zeros(2), 0.0)})
-    observe(one, HAND, perception)
-    grasp = next(i for i, target in enumerate(one.executor.targets) if target.key_pose.phase == "grasp")
-    before = one.executor.targets[grasp].T_world_ee
-    one.executor.begin(one.executor.targets, HAND, grasp + 1)
-    watch(one, perception, Hand(before, 0.0), 1)
-    assert one.state.attempts == 1
-    deeper = before @ se3.transform(np.eye(3), [0.0, 0.0, DEEPER_M])
-    assert_allclose(one.executor.targets[grasp].T_world_ee, deeper, atol=1e-9)
-    as_shown = Plan(shown, shown.object_poses, HAND.T_world_ee)
-    lift = as_shown.targets(planning_context())[grasp + 1]
-    assert_allclose(one.executor.targets[grasp + 1].T_world_ee, lift.T_world_ee, atol=1e-9)
-    # What slips out again is grasped from another side.
-    one.executor.begin(one.executor.targets, HAND, grasp + 1)
-    watch(one, perception, Hand(before, 0.0), 1)
-    assert one.state.attempts == 2
-    turned = float(se3.distances(one.executor.targets[grasp].T_world_ee, before)[1])
-    assert_allclose(np.rad2deg(turned), 90, atol=1e-4)
-
-
-def test_nothing_is_grasped_deeper_than_the_hand_may_go_nor_twice():
-    plan, context = Plan(entry(), entry().object_poses, HAND.T_world_ee), planning_context()
-    lowest = min(target.T_world_ee[2, 3] for target in plan.targets(context))
-    low, high = context.robot.workspace
-    own = replace(context.robot, workspace=np.array([[*low[:2], lowest], high]))
-    tight, wide = (
-        replace(context, robot=own, limits=TransferLimits(min_clearance_m=metres))
-        for metres in (0.004, 0.012)
-    )
-    assert plan.deepened(0, tight) is None
-    once = plan.deepened(0, wide)
-    assert once is not None
-    assert once.deeper == {0: DEEPER_M}
-    assert once.deepened(0, wide) is None
-
-
-# The demonstrated opening leaves so much room that the hand may go aside by 2 cm.
-@pytest.mark.parametrize(
-    ("pushed", "middle", "expected"),
-    [
-        (0.012, None, 0.02),
-        (-0.012, 0.05, -0.02),
-        (0.002, None, None),
-        (0.002, 0.01, None),
-        (0.002, -0.05, -0.02),
-    ],
-)
-def test_a_hand_that_one_finger_keeps_off_goes_a_little_aside_once(pushed, middle, expected):
-    context = planning_context()
-    if middle is not None:  # of the bowl, that far from the hand along the axis over which the fingers open
-        T_ee_bowl = se3.inverse(
-            Plan(entry(), entry().object_poses, HAND.T_world_ee).grasp(0, context).T_world_ee
-        )
-        T_ee_bowl = T_ee_bowl @ entry().object_poses["bowl"]
-        (own,) = se3.apply(se3.inverse(T_ee_bowl), np.array([[0.0, middle, T_ee_bowl[2, 3]]]))
-        context = planning_context(symmetries={"bowl": Symmetry(own[:2], 0.0)})
-    plan = Plan(entry(), entry().object_poses, HAND.T_world_ee)
-    aside = plan.dodging(0, pushed, context)
-    assert (aside is None) == (expected is None)
-    if aside is None:
-        return
-    before, after = plan.targets(context), aside.targets(context)
-    for i, target in enumerate(before):
-        y = (se3.inverse(target.T_world_ee) @ after[i].T_world_ee)[1, 3]
-        is_aside = target.key_pose.phase in ("approach", "grasp")
-        assert y == pytest.approx(expected if is_aside else 0.0, abs=2e-3)
-    assert aside.dodging(0, pushed, context) is None
-    # Objects that are seen a little elsewhere leave it so; what stood in the way is not beside one that is gone.
-    for metres, dodges in ((0.01, aside.dodges), (0.1, {})):
-        bowl = se3.from_yaw([metres, 0.0, 0.0], 0.0) @ plan.object_poses["bowl"]
-        assert aside.following({"bowl": bowl}).dodges == dodges
-    # It goes aside from where it was shown, and nowhere else.
-    shifted = replace(plan, shifts={0: 0.012}).dodging(0, pushed, context)
-    assert shifted is not None
-    assert shifted.shifts == {}
