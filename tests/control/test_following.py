@@ -10,6 +10,7 @@ from tests.memory.builders import OPEN_WIDTH, entry
 
 from lerobot_openspm.control.plan import MOVED_M
 from lerobot_openspm.control.state import Status
+from lerobot_openspm.geometry import se3
 from lerobot_openspm.perception.tracking.tracker import TrackStatus
 from lerobot_openspm.types import Hand
 
@@ -102,6 +103,16 @@ def test_an_object_that_jumps_under_the_hand_is_approached_from_above_again():
     perception.object_poses["bowl"] = shifted(entry().object_poses["bowl"], 0.10)
     watch(one, perception, HAND, 10)
     assert one.state.index == 0
+
+
+def test_an_object_that_jumps_is_approached_from_where_the_hand_is():
+    first, *others = entry().key_poses
+    far = replace(first, T_obj_ee=se3.from_yaw([-0.3, 0.0, 0.1], 0.0) @ first.T_obj_ee)
+    perception, one = Perception(entry().object_poses), controller(entry(key_poses=(far, first, *others)))
+    hand = advanced(one, perception, 2)  # above the bowl, on the way down
+    perception.object_poses["bowl"] = shifted(entry().object_poses["bowl"], 0.05)
+    watch(one, perception, hand, 10)
+    assert one.state.index == 1
 
 
 def test_the_landmark_that_jumps_does_not_send_a_held_object_back():

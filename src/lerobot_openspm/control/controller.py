@@ -230,7 +230,7 @@ class EpisodeController:
             logger.info("%r: moved: %s", self.instruction, ", ".join(sorted(changed)))
             # From further off, if what is approached has jumped aside.
             if executor.target is not None and moved & set(self._now_needed()):
-                self._begin(executor.way_index(), hand)
+                self._begin(executor.way_index(hand), hand)
             else:
                 executor.change(self._targets())
         self._wait_for_what_is_needed(hand)
@@ -262,7 +262,7 @@ class EpisodeController:
             return
         if state.status is Status.OBJECT_LOST:
             state.refusal = ""
-            self._begin(self.executor.way_index(), hand)
+            self._begin(self.executor.way_index(hand), hand)
         is_paused = scene.is_blind or scene.those(TrackStatus.STALE, needed)
         state.go(Status.PAUSED if is_paused else Status.RUNNING)
 
@@ -280,7 +280,7 @@ class EpisodeController:
         # With the object still in the hand only the way to its place is gone again.
         present, has_slipped = executor.present.key_pose, executor.has_lost_grip(hand)
         is_in_hand = bool(self.scene.tracker.held) and present.phase == "place" and not has_slipped
-        index = executor.way_index() if is_in_hand else executor.contact_index(hand)
+        index = executor.way_index(hand) if is_in_hand else executor.contact_index(hand)
         own, plan = present.sub_task, replace(state.plan, T_world_ee=hand.T_world_ee)
         if executor.was_kept_from_grasping(hand):
             plan = plan.dodging(own, executor.pushed_aside(hand), context) or context.otherwise(plan, own)

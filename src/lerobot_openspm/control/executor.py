@@ -302,8 +302,10 @@ class Executor:
         logger.info("trying key pose %d (%s) again: %s", self.state.index, phase, why)
         return True
 
-    def way_index(self) -> int:
-        """The first key pose of the way to the present one, at the same anchor and after the last contact."""
+    def way_index(self, hand: Hand) -> int:
+        """Where the way to the present key pose begins, at its anchor and after the last contact."""
+        if self.present.key_pose.phase == "approach":
+            return self.contact_index(hand)
         index, place = self.state.index, self.present.key_pose.anchor.place
         while index > 0:
             before = self.targets[index - 1].key_pose
