@@ -162,3 +162,21 @@ def test_a_lift_comes_up_to_speed_slowly_and_nothing_else_does():
     assert len(steps) > 10
     assert_allclose(speeds["lift"], np.minimum(steps / LIFT_STEPS, 1.0), atol=1e-9)
     assert set(speeds["pre-place"]) == {1.0}
+
+
+def test_a_lift_over_several_key_poses_comes_up_to_speed_once():
+    executor = make()
+    lift = next(i for i, one in enumerate(executor.targets) if one.key_pose.phase == "lift")
+    at = Hand(executor.targets[lift - 1].T_world_ee, 0.03)
+    executor.begin(executor.targets, at, lift)
+    assert executor.approach.lifted == 0
+    executor.approach.steps = 5
+    executor.state.index = lift
+    short = Hand(executor.targets[lift].T_world_ee, 0.03)
+    assert not executor.advance(short)
+    assert executor.state.index == lift + 1
+    assert executor.approach.speed == pytest.approx(6 / LIFT_STEPS)
+    executor.begin(executor.targets, Hand(HOME, OPEN_WIDTH), 0)
+    executor.approach.steps = LIFT_STEPS
+    executor.begin(executor.targets, Hand(HOME, OPEN_WIDTH), 1)
+    assert executor.approach.speed == 1.0

@@ -107,7 +107,7 @@ class Executor:
             target = replace(target, T_world_ee=target.axis.follow(start))
         before = self.targets[index - 1].key_pose.phase if index and self.strategy.feels_fingers else ""
         is_lifting = before == "grasp" and target.key_pose.phase in ("lift", "pre-place")
-        self.approach = Approach(start, is_lifting=is_lifting)
+        self.approach = Approach(start, lifted=0 if is_lifting else self.approach.lifted_so_far)
         self._approach_target(target)
         self._queue.clear()
 
@@ -120,7 +120,7 @@ class Executor:
             length = float(se3.distance(approach.start, target.T_world_ee))
             steps = int(np.ceil(length / self._robot.metres_per_step))
             approach.nominal_steps = max(approach.nominal_steps, steps)
-            approach.nominal_steps += LIFT_STEPS // 2 if approach.is_lifting else 0
+            approach.nominal_steps += (LIFT_STEPS - approach.lifted) // 2
 
     # Following it.
 

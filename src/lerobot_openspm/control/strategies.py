@@ -44,7 +44,7 @@ class Approach:
         corrected_at: Where the hand was then, ``T_world_ee`` ``(4, 4)``.
         is_blocked: Whether that correction brought the hand no closer, and it stands still.
         travelled: How far a drawer or a knob has followed the hand, metres or radians.
-        is_lifting: Whether something was just taken hold of, and is lifted off where it stood.
+        lifted: Steps that the hand was on its way with what it has just taken hold of as this way began.
     """
 
     start: Array
@@ -56,12 +56,17 @@ class Approach:
     corrected_at: Array | None = None
     is_blocked: bool = False
     travelled: float = 0.0
-    is_lifting: bool = False
+    lifted: int = LIFT_STEPS
+
+    @property
+    def lifted_so_far(self) -> int:
+        """The steps by now that :attr:`lifted` counts; from LIFT_STEPS on they make no difference."""
+        return min(self.lifted + self.steps, LIFT_STEPS)
 
     @property
     def speed(self) -> float:
         """The share of its speed that the hand goes at: a lift comes up to it slowly."""
-        return min(1.0, (self.steps + 1) / LIFT_STEPS) if self.is_lifting else 1.0
+        return min(1.0, (self.lifted_so_far + 1) / LIFT_STEPS)
 
     @property
     def is_time_up(self) -> bool:

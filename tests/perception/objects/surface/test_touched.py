@@ -19,8 +19,10 @@ from lerobot_openspm.perception.objects.surface.model import SurfaceModel
 from lerobot_openspm.perception.objects.surface.search import Place
 from lerobot_openspm.perception.objects.surface.shown import visible_share
 from lerobot_openspm.perception.objects.surface.touched import (
+    COVERED_M,
     Touched,
     _is_steady,
+    covering,
     middle,
     poses_beside,
     poses_by_touch,
@@ -266,3 +268,22 @@ def test_the_table_is_what_most_shows_and_not_what_fills_a_bin(grey_share, is_wo
     )
     colour, _ = frequent_colour(np.concatenate([grey, wood]).astype(np.float32))
     assert (colour.mean[0] > 30) == is_wood
+
+
+def test_places_that_demonstrations_showed_further_apart_are_all_remembered():
+    rng = np.random.default_rng(4)
+    xy = rng.uniform([-0.06, -0.03], [0.06, 0.03], (12, 2))
+    poses = [None if i == 5 else se3.from_yaw([*one, 1.1], 0.0) for i, one in enumerate(xy)]
+    groups = covering(poses)
+    places = np.array([place for _, place, _ in groups])
+    own = [[T for T in group if T is not None] for *_, group in groups]
+    assert sum(map(len, own)) == 11
+    for place, group in zip(places, own, strict=True):
+        assert all(np.linalg.norm(T[:3, 3] - place) <= COVERED_M for T in group)
+    assert 2 < len(groups) < 11
+    np.testing.assert_allclose(places[0], middle(poses))
+    # Where all stand alike the middle is enough.
+    near = [se3.from_yaw([x, 0.0, 1.1], 0.0) for x in (-0.02, 0.0, 0.02)]
+    ((number, place, group),) = covering(near)
+    assert (number, group) == (0, near)
+    np.testing.assert_allclose(place, [0.0, 0.0, 1.1])

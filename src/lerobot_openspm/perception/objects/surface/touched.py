@@ -40,6 +40,8 @@ ALIKE_SHARE, STEADY_SHARE, STEADY_M, MIN_STEADY = 0.7, 0.45, 0.015, 3
 AROUND_M = 0.12
 # What stands this much higher than on the table stands on something else, metres.
 RAISED_M = 0.02
+# Where it is sought again, a remembered place covers what stood so near to it, metres.
+COVERED_M = 0.025
 
 
 @dataclass(frozen=True)
@@ -205,7 +207,10 @@ def with_places(model: SurfaceModel, stood: Standing, scenes: Sequence[Demonstra
 
     Of what first pictures show badly the films tell what is usual.
     """
-    places = [[*middle(poses), _seen_first(model, scenes, poses)] for poses in stood.poses[:MAX_SHOWN]]
+    groups = [group for poses in stood.poses for group in covering(poses)]
+    # The middle of every place comes first, in case they are too many.
+    groups.sort(key=lambda group: group[0])
+    places = [[*place, _seen_first(model, scenes, poses)] for _, place, poses in groups[:MAX_SHOWN]]
     shown = np.array(places).reshape(-1, 4)
     if stood.touched.is_seen:
         return replace(model, shown=shown)
@@ -216,6 +221,29 @@ def with_places(model: SurfaceModel, stood: Standing, scenes: Sequence[Demonstra
     surface = replace(model.surface, points=model.surface.points - middle_xy)
     shown[:, :3] += middle_xy
     return replace(model, surface=surface, shown=shown, typical_agreement=typical, rival_agreement=rival)
+
+
+def covering(poses: Sequence[Array | None]) -> list[tuple[int, Array, list[Array | None]]]:
+    """The middle of some poses ``(4, 4)``, and some of them until all are near to one of these.
+
+    Returns:
+        Their numbers, places ``(3,)``, and the poses that are nearest to each.
+    """
+    own = np.array([[np.inf] * 3 if T is None else T[:3, 3] for T in poses])
+    is_there = np.isfinite(own[:, 0])
+    places = [middle(poses)]
+    while True:
+        away = np.linalg.norm(own[:, None] - np.array(places), axis=2)
+        furthest = int(np.where(is_there, away.min(1), 0.0).argmax())
+        if not is_there[furthest] or away[furthest].min() <= COVERED_M:
+            break
+        places.append(own[furthest])
+    nearest = away.argmin(1)
+    groups = [
+        (i, place, [T if nearest[k] == i else None for k, T in enumerate(poses)])
+        for i, place in enumerate(places)
+    ]
+    return [group for group in groups if any(T is not None for T in group[2])]
 
 
 def _seen_first(
