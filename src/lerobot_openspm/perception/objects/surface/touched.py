@@ -27,7 +27,7 @@ from lerobot_openspm.perception.objects.surface.search import (
     search,
     settle,
 )
-from lerobot_openspm.perception.objects.surface.shown import MAX_SHOWN
+from lerobot_openspm.perception.objects.surface.shown import KEPT_SHARE, MAX_SHOWN
 from lerobot_openspm.perception.objects.surface.sight import Sight, Surface, sight_of, sights_of
 from lerobot_openspm.types import ContactCue, DemonstrationScene, Moment, View
 
@@ -207,11 +207,8 @@ def with_places(model: SurfaceModel, stood: Standing, scenes: Sequence[Demonstra
 
     Of what first pictures show badly the films tell what is usual.
     """
-    groups = [group for poses in stood.poses for group in covering(poses)]
-    # The middle of every place comes first, in case they are too many.
-    groups.sort(key=lambda group: group[0])
-    places = [[*place, _seen_first(model, scenes, poses)] for _, place, poses in groups[:MAX_SHOWN]]
-    shown = np.array(places).reshape(-1, 4)
+    places = [one for poses in stood.poses for one in _places_shown(model, poses, scenes)]
+    shown = np.array(places[:MAX_SHOWN]).reshape(-1, 4)
     if stood.touched.is_seen:
         return replace(model, shown=shown)
     typical = float(np.clip(stood.agreement, 0.05, 1.0))
@@ -223,11 +220,23 @@ def with_places(model: SurfaceModel, stood: Standing, scenes: Sequence[Demonstra
     return replace(model, surface=surface, shown=shown, typical_agreement=typical, rival_agreement=rival)
 
 
-def covering(poses: Sequence[Array | None]) -> list[tuple[int, Array, list[Array | None]]]:
+def _places_shown(
+    model: SurfaceModel, poses: Sequence[Array | None], scenes: Sequence[DemonstrationScene]
+) -> list[list[float]]:
+    """Places (x, y, z) of an object's poses, and how well first pictures agree with it there.
+
+    What they agree with much less than usual at a place was not there.
+    """
+    usual = _seen_first(model, scenes, poses)
+    own = [(place, _seen_first(model, scenes, near)) for place, near in covering(poses)]
+    return [[*place, agreed] for place, agreed in own if agreed >= KEPT_SHARE * usual]
+
+
+def covering(poses: Sequence[Array | None]) -> list[tuple[Array, list[Array | None]]]:
     """The middle of some poses ``(4, 4)``, and some of them until all are near to one of these.
 
     Returns:
-        Their numbers, places ``(3,)``, and the poses that are nearest to each.
+        Their places ``(3,)``, and the poses that are nearest to each.
     """
     own = np.array([[np.inf] * 3 if T is None else T[:3, 3] for T in poses])
     is_there = np.isfinite(own[:, 0])
@@ -240,10 +249,10 @@ def covering(poses: Sequence[Array | None]) -> list[tuple[int, Array, list[Array
         places.append(own[furthest])
     nearest = away.argmin(1)
     groups = [
-        (i, place, [T if nearest[k] == i else None for k, T in enumerate(poses)])
+        (place, [T if nearest[k] == i else None for k, T in enumerate(poses)])
         for i, place in enumerate(places)
     ]
-    return [group for group in groups if any(T is not None for T in group[2])]
+    return [group for group in groups if any(T is not None for T in group[1])]
 
 
 def _seen_first(
