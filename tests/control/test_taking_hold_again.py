@@ -9,8 +9,9 @@ from tests.control.acting import HAND, Perception, controller, observe, planning
 from tests.control.test_executor import ROBOT, make
 from tests.memory.builders import entry
 
-from lerobot_openspm.control.feasibility import TransferLimits
+from lerobot_openspm.control.feasibility import Miss, TransferLimits
 from lerobot_openspm.control.plan import DEEPER_M, Plan
+from lerobot_openspm.control.planning import FEW_POINTS
 from lerobot_openspm.control.state import Status
 from lerobot_openspm.geometry import se3
 from lerobot_openspm.types import Hand, Symmetry
@@ -174,3 +175,34 @@ def test_a_hand_keeps_its_depth_while_the_fingers_close_and_not_while_they_open(
         action = executor.next_action(back)
         assert action is not None
         assert float(action[:3] @ T[:3, 2]) * ROBOT.metres_per_action == pytest.approx(share * 0.004)
+
+
+def test_a_key_pose_that_is_out_of_reach_one_way_round_leaves_the_other(monkeypatch):
+    context = planning_context()
+    plan = Plan(entry(), entry().object_poses, HAND.T_world_ee)
+    half = replace(plan, is_half_turned=True)
+    place = next(one for one in plan.targets(context) if one.key_pose.phase == "place")
+    miss = Miss(5, place, 0.1, 0.0)
+    monkeypatch.setattr(
+        Plan, "backing_off", lambda self, context: (self, miss if self.is_half_turned else None)
+    )
+    for ways in ([half, plan], [plan, half]):
+        found = context._clearest(ways, {})
+        assert found is not None
+        assert not found[0].is_half_turned
+    assert context._clearest([half, half], {}) is None
+
+
+def test_a_stretched_arm_is_not_led_step_by_step_into_other_things(monkeypatch):
+    context = planning_context()
+    plan = Plan(entry(), entry().object_poses, HAND.T_world_ee)
+    # What reaches further is each time in twice as much of something.
+    inside = {i: {"box": points} for i, points in enumerate((0, 10, 20, 40))}
+    ways = [replace(plan, turned=float(i)) for i in inside]
+    crowded = [(way, inside[round(way.turned)]) for way in ways]
+    monkeypatch.setattr(type(context), "_crowded", lambda self, plans, points: crowded)
+    monkeypatch.setattr(Plan, "backing_off", lambda self, context: (self, None))
+    monkeypatch.setattr(Plan, "reach_left", lambda self, context: 0.005 + 0.01 * self.turned)
+    found = context._clearest(ways, {})
+    assert found is not None
+    assert sum(found[1].values()) <= FEW_POINTS
