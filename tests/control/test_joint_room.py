@@ -7,14 +7,16 @@ import pytest
 from numpy.testing import assert_allclose
 from tests.control.acting import planning_context
 from tests.geometry.test_arm import LIBERO
-from tests.memory.builders import hand_pose, robot
+from tests.memory.builders import hand_pose, key_pose, robot
 
 from lerobot_openspm.control.feasibility import find_stance
 from lerobot_openspm.control.joint_room import OUT_M, ROOM_RAD, ways_out
 from lerobot_openspm.control.plan import Plan
+from lerobot_openspm.control.strategies import CORRECTION_STEPS, OUTWARD_STEPS, Approach, ClosedLoopTRC
+from lerobot_openspm.control.transfer import Target
 from lerobot_openspm.geometry import se3
 from lerobot_openspm.geometry.arm import load_arm
-from lerobot_openspm.types import Symmetry
+from lerobot_openspm.types import Hand, Symmetry
 
 HOME = hand_pose(-0.2, 0.0, 1.17)
 NEAR, FAR = [-0.41, 0.2, 0.9], [-0.1, 0.1, 0.9]
@@ -123,3 +125,36 @@ def test_a_way_out_that_cannot_be_followed_is_not_taken_and_that_is_said(panda, 
     monkeypatch.setattr(Plan, "followed", lambda self, context: (self, ["too far"] if self.out else []))
     assert context.clear(plan) is plan
     assert "a joint comes near its limit as the hand rises: led further out, too far" in caplog.text
+
+
+@pytest.mark.parametrize(
+    ("hand_m", "target_m", "is_known", "is_pushed"),
+    [
+        (0.72, 0.695, True, True),
+        (0.72, 0.718, True, False),  # it is where it should be
+        (0.72, 0.74, True, False),  # that only presses it against what is in its way
+        (0.50, 0.475, True, False),  # its elbow is far from turned over
+        (0.72, 0.695, False, False),
+    ],
+)
+def test_a_stretched_arm_that_does_not_come_in_is_pushed_outwards_once(
+    panda, hand_m, target_m, is_known, is_pushed
+):
+    ahead = np.array([0.8, -0.6, 0.0])
+    here, there = (hand_pose(*(panda.base + metres * ahead)[:2], 1.34) for metres in (hand_m, target_m))
+    strategy = ClosedLoopTRC(robot(arm=panda if is_known else None))
+    target = Target(there, key_pose("plate", np.eye(4), "place", closed=True), precise=True)
+    approach, pushes, blocked = Approach(here), list[int](), list[bool]()
+    for step in range(5 * CORRECTION_STEPS + OUTWARD_STEPS):
+        action = strategy.correct(target, approach, Hand(here, 0.03))
+        assert action is not None
+        if action[2] == 1.0:
+            assert_allclose(action[:2], [1.0, -0.75])
+            pushes.append(step)
+        assert_allclose(action[6], strategy.toward(target, here)[6])
+        blocked.append(approach.is_blocked)
+    n = OUTWARD_STEPS if is_pushed else 0
+    assert pushes == list(range(CORRECTION_STEPS, CORRECTION_STEPS + n))
+    # While it is pushed it is not given up; afterwards it is, if that did not help.
+    assert not any(blocked[: CORRECTION_STEPS + n])
+    assert blocked[-1]

@@ -5,7 +5,7 @@ no way left to go, and a controller that moves the hand straight on gets stuck t
 goes as it was shown: the longer it is on its way so close to the base, the further the arm drifts.
 
 An arm that is stretched out has no room either: carried on a little further, its elbow turns over, and from
-there a pull inwards only presses the elbow against its limit.
+there a pull inwards only presses the elbow against its limit. Pushed outwards, it turns back.
 """
 
 from __future__ import annotations
@@ -26,6 +26,8 @@ ROOM_RAD = np.deg2rad(15)
 OUT_M = tuple(np.arange(0.01, 0.125, 0.01).tolist())
 # An arm that cannot go on by the first of these is stretched, metres: by half of that the hand overshoots.
 FURTHER_M = (0.045, 0.035, 0.025, 0.015, 0.005)
+# A hand whose elbow is turned over stays further out than it should by at least this, metres.
+TOO_FAR_OUT_M = 0.004
 
 
 def ways_out(targets: Sequence[Target], arm: Arm, stance: Array) -> dict[int, Array]:
@@ -69,6 +71,19 @@ def reach_left(targets: Sequence[Target], arm: Arm, stance: Array) -> float:
                 if _reaches(arm, further, arm.onwards(further, stance, stance)):
                     break
     return left
+
+
+def way_to_turn_back(T_world_ee: Array, T_world_target: Array, arm: Arm) -> Array | None:
+    """The level unit vector ``(3,)`` outwards, if an elbow may be turned over that a push there turns back.
+
+    None where the hand ``(4, 4)`` is not stretched out, or no further out than it is to be ``(4, 4)``.
+    """
+    p = T_world_ee[:3, 3]
+    out = _away(p - arm.base)
+    if float(out @ (p - T_world_target[:3, 3])) < TOO_FAR_OUT_M:
+        return None
+    further = se3.transform(T_world_ee[:3, :3], p + out * FURTHER_M[0])
+    return None if _reaches(arm, further, arm.stance(further)) else out
 
 
 def _are_rising(targets: Sequence[Target]) -> list[bool]:

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from lerobot_openspm.control.joint_room import way_to_turn_back
 from lerobot_openspm.control.transfer import Target
 from lerobot_openspm.geometry import se3
 from lerobot_openspm.geometry.se3 import Array
@@ -26,6 +27,8 @@ SHUT_LEFT_M = 0.05
 # Each step of a correction makes good this share of the residual, and five steps are one correction. Every
 # further correction adds the same share again, because friction stops a hand that asks for millimetres.
 CORRECTION_SHARE, CORRECTION_STEPS = 0.2, 5
+# An elbow that is turned over turns back within so many steps of a push outwards.
+OUTWARD_STEPS = 14
 # A lift comes up to speed within so many steps: a jerk pulls what is held by its rim out of the fingers.
 LIFT_STEPS = 16
 
@@ -43,6 +46,8 @@ class Approach:
         left: Distance from the key pose at the last correction, metres with radians weighed in.
         corrected_at: Where the hand was then, ``T_world_ee`` ``(4, 4)``.
         is_blocked: Whether that correction brought the hand no closer, and it stands still.
+        outward: Unit vector ``(3,)`` of the push outwards for an elbow that is turned over, while it lasts.
+        outward_steps: Steps of it taken so far.
         travelled: How far a drawer or a knob has followed the hand, metres or radians.
         lifted: Steps that the hand was on its way with what it has just taken hold of as this way began.
     """
@@ -55,6 +60,8 @@ class Approach:
     left: float = np.inf
     corrected_at: Array | None = None
     is_blocked: bool = False
+    outward: Array | None = None
+    outward_steps: int = 0
     travelled: float = 0.0
     lifted: int = LIFT_STEPS
 
@@ -163,6 +170,8 @@ class ClosedLoopTRC(ClosedLoop):
         """Make good what the flow model has left of the way, once its time is up."""
         if not approach.is_time_up:
             return None
+        if approach.outward is not None:
+            return self._push_outward(approach.outward, target, approach, hand)
         if approach.late_steps % CORRECTION_STEPS == 0:
             approach.corrections += 1
             left = float(se3.distance(hand.T_world_ee, target.T_world_ee))
@@ -170,9 +179,27 @@ class ClosedLoopTRC(ClosedLoop):
             is_still = at is None or float(se3.distance(hand.T_world_ee, at)) < SWINGS_M
             approach.is_blocked = is_still and left > STUCK_SHARE * approach.left
             approach.left, approach.corrected_at = left, hand.T_world_ee
+            arm = self._robot.arm
+            if approach.is_blocked and arm is not None and not approach.outward_steps:
+                outward = way_to_turn_back(hand.T_world_ee, target.T_world_ee, arm)
+                if outward is not None:
+                    approach.outward, approach.is_blocked = outward, False
+                    return self._push_outward(outward, target, approach, hand)
         approach.late_steps += 1
         share = approach.speed * min(1.0, CORRECTION_SHARE * approach.corrections)
         return self.toward(target, hand.T_world_ee, share)
+
+    def _push_outward(self, outward: Array, target: Target, approach: Approach, hand: Hand) -> Array:
+        """An action along a level unit vector ``(3,)`` and up; after the last one corrections begin anew.
+
+        Up, because the arm straightens that way too, and what is carried keeps clear.
+        """
+        approach.outward_steps += 1
+        if approach.outward_steps == OUTWARD_STEPS:
+            approach.outward, approach.left, approach.corrected_at = None, np.inf, None
+        action = self.toward(target, hand.T_world_ee, share=1.0)
+        action[:3] = outward / np.abs(outward).max() + [0.0, 0.0, 1.0]
+        return action
 
     def _kept_on_way(self, action: Array, target: Target, approach: Approach, hand: Hand) -> Array:
         """An action whose motion across the straight way to the key pose leads back to that way.
