@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from dataclasses import dataclass
 
 import numpy as np
@@ -12,6 +13,8 @@ from lerobot_openspm.geometry import se3
 from lerobot_openspm.geometry.se3 import Array
 from lerobot_openspm.memory.robot import RobotModel
 from lerobot_openspm.types import Execution, Hand
+
+logger = logging.getLogger(__name__)
 
 # The numbers here were set by hand on the tabletop, and serve LIBERO as well.
 # The paper's epsilon_r: a precise key pose is met within this distance and angle.
@@ -183,6 +186,7 @@ class ClosedLoopTRC(ClosedLoop):
             if approach.is_blocked and arm is not None and not approach.outward_steps:
                 outward = way_to_turn_back(hand.T_world_ee, target.T_world_ee, arm)
                 if outward is not None:
+                    logger.info("the arm is stretched out and does not come in: pushing the hand outwards")
                     approach.outward, approach.is_blocked = outward, False
                     return self._push_outward(outward, target, approach, hand)
         approach.late_steps += 1
