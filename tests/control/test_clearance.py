@@ -9,6 +9,7 @@ from tests.memory.builders import entry, hand_pose, pick_and_place
 
 from lerobot_openspm.control.clearance import (
     BESIDE,
+    BESIDE,
     CLEARANCE_M,
     SAG_SHARE,
     Way,
@@ -75,6 +76,15 @@ def test_a_hand_that_passes_high_enough_where_the_object_stands_need_not_rise():
     # It comes down from 0.4 m to 0.1 m, and is still high above a post near its start.
     assert heights(pillar(0.02, 0.0, 0.2), start=(0, 0, 0.4), goal=(0.4, 0, 0.1)) is None
     assert heights(pillar(0.38, 0.0, 0.2), start=(0, 0, 0.4), goal=(0.4, 0, 0.1)) is not None
+
+
+def test_what_an_empty_hand_leaves_behind_needs_no_room_but_what_it_would_go_through():
+    low, beside = 0.1 - CLEARANCE_M + 0.001, RADIUS / BESIDE + 0.001
+    for behind in (pillar(-0.001, 0.0, low), pillar(-0.001, beside, 0.5)):
+        assert heights(behind) is None
+        assert heights(behind, below=0.001) is not None
+        assert heights(behind + [0.002, 0.0, 0.0]) is not None
+    assert_allclose(heights(pillar(-0.001, 0.0, 0.101)), 0.101)
 
 
 def carried_over(*posts):

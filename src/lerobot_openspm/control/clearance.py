@@ -88,17 +88,23 @@ class Way:
 
         Args:
             points: What stands about.
-            radius: Of the hand, and what it carries, metres.
+            radius: Of the hand, and what it carries, with room beside it, metres.
         """
         share = np.linspace(0, 1, STEPS)[:, None]
         places = self.start + share * (self.goal - self.start)
         apart = np.linalg.norm(points[None, :, :2] - places[:, None, :2], axis=-1)
-        is_under = apart < radius
+        is_left = self._leaves(points)
+        is_under = apart < np.where(is_left, radius / BESIDE, radius)
         sag = SAG_SHARE * self.length * 4 * share * (1 - share)
-        needed = points[None, :, 2] + sag + self.below + CLEARANCE_M
+        needed = points[None, :, 2] + np.where(is_left, 0.0, sag + self.below + CLEARANCE_M)
         if not (is_under & (needed > places[:, None, 2])).any():
             return None
         return float(needed[is_under].max())
+
+    def _leaves(self, points: Array) -> NDArray[np.bool_]:
+        """Which of points ``(n, 3)`` an empty hand has behind it as it sets out: it needs no room there."""
+        is_behind = (points - self.start)[:, :2] @ (self.goal - self.start)[:2] <= 0
+        return is_behind & (self.below == 0)
 
     def between(self, points: Array, radius: float) -> Array:
         """Those of points ``(n, 3)`` that are neither near its start nor near its goal, seen from above."""
