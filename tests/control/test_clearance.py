@@ -9,7 +9,6 @@ from tests.memory.builders import entry, hand_pose, pick_and_place
 
 from lerobot_openspm.control.clearance import (
     BESIDE,
-    BESIDE,
     CLEARANCE_M,
     SAG_SHARE,
     Way,
@@ -83,7 +82,7 @@ def test_what_an_empty_hand_leaves_behind_needs_no_room_but_what_it_would_go_thr
     for behind in (pillar(-0.001, 0.0, low), pillar(-0.001, beside, 0.5)):
         assert heights(behind) is None
         assert heights(behind, below=0.001) is not None
-        assert heights(behind + [0.002, 0.0, 0.0]) is not None
+        assert heights(behind + np.array([0.002, 0.0, 0.0])) is not None
     assert_allclose(heights(pillar(-0.001, 0.0, 0.101)), 0.101)
 
 
