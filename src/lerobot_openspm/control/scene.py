@@ -36,7 +36,8 @@ class LookRequest:
 
     Attributes:
         names: The objects.
-        expected: Poses ``T_world_obj`` ``(4, 4)`` of all objects that were seen before.
+        expected: Poses ``T_world_obj`` ``(4, 4)`` of the objects that were seen before, without those that
+            have fallen out of the hand since.
         time_s: Seconds since the episode began.
         held: Those of the objects that are taken to be in the hand.
         told_apart: Those that the instruction tells from others of their kind.
@@ -151,7 +152,8 @@ class SceneState:
 
     def look(self, names: Sequence[str], hand: Hand, back_to: int | None = None) -> LookRequest:
         """A look for some objects, now."""
-        expected = self.tracker.poses(hand.T_world_ee)
+        poses, fallen = self.tracker.poses(hand.T_world_ee), self.tracker.fallen
+        expected = {name: T for name, T in poses.items() if name not in fallen}
         held = self.tracker.held & frozenset(names)
         told_apart = self.grounding.told_apart & frozenset(names)
         displaced = frozenset(self.tracker.displaced)

@@ -164,8 +164,8 @@ class ClosedLoopTRC(ClosedLoop):
         return self._is_near(target, approach, hand)
 
     def from_chunk(self, action: Array, target: Target, approach: Approach, hand: Hand) -> Array:
-        """The flow model's action, kept on the path of a push, and slow where a lift begins."""
-        if target.key_pose.phase == "push":
+        """The flow model's action, kept on the way of a push or to a place, and slow where a lift begins."""
+        if target.key_pose.phase in ("push", "place"):
             return self._kept_on_way(action, target, approach, hand)
         return np.append(approach.speed * action[:6], action[6])
 
@@ -208,7 +208,8 @@ class ClosedLoopTRC(ClosedLoop):
     def _kept_on_way(self, action: Array, target: Target, approach: Approach, hand: Hand) -> Array:
         """An action whose motion across the straight way to the key pose leads back to that way.
 
-        Nothing holds what is pushed. A hand that strays by millimetres slips over or past it.
+        Nothing holds what is pushed. A hand that strays by millimetres slips over or past it. What is put
+        down stays where it touches first.
         """
         here, end = hand.T_world_ee[:3, 3], target.T_world_ee[:3, 3]
         way = end - approach.start[:3, 3]

@@ -11,7 +11,7 @@ import numpy as np
 from lerobot_openspm.geometry import se3
 from lerobot_openspm.geometry.se3 import Array
 from lerobot_openspm.memory.compose import sub_task_index
-from lerobot_openspm.memory.entry import CONTACT_PHASES, WORLD, Anchor
+from lerobot_openspm.memory.entry import AXIS_KINDS, CONTACT_PHASES, WORLD, Anchor
 from lerobot_openspm.mining.key_poses import KeyPose
 from lerobot_openspm.types import SubTask
 
@@ -22,6 +22,11 @@ PRIOR_M = 0.05
 AXES_PRIOR_M = 0.03
 # The deviation of a good demonstration at its contacts is of this order.
 QUALITY_SCALE_M = 0.02
+
+# What is grasped firmly keeps the fingers apart. Closing by more than the first share of how far apart they
+# were is slipping, and at the second one the grasp is nearly lost. Of what is thinner than the last share of
+# the open gripper that tells nothing.
+FIRM_SHARE, SLIPPED_SHARE, FELT_SHARE = 0.85, 0.5, 0.03
 
 # Where the object that the instruction suggests for a contact was not found, another one is believed if so
 # many demonstrations keep within this distance of one another in its frame, and not in the world's.
@@ -222,7 +227,10 @@ def align_symmetric(
 
 
 def qualities(demonstrations: Sequence[Demonstration], anchors: Mapping[Role, Anchor]) -> list[float]:
-    """The paper's ``r`` of each demonstration: 1 where it agrees with the others at its contacts."""
+    """The paper's ``r`` of each demonstration: 1 where it agrees with the others at its contacts.
+
+    Less where what it carried slipped in the fingers, see :func:`firmness`: it may slip out another time.
+    """
     gathered: dict[Role, list[tuple[int, Array]]] = defaultdict(list)
     for i, demonstration in enumerate(demonstrations):
         for role, pose in zip(roles(demonstration.key_poses), demonstration.key_poses, strict=True):
@@ -239,4 +247,20 @@ def qualities(demonstrations: Sequence[Demonstration], anchors: Mapping[Role, An
             continue
         for (i, _), distance in zip(members, distances, strict=True):
             worst[i] = max(worst[i], distance)
-    return [float(np.exp(-((w / QUALITY_SCALE_M) ** 2))) for w in worst]
+    agreement = np.exp(-((worst / QUALITY_SCALE_M) ** 2))
+    firm = [firmness(demonstration.key_poses) for demonstration in demonstrations]
+    return [float(r) for r in agreement * firm]
+
+
+def firmness(key_poses: Sequence[KeyPose]) -> float:
+    """How firmly a demonstration held what it carried: 1 where it did not slip, 0 where it nearly fell."""
+    least, around, widest = 1.0, 0.0, max((pose.opening for pose in key_poses), default=0.0)
+    for pose, after in zip(key_poses, [*key_poses[1:], None], strict=True):
+        if pose.phase == "grasp":
+            is_handle = after is not None and after.phase in AXIS_KINDS
+            around = 0.0 if is_handle else pose.opening
+        elif not pose.closed:
+            around = 0.0
+        elif around > FELT_SHARE * widest:
+            least = min(least, pose.opening / around)
+    return float(np.clip((least - SLIPPED_SHARE) / (FIRM_SHARE - SLIPPED_SHARE), 0.0, 1.0))

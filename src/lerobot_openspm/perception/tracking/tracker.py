@@ -7,7 +7,7 @@ believed when a second look agrees; then the object has moved, and its filter be
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass, field
 from enum import StrEnum
 
@@ -19,6 +19,9 @@ from lerobot_openspm.geometry.se3 import Array
 from lerobot_openspm.perception.tracking import kalman
 from lerobot_openspm.perception.tracking.measurement import measurement_covariance
 from lerobot_openspm.types import PoseEstimate
+
+# What the hand lost this much above where it took it from, metres, may lie anywhere after so many seconds.
+FALLEN_M, FALLING_S = 0.05, 0.4
 
 
 class TrackStatus(StrEnum):
@@ -82,6 +85,8 @@ class _Track:
         doubted: Whether the next sure sight is believed wherever it is.
         covered: Whether something may hide it since it was last seen: the hand has let go of it there, or has
             opened something.
+        fallen: Whether the hand lost it high up; see :data:`FALLEN_M`.
+        falling_s: For how long it may still be falling.
         stood_m: Height in the world from which the hand took it; infinity before.
     """
 
@@ -94,6 +99,8 @@ class _Track:
     rivalled: bool = False
     doubted: bool = False
     covered: bool = False
+    fallen: bool = False
+    falling_s: float = 0.0
     stood_m: float = np.inf
 
 
@@ -144,6 +151,7 @@ class Tracker:
         step = kalman.motion(dt_s, self.settings.linear, self.settings.angular)
         for track in self._tracks.values():
             track.belief = kalman.predict(track.belief, step)
+            track.falling_s = max(0.0, track.falling_s - dt_s)
 
     def look(
         self,
@@ -170,6 +178,8 @@ class Tracker:
                 if estimate.status == "found" and estimate.visible >= self.settings.visible:
                     self._begin(name, estimate.T_world_obj, estimate)
                     moved.add(name)
+            elif track.falling_s > 0:
+                track.hidden = True
             elif self._is_seen(estimate):
                 if self._take(name, track, estimate, T_world_ee, waited_s, is_felt):
                     moved.add(name)
@@ -182,16 +192,15 @@ class Tracker:
         track = self._tracks.get(name)
         if track is not None and not track.held:
             self.displaced.add(name)
-            track.stood_m = float(track.smoothed[2, 3])
+            track.stood_m, track.fallen = float(track.smoothed[2, 3]), False
             self._carry(track, se3.inverse(T_world_ee), held=True)
 
     def release(self, names: Iterable[str], T_world_ee: Array) -> None:
         """The hand lets go of objects, which stay where they are now, be they recognised there or not."""
         for name in names:
-            track = self._tracks.get(name)
-            if track is not None and track.held:
-                self._carry(track, T_world_ee, held=False)
-                track.covered = True
+            if name in self.held:
+                self._carry(self._tracks[name], T_world_ee, held=False)
+                self._tracks[name].covered = True
 
     def drop(self, names: Iterable[str], T_world_ee: Array) -> None:
         """The hand has lost objects: they lie below it, no higher than where it took them from."""
@@ -199,6 +208,8 @@ class Tracker:
             track = self._tracks[name]
             self.release([name], T_world_ee)
             fallen = np.array([0.0, 0.0, min(0.0, track.stood_m - float(track.smoothed[2, 3]))])
+            track.fallen = bool(fallen[2] < -FALLEN_M)
+            track.falling_s = FALLING_S * track.fallen
             track.smoothed = se3.transform(track.smoothed[:3, :3], track.smoothed[:3, 3] + fallen)
             track.belief = track.belief._replace(position=track.belief.position + fallen)
 
@@ -207,12 +218,11 @@ class Tracker:
         for track in self._tracks.values():
             track.covered = track.covered or not track.held
 
-    def doubt(self, names: Iterable[str], T_world_ee: Array) -> None:
+    def doubt(self, names: Collection[str], T_world_ee: Array) -> None:
         """Objects need not be where they are taken to be; the next sure sight of them is believed at once."""
         self.drop(names, T_world_ee)
-        for name in names:
-            if name in self._tracks:
-                self._tracks[name].doubted = True
+        for name in self._tracks.keys() & set(names):
+            self._tracks[name].doubted = True
 
     def forget(self, names: Iterable[str]) -> None:
         """These names stand for other objects from now on."""
@@ -221,13 +231,18 @@ class Tracker:
             self.displaced.add(name)
 
     @property
+    def fallen(self) -> frozenset[str]:
+        """Objects that the hand lost high up and that were not seen since: they may lie anywhere."""
+        return frozenset(name for name, track in self._tracks.items() if track.fallen)
+
+    @property
     def held(self) -> frozenset[str]:
         """Objects that the hand carries."""
         return frozenset(name for name, track in self._tracks.items() if track.held)
 
     def _begin(self, name: str, T_world_obj: Array, estimate: PoseEstimate) -> None:
-        belief = kalman.begin(T_world_obj[None], measurement_covariance(estimate)[None])
-        self._tracks[name] = _Track(belief, T_world_obj)
+        R = measurement_covariance(estimate)
+        self._tracks[name] = _Track(kalman.begin(T_world_obj[None], R[None]), T_world_obj)
 
     def _is_seen(self, estimate: PoseEstimate) -> bool:
         return (
@@ -260,7 +275,7 @@ class Tracker:
             )
             if innovation.accepted[0]:
                 track.belief, track.rival, track.missed_s = belief, None, 0.0
-                track.hidden = track.rivalled = track.doubted = track.covered = False
+                track.hidden = track.rivalled = track.doubted = track.covered = track.fallen = False
                 track.smoothed = self._smoothed(track.smoothed, belief.T[0])
                 return False
         if track.held and is_felt:
@@ -280,9 +295,8 @@ class Tracker:
         Nor is one that the hand has put where it looks different, as in a drawer, or has opened a drawer
         before.
         """
-        expected = _in_world(track.belief.T[0], track, T_world_ee)
         near = self.settings.carrying_m if self.held else self.settings.hand_m
-        track.rival = None
+        track.rival, expected = None, _in_world(track.belief.T[0], track, T_world_ee)
         track.hidden = (
             estimate.visible < self.settings.visible
             or estimate.status == "found"
