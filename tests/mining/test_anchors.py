@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
@@ -6,7 +8,14 @@ from tests.memory.builders import hand_pose
 from lerobot_openspm.geometry import se3
 from lerobot_openspm.language.instruction import parse_instruction
 from lerobot_openspm.memory.entry import WORLD, Anchor
-from lerobot_openspm.mining.anchors import Demonstration, align_symmetric, consensus, qualities, roles
+from lerobot_openspm.mining.anchors import (
+    Demonstration,
+    align_symmetric,
+    consensus,
+    firmness,
+    qualities,
+    roles,
+)
 from lerobot_openspm.mining.key_poses import KeyPose
 
 SUB_TASKS = parse_instruction("put the bowl on the plate")
@@ -135,6 +144,49 @@ def test_the_outlier_among_the_demonstrations_has_the_lowest_quality():
     assert int(np.argmin(scores)) == 3
     assert scores[3] < 0.5 < min(score for i, score in enumerate(scores) if i != 3)
     assert all(0 <= score <= 1 for score in scores)
+
+
+HELD = (("approach", False, 0.08), ("grasp", True, 0.01), ("lift", True, 0.01), ("place", True, 0.01))
+
+
+def held(*changed, opened=0.08):
+    """Key poses of something that is carried; by number, some with the fingers at another opening."""
+    openings = {0: opened, **dict(changed)}
+    return [
+        replace(key_pose(phase, np.eye(4)), closed=closed, opening=openings.get(i, opening))
+        for i, (phase, closed, opening) in enumerate(HELD)
+    ]
+
+
+@pytest.mark.parametrize(
+    ("poses", "expected"),
+    [
+        (held(), 1.0),
+        (held((2, 0.0086)), 1.0),
+        (held((3, 0.00675)), 0.5),
+        (held((2, 0.004), (3, 0.01)), 0.0),
+        # What is this thin is not felt, and an opening is told in any unit.
+        (held((1, 0.0023), (2, 0.001), (3, 0.001)), 1.0),
+        (held((1, 1.0), (2, 1.0), (3, 0.675), opened=8.0), 0.5),
+        ([], 1.0),
+    ],
+)
+def test_what_slipped_in_the_fingers_was_not_held_firmly(poses, expected):
+    assert firmness(poses) == pytest.approx(expected)
+
+
+def test_a_handle_may_slip_and_what_is_let_go_is_not_held():
+    grasp, lift = held()[1:3]
+    assert firmness([grasp, replace(lift, phase="open", opening=0.002)]) == 1.0
+    gone = replace(lift, phase="release", closed=False, opening=0.08)
+    assert firmness([grasp, gone, replace(lift, opening=0.002)]) == 1.0
+
+
+def test_a_demonstration_in_which_it_slipped_counts_less():
+    made = demonstrations(4)
+    shown = [replace(one, key_poses=tuple(held())) for one in made]
+    shown[2] = replace(shown[2], key_poses=tuple(held((3, 0.00675))))
+    assert_allclose(qualities(shown, {}), [1.0, 1.0, 0.5, 1.0])
 
 
 def test_demonstrations_that_agree_and_single_ones_are_perfect():

@@ -255,9 +255,9 @@ def qualities(demonstrations: Sequence[Demonstration], anchors: Mapping[Role, An
 def firmness(key_poses: Sequence[KeyPose]) -> float:
     """How firmly a demonstration held what it carried: 1 where it did not slip, 0 where it nearly fell."""
     least, around, widest = 1.0, 0.0, max((pose.opening for pose in key_poses), default=0.0)
-    for pose, after in zip(key_poses, [*key_poses[1:], None], strict=True):
+    for i, pose in enumerate(key_poses):
         if pose.phase == "grasp":
-            is_handle = after is not None and after.phase in AXIS_KINDS
+            is_handle = any(after.phase in AXIS_KINDS for after in key_poses[i + 1 : i + 2])
             around = 0.0 if is_handle else pose.opening
         elif not pose.closed:
             around = 0.0

@@ -6,6 +6,8 @@ from tests.geometry.strategies import transforms
 
 from lerobot_openspm.geometry import se3
 from lerobot_openspm.perception.tracking.tracker import (
+    FALLEN_M,
+    FALLING_S,
     Tracker,
     TrackerSettings,
     TrackStatus,
@@ -228,6 +230,37 @@ def test_what_the_hand_has_lost_lies_below_it_no_higher_than_it_was_taken_from()
         assert look(one, seen(shifted(CUP, *expected))) == frozenset(), "it is expected there"
         one.drop(["cup"], moved)
         assert_allclose(pose(one)[:3, 3], shifted(CUP, *expected)[:3, 3], atol=1e-4)
+
+
+def test_what_is_lost_high_up_is_believed_to_be_seen_anywhere_once_it_has_come_to_rest():
+    there, step_s = shifted(CUP, 0.3, 0.2, -0.1), 0.05
+    for height, is_fallen in ((FALLEN_M + 0.001, True), (FALLEN_M - 0.001, False)):
+        one = tracker()
+        one.hold("cup", FAR_HAND)
+        one.doubt(["cup"], shifted(FAR_HAND, 0.1, 0.0, height))
+        assert one.fallen == ({"cup"} if is_fallen else frozenset())
+        looks = 0
+        while not one.look({"cup": seen(there)}, FAR_HAND, step_s):
+            one.predict(step_s)
+            looks += 1
+        least = round(FALLING_S / step_s) if is_fallen else 0
+        assert least <= looks <= least + is_fallen
+        assert_allclose(pose(one), there)
+        assert one.fallen == frozenset()
+
+
+@pytest.mark.parametrize("again", ["seen where it is taken to be", "taken hold of"])
+def test_what_has_fallen_is_known_again_once_it_is(again):
+    one = tracker()
+    one.hold("cup", FAR_HAND)
+    one.drop(["cup"], shifted(FAR_HAND, 0.0, 0.0, 2 * FALLEN_M))
+    one.predict(2 * FALLING_S)
+    assert one.fallen == {"cup"}
+    if again == "taken hold of":
+        one.hold("cup", FAR_HAND)
+    else:
+        assert look(one, seen(CUP)) == frozenset()
+    assert one.fallen == frozenset()
 
 
 def test_objects_do_not_disturb_one_another():
