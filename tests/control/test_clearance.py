@@ -40,8 +40,9 @@ def over(top, start, goal, below=0.0):
     return top + below + CLEARANCE_M + sag(float(np.linalg.norm((goal - start)[:2, 3])))
 
 
-def heights(*points, start=(0.0, 0.0, 0.1), goal=(0.4, 0.0, 0.1), below=0.0):
-    return Way(np.array(start), np.array(goal), below).height_over(np.concatenate(points), RADIUS)
+def heights(*points, start=(0.0, 0.0, 0.1), goal=(0.4, 0.0, 0.1), below=0.0, is_empty=False):
+    way = Way(np.array(start), np.array(goal), below, is_empty)
+    return way.height_over(np.concatenate(points), RADIUS)
 
 
 def test_what_stands_beside_the_way_or_below_it_leaves_it_clear():
@@ -80,10 +81,24 @@ def test_a_hand_that_passes_high_enough_where_the_object_stands_need_not_rise():
 def test_what_an_empty_hand_leaves_behind_needs_no_room_but_what_it_would_go_through():
     low, beside = 0.1 - CLEARANCE_M + 0.001, RADIUS / BESIDE + 0.001
     for behind in (pillar(-0.001, 0.0, low), pillar(-0.001, beside, 0.5)):
-        assert heights(behind) is None
-        assert heights(behind, below=0.001) is not None
-        assert heights(behind + np.array([0.002, 0.0, 0.0])) is not None
-    assert_allclose(heights(pillar(-0.001, 0.0, 0.101)), 0.101)
+        assert heights(behind, is_empty=True) is None
+        assert heights(behind) is not None
+        assert heights(behind + np.array([0.002, 0.0, 0.0]), is_empty=True) is not None
+    for there in (pillar(-0.001, 0.0, 0.101), pillar(-0.001, beside - 0.002, 0.101)):
+        assert_allclose(heights(there, is_empty=True), 0.101)
+
+
+@pytest.mark.parametrize("knows_load", [True, False])
+def test_a_hand_that_carries_something_needs_room_behind_it_whatever_is_known_of_the_load(knows_load):
+    shown = entry()
+    poses = {"bowl": se3.from_yaw([-0.2, 0.0, 0.0], 0.0), "plate": se3.from_yaw([0.2, 0.0, 0.0], 0.0)}
+    plain = transfer(shown, poses, {}, HOME)
+    *_, lift, _, _ = plain[:6]
+    x, y, z = lift.T_world_ee[:3, 3]
+    points = {"post": pillar(x - 0.001, y + RADIUS / BESIDE + 0.005, z + 0.1)}
+    points |= {"bowl": pillar(-0.2, 0.0, 0.05)} if knows_load else {}
+    _, crossed = lifted(shown, plain, HOME, points, RADIUS / BESIDE)
+    assert crossed == ["post"]
 
 
 def carried_over(*posts):

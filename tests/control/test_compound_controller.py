@@ -14,7 +14,7 @@ from tests.control.acting import (
     shifted,
     watch,
 )
-from tests.memory.builders import entry, hand_pose, key_pose
+from tests.memory.builders import OPEN_WIDTH, entry, hand_pose, key_pose
 from tests.memory.test_compound import BOX as BOX_IN_DRAWER
 from tests.memory.test_compound import drawer_entry
 
@@ -279,7 +279,10 @@ def test_what_was_opened_is_not_looked_for_when_a_later_grasp_is_tried_again():
     perception.asked.clear()
     watch(one, perception, Hand(hand.T_world_ee, 0.0), 1)
     assert one.state.attempts == 1
-    assert perception.asked == [["bowl"]]
+    assert perception.asked == [[]], "what is falling is not looked for"
+    watch(one, perception, Hand(hand.T_world_ee, OPEN_WIDTH), 12)
+    assert ["bowl"] in perception.asked
+    assert not any("cabinet" in asked for asked in perception.asked)
 
 
 def test_a_part_that_cannot_be_found_is_waited_for():

@@ -5,14 +5,24 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
-from tests.control.acting import HAND, LOOK_AGAIN_STEPS, Perception, controller, observe, shifted, watch
+from tests.control.acting import (
+    HAND,
+    LOOK_AGAIN_STEPS,
+    Perception,
+    controller,
+    observe,
+    planning_context,
+    shifted,
+    watch,
+)
 from tests.memory.builders import OPEN_WIDTH, entry
 
 from lerobot_openspm.control.plan import MOVED_M
+from lerobot_openspm.control.scene import SceneState
 from lerobot_openspm.control.state import Status
 from lerobot_openspm.geometry import se3
-from lerobot_openspm.perception.tracking.tracker import TrackStatus
-from lerobot_openspm.types import Hand
+from lerobot_openspm.perception.tracking.tracker import FALLEN_M, FALLING_S, TrackStatus
+from lerobot_openspm.types import Hand, PoseEstimate
 
 
 def advanced(one, perception, index):
@@ -241,3 +251,23 @@ def test_how_soon_a_jump_is_noticed_does_not_hang_on_the_robots_rate(step_s):
     perception.object_poses["bowl"] = moved = shifted(entry().object_poses["bowl"], 0.10)
     watch(one, perception, HAND, max(2, int(0.5 / step_s + 1e-9)))
     assert_allclose(one.executor.targets[0].T_world_ee, moved @ entry().key_poses[0].T_obj_ee)
+
+
+def test_what_fell_from_high_up_is_looked_for_anywhere_once_it_has_come_to_rest():
+    scene, found = (
+        SceneState(planning_context()),
+        PoseEstimate("found", np.eye(4), np.eye(4) * 1e-6, 1.0),
+    )
+    scene.tracker.look({"bowl": found}, HAND.T_world_ee, 0.0)
+    assert scene.look(["bowl"], HAND).expected.keys() == {"bowl"}
+    scene.tracker.hold("bowl", HAND.T_world_ee)
+    T_high = se3.transform(HAND.T_world_ee[:3, :3], HAND.T_world_ee[:3, 3] + [0.0, 0.0, 2 * FALLEN_M])
+    scene.doubt({"bowl"}, Hand(T_high, OPEN_WIDTH))
+    falling = scene.look(["bowl", "plate"], HAND)
+    assert (falling.names, dict(falling.expected)) == (("plate",), {})
+    for _ in range(round(FALLING_S / scene._context.step_s) + 1):
+        scene.predict()
+    fallen = scene.look(["bowl", "plate"], HAND)
+    assert (fallen.names, dict(fallen.expected)) == (("bowl", "plate"), {})
+    scene.tracker.look({"bowl": found}, HAND.T_world_ee, 0.0)
+    assert scene.look(["bowl"], HAND).expected.keys() == {"bowl"}

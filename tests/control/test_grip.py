@@ -176,6 +176,13 @@ def test_a_lift_over_several_key_poses_comes_up_to_speed_once():
     assert not executor.advance(short)
     assert executor.state.index == lift + 1
     assert executor.approach.speed == pytest.approx(6 / LIFT_STEPS)
+    for phase in ("pre-place", "place"):  # be it straight to the place
+        target = replace(
+            executor.targets[lift + 1], key_pose=key_pose("plate", np.eye(4), phase, closed=True)
+        )
+        action = np.array([0.0, 0.0, 0.0, 0.5, 0.0, 0.0, 1.0])
+        slow = executor.strategy.from_chunk(action, target, executor.approach, short)
+        assert_allclose(slow[3:], [0.5 * 6 / LIFT_STEPS, 0.0, 0.0, 1.0])
     executor.begin(executor.targets, Hand(HOME, OPEN_WIDTH), 0)
     executor.approach.steps = LIFT_STEPS
     executor.begin(executor.targets, Hand(HOME, OPEN_WIDTH), 1)

@@ -16,6 +16,7 @@ from lerobot_openspm.control.strategies import CORRECTION_STEPS, OUTWARD_STEPS, 
 from lerobot_openspm.control.transfer import Target
 from lerobot_openspm.geometry import se3
 from lerobot_openspm.geometry.arm import load_arm
+from lerobot_openspm.memory.entry import Axis
 from lerobot_openspm.types import Hand, Symmetry
 
 HOME = hand_pose(-0.2, 0.0, 1.17)
@@ -128,22 +129,28 @@ def test_a_way_out_that_cannot_be_followed_is_not_taken_and_that_is_said(panda, 
 
 
 @pytest.mark.parametrize(
-    ("hand_m", "target_m", "is_known", "is_pushed"),
+    ("phase", "hand_m", "target_m", "above_m", "is_known", "is_pushed"),
     [
-        (0.72, 0.695, True, True),
-        (0.72, 0.718, True, False),  # it is where it should be
-        (0.72, 0.74, True, False),  # that only presses it against what is in its way
-        (0.50, 0.475, True, False),  # its elbow is far from turned over
-        (0.72, 0.695, False, False),
+        ("place", 0.72, 0.695, 0.0, True, True),
+        ("pre-place", 0.72, 0.695, 0.02, True, True),
+        ("place", 0.72, 0.711, 0.0, True, False),  # it touches something, near enough
+        ("place", 0.72, 0.695, 0.05, True, False),  # it is held up from below
+        ("place", 0.72, 0.74, 0.0, True, False),  # that only presses it against what is in its way
+        ("place", 0.56, 0.535, 0.0, True, False),  # its elbow is far from turned over
+        ("place", 0.72, 0.695, 0.0, False, False),
+        ("push", 0.72, 0.695, 0.0, True, False),
+        ("open", 0.72, 0.695, 0.0, True, False),
     ],
 )
 def test_a_stretched_arm_that_does_not_come_in_is_pushed_outwards_once(
-    panda, hand_m, target_m, is_known, is_pushed
+    panda, phase, hand_m, target_m, above_m, is_known, is_pushed
 ):
     ahead = np.array([0.8, -0.6, 0.0])
-    here, there = (hand_pose(*(panda.base + metres * ahead)[:2], 1.34) for metres in (hand_m, target_m))
+    at = panda.base + hand_m * ahead, panda.base + target_m * ahead
+    here, there = (hand_pose(x, y, z) for (x, y, _), z in zip(at, (1.34 + above_m, 1.34), strict=True))
     strategy = ClosedLoopTRC(robot(arm=panda if is_known else None))
-    target = Target(there, key_pose("plate", np.eye(4), "place", closed=True), precise=True)
+    axis = Axis("slide", ahead, 0.1) if phase == "open" else None
+    target = Target(there, key_pose("plate", np.eye(4), phase, closed=True), precise=True, axis=axis)
     approach, pushes, blocked = Approach(here), list[int](), list[bool]()
     for step in range(5 * CORRECTION_STEPS + OUTWARD_STEPS):
         action = strategy.correct(target, approach, Hand(here, 0.03))
@@ -158,3 +165,4 @@ def test_a_stretched_arm_that_does_not_come_in_is_pushed_outwards_once(
     # While it is pushed it is not given up; afterwards it is, if that did not help.
     assert not any(blocked[: CORRECTION_STEPS + n])
     assert blocked[-1]
+    assert approach.corrections == (4 if is_pushed else 8), "they begin anew"

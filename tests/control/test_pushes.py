@@ -16,6 +16,7 @@ from lerobot_openspm.control.planning import PlanningContext
 from lerobot_openspm.control.pushes import push_paths
 from lerobot_openspm.control.scene import LEFT_BEHIND_M, OUTRUN_M
 from lerobot_openspm.control.state import EpisodeState, Status
+from lerobot_openspm.control.strategies import CORRECTION_SHARE
 from lerobot_openspm.control.transfer import Target, transfer, turn_about
 from lerobot_openspm.geometry import se3
 from lerobot_openspm.memory.entry import Anchor, Outcome
@@ -136,8 +137,9 @@ def test_a_push_without_a_known_outcome_ends_where_the_demonstration_did():
 def test_a_hand_that_strays_while_it_pushes_or_puts_something_down_is_led_back_to_its_way(phase):
     executor = Executor("closed_loop_trc", robot(), EpisodeState())
     memory = replace(push().key_poses[2], phase=phase)
+    path = push_paths(push(), LAYOUT)[0] if phase == "push" else None
     start, end = hand_pose(0.3, 0.0, 0.02), hand_pose(0.1, 0.0, 0.02)
-    executor.begin([Target(end, memory, precise=True)], Hand(start, 0.0))
+    executor.begin([Target(end, memory, precise=True, push=path)], Hand(start, 0.0))
     strayed = Hand(hand_pose(0.2, 0.004, 0.028), 0.0)
     executor.push_chunk(np.tile([-0.5, 0.3, 0.3, 0, 0, 0.1, 1.0], (5, 1)))
     action = executor.next_action(strayed)
@@ -146,8 +148,8 @@ def test_a_hand_that_strays_while_it_pushes_or_puts_something_down_is_led_back_t
     if phase == "approach":  # in free space it may go round
         assert_allclose(action[1:3], 0.3)
     else:
-        assert action[1] < 0
-        assert action[2] < 0
+        back = -CORRECTION_SHARE * np.array([0.004, 0.008]) / robot().metres_per_action
+        assert_allclose(action[1:3], back)
 
 
 @given(st.floats(-0.05, 0.05), st.floats(-0.05, 0.05), st.floats(-1, 1), st.floats(-1, 1))

@@ -168,6 +168,7 @@ def held(*changed, opened=0.08):
         # What is this thin is not felt, and an opening is told in any unit.
         (held((1, 0.0023), (2, 0.001), (3, 0.001)), 1.0),
         (held((1, 1.0), (2, 1.0), (3, 0.675), opened=8.0), 0.5),
+        (held((1, 0.23), (2, 0.1), (3, 0.1), opened=8.0), 1.0),
         ([], 1.0),
     ],
 )
@@ -177,7 +178,10 @@ def test_what_slipped_in_the_fingers_was_not_held_firmly(poses, expected):
 
 def test_a_handle_may_slip_and_what_is_let_go_is_not_held():
     grasp, lift = held()[1:3]
-    assert firmness([grasp, replace(lift, phase="open", opening=0.002)]) == 1.0
+    for phase in ("open", "turn"):
+        handle = replace(lift, phase=phase, opening=0.002)
+        assert firmness([grasp, handle]) == 1.0
+        assert firmness([grasp, replace(lift, opening=0.002), handle]) == 0.0
     gone = replace(lift, phase="release", closed=False, opening=0.08)
     assert firmness([grasp, gone, replace(lift, opening=0.002)]) == 1.0
 

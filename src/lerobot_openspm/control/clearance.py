@@ -63,11 +63,13 @@ class Way:
         start: Where the fingertips are ``(3,)``, world.
         goal: Where they go ``(3,)``.
         below: How far what is in the hand reaches below them, metres.
+        is_empty: Whether nothing is in it.
     """
 
     start: Array
     goal: Array
     below: float
+    is_empty: bool = False
 
     @property
     def length(self) -> float:
@@ -104,7 +106,7 @@ class Way:
     def _leaves(self, points: Array) -> NDArray[np.bool_]:
         """Which of points ``(n, 3)`` an empty hand has behind it as it sets out: it needs no room there."""
         is_behind = (points - self.start)[:, :2] @ (self.goal - self.start)[:2] <= 0
-        return is_behind & (self.below == 0)
+        return is_behind & self.is_empty
 
     def between(self, points: Array, radius: float) -> Array:
         """Those of points ``(n, 3)`` that are neither near its start nor near its goal, seen from above."""
@@ -174,7 +176,7 @@ def lifted(
     for i, (pose, target) in enumerate(zip(entry.key_poses, targets, strict=False)):
         T, grasped = target.T_world_ee, standing.grasped
         below = _below(standing.T_world_grasp, standing.points.get(grasped)) if standing.is_held else 0.0
-        way = Way(before[:3, 3], T[:3, 3], below)
+        way = Way(before[:3, 3], T[:3, 3], below, is_empty=not standing.is_held)
         if -T[2, 2] > UPRIGHT and pose.phase in CROSSING and way.length > SHORTEST_M:
             previous = entry.key_poses[i - 1] if i else None
             near = {grasped, *pose.anchor.objects, *(previous.anchor.objects if previous else ())}

@@ -26,8 +26,9 @@ ROOM_RAD = np.deg2rad(15)
 OUT_M = tuple(np.arange(0.01, 0.125, 0.01).tolist())
 # An arm that cannot go on by the first of these is stretched, metres: by half of that the hand overshoots.
 FURTHER_M = (0.045, 0.035, 0.025, 0.015, 0.005)
-# A hand whose elbow is turned over stays further out than it should by at least this, metres.
-TOO_FAR_OUT_M = 0.004
+# A hand whose elbow is turned over stays further out than it should: that is at least this share of how far
+# it is from there.
+TOO_FAR_OUT_SHARE = 0.5
 
 
 def ways_out(targets: Sequence[Target], arm: Arm, stance: Array) -> dict[int, Array]:
@@ -76,11 +77,12 @@ def reach_left(targets: Sequence[Target], arm: Arm, stance: Array) -> float:
 def way_to_turn_back(T_world_ee: Array, T_world_target: Array, arm: Arm) -> Array | None:
     """The level unit vector ``(3,)`` outwards, if an elbow may be turned over that a push there turns back.
 
-    None where the hand ``(4, 4)`` is not stretched out, or no further out than it is to be ``(4, 4)``.
+    None where the hand ``(4, 4)`` is not stretched out, or is not mainly further out than it is to be
+    ``(4, 4)``.
     """
     p = T_world_ee[:3, 3]
-    out = _away(p - arm.base)
-    if float(out @ (p - T_world_target[:3, 3])) < TOO_FAR_OUT_M:
+    out, off = _away(p - arm.base), p - T_world_target[:3, 3]
+    if float(out @ off) <= TOO_FAR_OUT_SHARE * float(np.linalg.norm(off)):
         return None
     further = se3.transform(T_world_ee[:3, :3], p + out * FURTHER_M[0])
     return None if _reaches(arm, further, arm.stance(further)) else out

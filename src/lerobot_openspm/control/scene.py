@@ -151,9 +151,10 @@ class SceneState:
         return self._step * self._context.step_s
 
     def look(self, names: Sequence[str], hand: Hand, back_to: int | None = None) -> LookRequest:
-        """A look for some objects, now."""
-        poses, fallen = self.tracker.poses(hand.T_world_ee), self.tracker.fallen
-        expected = {name: T for name, T in poses.items() if name not in fallen}
+        """A look for some objects, now, but for those that are still falling out of the hand."""
+        poses, tracker = self.tracker.poses(hand.T_world_ee), self.tracker
+        names = [name for name in names if name not in tracker.falling]
+        expected = {name: T for name, T in poses.items() if name not in tracker.fallen}
         held = self.tracker.held & frozenset(names)
         told_apart = self.grounding.told_apart & frozenset(names)
         displaced = frozenset(self.tracker.displaced)

@@ -166,7 +166,7 @@ class ClosedLoopTRC(ClosedLoop):
     def from_chunk(self, action: Array, target: Target, approach: Approach, hand: Hand) -> Array:
         """The flow model's action, kept on the way of a push or to a place, and slow where a lift begins."""
         if target.key_pose.phase in ("push", "place"):
-            return self._kept_on_way(action, target, approach, hand)
+            action = self._kept_on_way(action, target, approach, hand)
         return np.append(approach.speed * action[:6], action[6])
 
     def correct(self, target: Target, approach: Approach, hand: Hand) -> Array | None:
@@ -182,16 +182,22 @@ class ClosedLoopTRC(ClosedLoop):
             is_still = at is None or float(se3.distance(hand.T_world_ee, at)) < SWINGS_M
             approach.is_blocked = is_still and left > STUCK_SHARE * approach.left
             approach.left, approach.corrected_at = left, hand.T_world_ee
-            arm = self._robot.arm
-            if approach.is_blocked and arm is not None and not approach.outward_steps:
-                outward = way_to_turn_back(hand.T_world_ee, target.T_world_ee, arm)
-                if outward is not None:
-                    logger.info("the arm is stretched out and does not come in: pushing the hand outwards")
-                    approach.outward, approach.is_blocked = outward, False
-                    return self._push_outward(outward, target, approach, hand)
+            if approach.is_blocked and not approach.outward_steps:
+                approach.outward = self._way_to_turn_back(target, approach, hand)
+            if approach.outward is not None:
+                logger.info("the arm is stretched out and does not come in: pushing the hand outwards")
+                approach.is_blocked = False
+                return self._push_outward(approach.outward, target, approach, hand)
         approach.late_steps += 1
         share = approach.speed * min(1.0, CORRECTION_SHARE * approach.corrections)
         return self.toward(target, hand.T_world_ee, share)
+
+    def _way_to_turn_back(self, target: Target, approach: Approach, hand: Hand) -> Array | None:
+        """See :func:`way_to_turn_back`; None where the hand is near enough, or moves what it touches."""
+        is_moving = target.axis is not None or target.key_pose.phase == "push"
+        if self._robot.arm is None or is_moving or self.is_met(target, approach, hand):
+            return None
+        return way_to_turn_back(hand.T_world_ee, target.T_world_ee, self._robot.arm)
 
     def _push_outward(self, outward: Array, target: Target, approach: Approach, hand: Hand) -> Array:
         """An action along a level unit vector ``(3,)`` and up; after the last one corrections begin anew.
@@ -201,6 +207,7 @@ class ClosedLoopTRC(ClosedLoop):
         approach.outward_steps += 1
         if approach.outward_steps == OUTWARD_STEPS:
             approach.outward, approach.left, approach.corrected_at = None, np.inf, None
+            approach.corrections = approach.late_steps = 0
         action = self.toward(target, hand.T_world_ee, share=1.0)
         action[:3] = outward / np.abs(outward).max() + [0.0, 0.0, 1.0]
         return action
@@ -209,7 +216,7 @@ class ClosedLoopTRC(ClosedLoop):
         """An action whose motion across the straight way to the key pose leads back to that way.
 
         Nothing holds what is pushed. A hand that strays by millimetres slips over or past it. What is put
-        down stays where it touches first.
+        down stays where it touches first, so it must not come down beside its place.
         """
         here, end = hand.T_world_ee[:3, 3], target.T_world_ee[:3, 3]
         way = end - approach.start[:3, 3]

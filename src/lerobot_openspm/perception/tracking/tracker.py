@@ -20,7 +20,7 @@ from lerobot_openspm.perception.tracking import kalman
 from lerobot_openspm.perception.tracking.measurement import measurement_covariance
 from lerobot_openspm.types import PoseEstimate
 
-# What the hand lost this much above where it took it from, metres, may lie anywhere after so many seconds.
+# What the hand lost this much higher or lower than it took it from, metres, may lie anywhere so much later.
 FALLEN_M, FALLING_S = 0.05, 0.4
 
 
@@ -85,7 +85,7 @@ class _Track:
         doubted: Whether the next sure sight is believed wherever it is.
         covered: Whether something may hide it since it was last seen: the hand has let go of it there, or has
             opened something.
-        fallen: Whether the hand lost it high up; see :data:`FALLEN_M`.
+        fallen: Whether the hand lost it high up, and it was not seen since; see :data:`FALLEN_M`.
         falling_s: For how long it may still be falling.
         stood_m: Height in the world from which the hand took it; infinity before.
     """
@@ -178,8 +178,6 @@ class Tracker:
                 if estimate.status == "found" and estimate.visible >= self.settings.visible:
                     self._begin(name, estimate.T_world_obj, estimate)
                     moved.add(name)
-            elif track.falling_s > 0:
-                track.hidden = True
             elif self._is_seen(estimate):
                 if self._take(name, track, estimate, T_world_ee, waited_s, is_felt):
                     moved.add(name)
@@ -192,7 +190,7 @@ class Tracker:
         track = self._tracks.get(name)
         if track is not None and not track.held:
             self.displaced.add(name)
-            track.stood_m, track.fallen = float(track.smoothed[2, 3]), False
+            track.stood_m, track.fallen, track.falling_s = float(track.smoothed[2, 3]), False, 0.0
             self._carry(track, se3.inverse(T_world_ee), held=True)
 
     def release(self, names: Iterable[str], T_world_ee: Array) -> None:
@@ -207,8 +205,9 @@ class Tracker:
         for name in [name for name in names if name in self.held]:
             track = self._tracks[name]
             self.release([name], T_world_ee)
-            fallen = np.array([0.0, 0.0, min(0.0, track.stood_m - float(track.smoothed[2, 3]))])
-            track.fallen = bool(fallen[2] < -FALLEN_M)
+            lower = track.stood_m - float(track.smoothed[2, 3])
+            fallen = np.array([0.0, 0.0, min(0.0, lower)])
+            track.fallen = abs(lower) > FALLEN_M
             track.falling_s = FALLING_S * track.fallen
             track.smoothed = se3.transform(track.smoothed[:3, :3], track.smoothed[:3, 3] + fallen)
             track.belief = track.belief._replace(position=track.belief.position + fallen)
@@ -236,6 +235,11 @@ class Tracker:
         return frozenset(name for name, track in self._tracks.items() if track.fallen)
 
     @property
+    def falling(self) -> frozenset[str]:
+        """Those of them that may not have come to rest yet."""
+        return frozenset(name for name, track in self._tracks.items() if track.falling_s > 0)
+
+    @property
     def held(self) -> frozenset[str]:
         """Objects that the hand carries."""
         return frozenset(name for name, track in self._tracks.items() if track.held)
@@ -245,11 +249,8 @@ class Tracker:
         self._tracks[name] = _Track(kalman.begin(T_world_obj[None], R[None]), T_world_obj)
 
     def _is_seen(self, estimate: PoseEstimate) -> bool:
-        return (
-            estimate.status == "found"
-            and estimate.confidence >= self.settings.sure
-            and estimate.visible >= self.settings.visible
-        )
+        is_sure = estimate.status == "found" and estimate.confidence >= self.settings.sure
+        return is_sure and estimate.visible >= self.settings.visible
 
     def _take(
         self,
@@ -262,17 +263,15 @@ class Tracker:
     ) -> bool:
         """Update a track with a sure estimate; whether the object turned out to be elsewhere."""
         expected = _in_world(track.belief.T[0], track, T_world_ee)
-        T_world_obj = nearest_equivalent(
-            estimate.T_world_obj, expected, self.yaw_periods.get(name, 2 * np.pi)
-        )
+        period = self.yaw_periods.get(name, 2 * np.pi)
+        T_world_obj = nearest_equivalent(estimate.T_world_obj, expected, period)
         R = measurement_covariance(estimate)
         apart = float(np.linalg.norm(T_world_obj[:3, 3] - expected[:3, 3]))
         near_m = self.settings.near_held_m if track.held else self.settings.near_m
         if apart <= near_m:
             T_mount_world = se3.inverse(T_world_ee) if track.held else np.eye(4)
-            belief, innovation = kalman.update(
-                track.belief, (T_mount_world @ T_world_obj)[None], _rotated(R, T_mount_world)[None]
-            )
+            T, R_mount = T_mount_world @ T_world_obj, _rotated(R, T_mount_world)
+            belief, innovation = kalman.update(track.belief, T[None], R_mount[None])
             if innovation.accepted[0]:
                 track.belief, track.rival, track.missed_s = belief, None, 0.0
                 track.hidden = track.rivalled = track.doubted = track.covered = track.fallen = False
@@ -301,6 +300,7 @@ class Tracker:
             estimate.visible < self.settings.visible
             or estimate.status == "found"
             or (track.covered and not track.doubted)
+            or track.fallen
             or float(np.linalg.norm(expected[:3, 3] - T_world_ee[:3, 3])) < near
         )
         track.rivalled = estimate.status == "ambiguous" and not track.hidden
