@@ -207,8 +207,8 @@ class MemoryEntry:
         key: What the entry is found by, ``k_i``.
         language: The instruction of the demonstration, ``l_i``.
         key_poses: In the order of execution.
-        quality: The paper's ``r_i``, 0 to 1: how closely the demonstration agrees with others of its task, and
-            how firmly it held what it carried, updated by how it fared at deployment.
+        quality: The paper's ``r_i``, 0 to 1: how closely the demonstration agrees with others of its task
+            and how firmly it held what it carried, updated by how it fared at deployment.
         version: The paper's ``nu_i``: counts up when an entry is replaced.
         source: Dataset and episode the entry was mined from, "name#20"; "name#20.2" where the episode did
             this a second time.
