@@ -93,8 +93,8 @@ def test_a_hand_that_carries_something_needs_room_behind_it_whatever_is_known_of
     shown = entry()
     poses = {"bowl": se3.from_yaw([-0.2, 0.0, 0.0], 0.0), "plate": se3.from_yaw([0.2, 0.0, 0.0], 0.0)}
     plain = transfer(shown, poses, {}, HOME)
-    *_, lift, _, _ = plain[:6]
-    x, y, z = lift.T_world_ee[:3, 3]
+    assert plain[3].key_pose.phase == "lift"
+    x, y, z = plain[3].T_world_ee[:3, 3]
     points = {"post": pillar(x - 0.001, y + RADIUS / BESIDE + 0.005, z + 0.1)}
     points |= {"bowl": pillar(-0.2, 0.0, 0.05)} if knows_load else {}
     _, crossed = lifted(shown, plain, HOME, points, RADIUS / BESIDE)

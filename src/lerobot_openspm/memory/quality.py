@@ -6,15 +6,15 @@ from dataclasses import replace
 
 from lerobot_openspm.memory.entry import MemoryEntry
 
-# The demonstrations' agreement weighs as much as this many trials: after one failure of a good entry, others
-# of its task are tried first; after five trials these weigh more.
+# What the demonstrations tell, their agreement and how firmly they held, weighs as much as this many trials:
+# after one failure of a good entry, others of its task are tried first; after five trials these weigh more.
 PRIOR_TRIALS = 5
 
 
 def with_success(entry: MemoryEntry, success: bool) -> MemoryEntry:
     """An entry after it was acted by once more.
 
-    ``r`` is the mean of a Beta distribution whose prior has the demonstrations' agreement as its mean and
+    ``r`` is the mean of a Beta distribution whose prior has what the demonstrations tell as its mean and
     :data:`PRIOR_TRIALS` as its weight; each trial is one more observation.
     """
     weight = PRIOR_TRIALS + entry.trials
@@ -23,7 +23,7 @@ def with_success(entry: MemoryEntry, success: bool) -> MemoryEntry:
 
 
 def prior_quality(entry: MemoryEntry) -> float:
-    """What ``r`` was before any trial: how well the demonstration agrees with others."""
+    """What ``r`` was before any trial: what the demonstrations tell."""
     weight = PRIOR_TRIALS + entry.trials
     return min(max((entry.quality * weight - entry.successes) / PRIOR_TRIALS, 0.0), 1.0)
 

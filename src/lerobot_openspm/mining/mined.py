@@ -59,7 +59,7 @@ class MinedTask:
         aligned: Key poses and object poses of each, frames of symmetric objects turned so that they agree.
         anchors: For each role of a key pose, the frame in which the demonstrations agree best.
         axes: For each demonstration, the axes along which drawers slid and about which knobs turned.
-        qualities: For each demonstration the paper's ``r``, 0 to 1: how closely it agrees with the others.
+        qualities: For each demonstration the paper's ``r``, 0 to 1; see :func:`anchors.qualities`.
         outcomes: For each demonstration, where it left its targets relative to their landmarks.
     """
 

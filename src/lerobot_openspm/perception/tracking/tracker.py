@@ -85,7 +85,7 @@ class _Track:
         doubted: Whether the next sure sight is believed wherever it is.
         covered: Whether something may hide it since it was last seen: the hand has let go of it there, or has
             opened something.
-        fallen: Whether the hand lost it high up, and it was not seen since; see :data:`FALLEN_M`.
+        fallen: Whether the hand lost it at another height, and it was not seen since; see :data:`FALLEN_M`.
         falling_s: For how long it may still be falling.
         stood_m: Height in the world from which the hand took it; infinity before.
     """
@@ -231,7 +231,7 @@ class Tracker:
 
     @property
     def fallen(self) -> frozenset[str]:
-        """Objects that the hand lost high up and that were not seen since: they may lie anywhere."""
+        """Objects lost at another height than they were taken from, not seen since: they may lie anywhere."""
         return frozenset(name for name, track in self._tracks.items() if track.fallen)
 
     @property
