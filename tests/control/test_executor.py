@@ -293,7 +293,7 @@ def test_closed_loop_queries_start_from_the_hand():
 
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
 def test_non_finite_actions_never_reach_the_robot(value):
-    executor = make()
+    executor = make("closed_loop")
     chunk = np.zeros((CHUNK, 7))
     chunk[3, 2] = value
     with pytest.raises(OpenSPMError, match="not finite"):
@@ -302,7 +302,7 @@ def test_non_finite_actions_never_reach_the_robot(value):
 
 
 def test_actions_left_over_are_dropped_at_the_next_key_pose():
-    executor = make()
+    executor = make("closed_loop")
     executor.push_chunk(np.ones((CHUNK, 7)))
     executor.next_action(Hand(HOME, OPEN_WIDTH))
     executor.advance(Hand(executor.targets[0].T_world_ee, OPEN_WIDTH))

@@ -79,7 +79,7 @@ def test_key_poses_follow_an_object_that_has_moved(shift, follows):
 
 
 def test_what_jumped_is_noticed_within_half_a_second_and_the_queued_chunk_is_dropped():
-    perception, one = Perception(entry().object_poses), controller()
+    perception, one = Perception(entry().object_poses), controller(execution="closed_loop")
     observe(one, HAND, perception)
     one.executor.push_chunk(np.full((5, 7), 0.5))
     one.executor.next_action(HAND)

@@ -9,7 +9,6 @@ from tests.control.test_executor import HOME, ROBOT, World, make, run
 from tests.memory.builders import OPEN_WIDTH, entry, hand_pose, key_pose, pick_and_place
 
 from lerobot_openspm.control.state import Status
-from lerobot_openspm.control.strategies import LIFT_STEPS
 from lerobot_openspm.geometry import se3
 from lerobot_openspm.types import Hand
 
@@ -143,47 +142,3 @@ def test_fingers_that_close_do_not_push_the_hand_back_but_lead_it_sideways():
         assert_allclose(back, expected * metres * T[:3, i], atol=1e-9)
     far = se3.transform(T[:3, :3], T[:3, 3] - 0.1 * along)
     assert np.abs(executor.strategy.grip(grasp, far)[:6]).max() <= 1 + 1e-12
-
-
-def test_a_lift_comes_up_to_speed_slowly_and_nothing_else_does():
-    executor, world = make(), World()
-    speeds: dict[str, list[float]] = {"lift": [], "pre-place": []}
-    for _ in range(600):
-        if executor.state.status is not Status.RUNNING or executor.advance(world.hand):
-            break
-        if (action := executor.next_action(world.hand)) is None:
-            executor.push_chunk(np.tile([1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0], (5, 1)))
-            action = executor.next_action(world.hand)
-        phase = executor.present.key_pose.phase
-        if phase in speeds and not executor.approach.corrections:
-            speeds[phase].append(float(action[0]))
-        world.step(action)
-    steps = np.arange(1, len(speeds["lift"]) + 1)
-    assert len(steps) > 10
-    assert_allclose(speeds["lift"], np.minimum(steps / LIFT_STEPS, 1.0), atol=1e-9)
-    assert set(speeds["pre-place"]) == {1.0}
-
-
-def test_a_lift_over_several_key_poses_comes_up_to_speed_once():
-    executor = make()
-    lift = next(i for i, one in enumerate(executor.targets) if one.key_pose.phase == "lift")
-    at = Hand(executor.targets[lift - 1].T_world_ee, 0.03)
-    executor.begin(executor.targets, at, lift)
-    assert executor.approach.lifted == 0
-    executor.approach.steps = 5
-    executor.state.index = lift
-    short = Hand(executor.targets[lift].T_world_ee, 0.03)
-    assert not executor.advance(short)
-    assert executor.state.index == lift + 1
-    assert executor.approach.speed == pytest.approx(6 / LIFT_STEPS)
-    for phase in ("pre-place", "place"):  # be it straight to the place
-        target = replace(
-            executor.targets[lift + 1], key_pose=key_pose("plate", np.eye(4), phase, closed=True)
-        )
-        action = np.array([0.0, 0.0, 0.0, 0.5, 0.0, 0.0, 1.0])
-        slow = executor.strategy.from_chunk(action, target, executor.approach, short)
-        assert_allclose(slow[3:], [0.5 * 6 / LIFT_STEPS, 0.0, 0.0, 1.0])
-    executor.begin(executor.targets, Hand(HOME, OPEN_WIDTH), 0)
-    executor.approach.steps = LIFT_STEPS
-    executor.begin(executor.targets, Hand(HOME, OPEN_WIDTH), 1)
-    assert executor.approach.speed == 1.0

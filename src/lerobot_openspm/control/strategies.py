@@ -30,6 +30,10 @@ SHUT_LEFT_M = 0.05
 # Each step of a correction makes good this share of the residual, and five steps are one correction. Every
 # further correction adds the same share again, because friction stops a hand that asks for millimetres.
 CORRECTION_SHARE, CORRECTION_STEPS = 0.2, 5
+# Near a key pose a straight way makes good this share of what is left in every step.
+ARRIVING_SHARE = 0.5
+# Phases whose way is one key pose long, whatever its shape.
+UNCUT_PHASES = ("push", "open", "turn")
 # An elbow that is turned over turns back within so many steps of a push outwards.
 OUTWARD_STEPS = 14
 # A lift comes up to speed within so many steps: a jerk pulls what is held by its rim out of the fingers.
@@ -154,6 +158,9 @@ class OpenLoop(ClosedLoop):
 class ClosedLoopTRC(ClosedLoop):
     """Closed loop with the paper's terminal residual correction, and fingers that notice a lost grip.
 
+    The hand goes straight from key pose to key pose wherever mining has cut the demonstrated path at its
+    corners. The flow model is asked for the ways that were not cut: of a push, a drawer or a knob.
+
     The correction is the residual itself, so that the error contracts whatever the model has learned.
     """
 
@@ -164,15 +171,15 @@ class ClosedLoopTRC(ClosedLoop):
         return self._is_near(target, approach, hand)
 
     def from_chunk(self, action: Array, target: Target, approach: Approach, hand: Hand) -> Array:
-        """The flow model's action, kept on the way of a push or to a place, and slow where a lift begins."""
-        if target.key_pose.phase in ("push", "place"):
-            action = self._kept_on_way(action, target, approach, hand)
-        return np.append(approach.speed * action[:6], action[6])
+        """The flow model's action, kept on the way of a push."""
+        if target.key_pose.phase == "push":
+            return self._kept_on_way(action, target, approach, hand)
+        return action
 
     def correct(self, target: Target, approach: Approach, hand: Hand) -> Array | None:
-        """Make good what the flow model has left of the way, once its time is up."""
+        """The next step of a straight way; once its time is up, what makes good what is left of the way."""
         if not approach.is_time_up:
-            return None
+            return None if target.key_pose.phase in UNCUT_PHASES else self._straight(target, approach, hand)
         if approach.outward is not None:
             return self._push_outward(approach.outward, target, approach, hand)
         if approach.late_steps % CORRECTION_STEPS == 0:
@@ -189,7 +196,13 @@ class ClosedLoopTRC(ClosedLoop):
                 approach.is_blocked = False
                 return self._push_outward(approach.outward, target, approach, hand)
         approach.late_steps += 1
-        share = approach.speed * min(1.0, CORRECTION_SHARE * approach.corrections)
+        share = approach.speed * min(1.0, CORRECTION_SHARE * (approach.corrections + 1))
+        return self.toward(target, hand.T_world_ee, share)
+
+    def _straight(self, target: Target, approach: Approach, hand: Hand) -> Array:
+        """An action straight to the key pose at the demonstrated pace, slower where it is near."""
+        left = max(float(se3.distance(hand.T_world_ee, target.T_world_ee)), 1e-9)
+        share = approach.speed * min(ARRIVING_SHARE, self._robot.metres_per_step / left)
         return self.toward(target, hand.T_world_ee, share)
 
     def _way_to_turn_back(self, target: Target, approach: Approach, hand: Hand) -> Array | None:

@@ -231,6 +231,18 @@ def test_it_is_followed_from_where_it_is_expected(models):
     assert float(se3.distance(first.T_world_obj, again.T_world_obj)) < 0.006
 
 
+@pytest.mark.parametrize(("rise", "taken"), [(0.0, 0.016), (0.014, 0.006)])
+def test_what_was_taken_to_stand_too_high_or_too_low_on_something_is_found_at_its_height(models, rise, taken):
+    model = models["block"]
+    T = model.localise(Look(views_at(moved(0.12, 0.12, 0.3), looking_down(*HOME)))).T_world_obj
+    scene = {"block": se3.from_yaw([0.12, 0.12, rise], 0.3)}
+    expected = {"block": se3.from_yaw([0.0, 0.0, taken], 0.0) @ T}
+    again = model.localise(Look(views_at(scene, looking_down(0.12, 0.08, 0.3)), expected=expected))
+    assert again.status == "found"
+    true = T[:3, 3] + [0.0, 0.0, rise]
+    assert again.T_world_obj[:3, 3] == pytest.approx(true, abs=0.006)
+
+
 def test_pictures_that_tell_a_place_vaguely_are_no_evidence(models):
     model, scene = models["block"], moved(0.12, 0.12, 0.3)
     views = views_at(scene, looking_down(0.12, 0.1, 0.35))

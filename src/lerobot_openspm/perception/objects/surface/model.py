@@ -54,6 +54,8 @@ ANOTHER_SHARE, TOLD_APART_SHARE = 0.85, 0.7
 FOLLOWED_M = 0.02
 # An object that is expected this much above the table is in the hand, metres.
 LIFTED_M = 0.02
+# One that is expected this much above the table stands on something, or does not, metres.
+RAISED_M = 0.005
 # Of the typical agreement around where an object is expected: below this it is gone; from KEPT_SHARE on it is
 # seen there; in between something may hide it.
 GONE_SHARE = 0.4
@@ -276,7 +278,10 @@ class SurfaceModel:
         return Freedom(not self.surface.is_round)
 
     def _refined(self, sights: Mapping[str, Sight], T_world_obj: Array) -> Place:
-        return settle(self.surface, sights, _pose(T_world_obj), self._freedom)
+        # A look from afar tells badly on what it stands, if on anything.
+        is_raised = T_world_obj[2, 3] - self.height > RAISED_M and not self._is_lifted(T_world_obj)
+        freedom = replace(self._freedom, lifts=is_raised)
+        return settle(self.surface, sights, _pose(T_world_obj), freedom)
 
     def _estimate(
         self, look: Look, sights: Mapping[str, Sight], places: list[Place], told_apart: bool = False
