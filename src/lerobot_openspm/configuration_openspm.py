@@ -165,7 +165,8 @@ class OpenSPMConfig(PreTrainedConfig):
             a frame takes longer than learning from a hundred samples.
         noise_seed: Seed of the flow model's noise, which is drawn per (seed, episode, chunk).
         execution: How key poses are followed: "open_loop" plans each chunk from where the hand should be,
-            "closed_loop" from where it is, "closed_loop_trc" adds terminal residual correction.
+            "closed_loop" from where it is. "closed_loop_trc" adds terminal residual correction, and goes
+            straight where nothing is pushed, pulled or turned.
         reach_margin_m: How far outside the demonstrated workspace a key pose may lie, in metres, where the
             arm's joints are not known. What lies further out is refused.
         min_clearance_m: How far below the lowest demonstrated hand position a key pose may lie, in metres.

@@ -227,7 +227,7 @@ def test_a_hand_that_swings_about_a_key_pose_is_not_blocked():
         for side in (1, -1, 1, -1):
             off = T @ se3.transform(np.eye(3), np.array([0.0, 0.008 + side * swing_m, 0.0]))
             for _ in range(CORRECTION_STEPS):
-                executor.strategy.correct(executor.targets[0], approach, Hand(off, OPEN_WIDTH))
+                executor.strategy.direct(executor.targets[0], approach, Hand(off, OPEN_WIDTH))
         assert approach.is_blocked == is_blocked
 
 

@@ -153,7 +153,7 @@ def test_a_stretched_arm_that_does_not_come_in_is_pushed_outwards_once(
     target = Target(there, key_pose("plate", np.eye(4), phase, closed=True), precise=True, axis=axis)
     approach, pushes, blocked = Approach(here), list[int](), list[bool]()
     for step in range(5 * CORRECTION_STEPS + OUTWARD_STEPS):
-        action = strategy.correct(target, approach, Hand(here, 0.03))
+        action = strategy.direct(target, approach, Hand(here, 0.03))
         assert action is not None
         if action[2] == 1.0:
             assert_allclose(action[:2], [1.0, -0.75])

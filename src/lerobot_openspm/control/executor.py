@@ -196,7 +196,7 @@ class Executor:
             action = self.strategy.grip(target, self._here(hand))
         elif self._queue:
             action = self.strategy.from_chunk(self._queue.popleft(), target, approach, hand)
-        elif (action := self.strategy.correct(target, approach, hand)) is None:
+        elif (action := self.strategy.direct(target, approach, hand)) is None:
             return None
         approach.steps += 1
         self._believed = se3.apply_increment(self._believed, action[:6] * self._robot.gains)

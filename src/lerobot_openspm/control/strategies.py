@@ -105,7 +105,7 @@ class ClosedLoop:
         """The action ``(7,)`` that is taken for one of the flow model's."""
         return action
 
-    def correct(self, target: Target, approach: Approach, hand: Hand) -> Array | None:
+    def direct(self, target: Target, approach: Approach, hand: Hand) -> Array | None:
         """An action ``(7,)`` instead of the next chunk's; None where a chunk is wanted."""
         return None
 
@@ -176,7 +176,7 @@ class ClosedLoopTRC(ClosedLoop):
             return self._kept_on_way(action, target, approach, hand)
         return action
 
-    def correct(self, target: Target, approach: Approach, hand: Hand) -> Array | None:
+    def direct(self, target: Target, approach: Approach, hand: Hand) -> Array | None:
         """The next step of a straight way; once its time is up, what makes good what is left of the way."""
         if not approach.is_time_up:
             return None if target.key_pose.phase in UNCUT_PHASES else self._straight(target, approach, hand)
