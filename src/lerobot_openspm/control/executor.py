@@ -107,7 +107,8 @@ class Executor:
             target = replace(target, T_world_ee=target.axis.follow(start))
         before = self.targets[index - 1].key_pose.phase if index and self.strategy.feels_fingers else ""
         is_lifting = before == "grasp" and target.key_pose.phase in ("lift", "pre-place")
-        self.approach = Approach(start, lifted=0 if is_lifting else self.approach.lifted_so_far)
+        last = self.approach
+        self.approach = Approach(start, before=last.before, lifted=0 if is_lifting else last.lifted_so_far)
         self._approach_target(target)
         self._queue.clear()
 
@@ -117,9 +118,8 @@ class Executor:
         self.targets = (*self.targets[:index], target, *self.targets[index + 1 :])
         approach.nominal_steps = target.key_pose.n_steps
         if not target.key_pose.dwell:
-            length = float(se3.distance(approach.start, target.T_world_ee))
-            steps = int(np.ceil(length / self._robot.metres_per_step))
-            approach.nominal_steps = max(approach.nominal_steps, steps)
+            steps = se3.distance(approach.start, target.T_world_ee) / self._robot.metres_per_step
+            approach.nominal_steps = max(approach.nominal_steps, int(np.ceil(steps)))
             approach.nominal_steps += (LIFT_STEPS - approach.lifted) // 2
 
     # Following it.
@@ -158,10 +158,7 @@ class Executor:
         has_next = self.state.index + 1 < len(self.targets)
         if is_passed_by and (is_used_up or approach.is_blocked):
             # A hand that is held up short of a key pose it only passes by goes on to the next one.
-            if has_next:
-                self._enter(self.state.index + 1, hand)
-            else:
-                self.stop(Status.DONE)
+            self._enter(self.state.index + 1, hand) if has_next else self.stop(Status.DONE)
             return False
         if self._is_held_up_from_below(hand):
             logger.info("letting go here: what is carried is held up from below")
@@ -199,6 +196,7 @@ class Executor:
         elif (action := self.strategy.direct(target, approach, hand)) is None:
             return None
         approach.steps += 1
+        approach.before = hand.T_world_ee
         self._believed = se3.apply_increment(self._believed, action[:6] * self._robot.gains)
         return action
 
@@ -284,7 +282,7 @@ class Executor:
 
     def feels_handle(self, index: int) -> bool:
         """Whether the fingers hold something before a key pose, so that a loss would show in the opening."""
-        held = self._robot.open_width * HOLDING_SHARE
+        held = HOLDING_SHARE * self._robot.open_width
         return index > 0 and self.targets[index - 1].key_pose.opening >= held
 
     # Trying again.

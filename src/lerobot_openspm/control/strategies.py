@@ -32,6 +32,8 @@ SHUT_LEFT_M = 0.05
 CORRECTION_SHARE, CORRECTION_STEPS = 0.2, 5
 # Near a key pose a straight way makes good this share of what is left in every step.
 ARRIVING_SHARE = 0.5
+# This share of a motion that was not meant is countered. From 1 on an arm without lag would swing.
+LEAD = 0.5
 # Phases whose way is one key pose long, whatever its shape.
 UNCUT_PHASES = ("push", "open", "turn")
 # An elbow that is turned over turns back within so many steps of a push outwards.
@@ -55,6 +57,7 @@ class Approach:
         is_blocked: Whether that correction brought the hand no closer, and it stands still.
         outward: Unit vector ``(3,)`` of the push outwards for an elbow that is turned over, while it lasts.
         outward_steps: Steps of it taken so far.
+        before: Where the hand was a step ago, ``T_world_ee`` ``(4, 4)``.
         travelled: How far a drawer or a knob has followed the hand, metres or radians.
         lifted: Steps that the hand was on its way with what it has just taken hold of as this way began.
     """
@@ -69,6 +72,7 @@ class Approach:
     is_blocked: bool = False
     outward: Array | None = None
     outward_steps: int = 0
+    before: Array | None = None
     travelled: float = 0.0
     lifted: int = LIFT_STEPS
 
@@ -115,9 +119,12 @@ class ClosedLoop:
         While the fingers open or close it keeps the hand in place. The flow model's condition does not tell
         how far a grasp has come, and a hand that drifts by a centimetre loses the object.
         """
+        return self._action(share * se3.increment(here, target.T_world_ee), target)
+
+    def _action(self, increment: Array, target: Target) -> Array:
+        """The action ``(7,)`` that moves the hand by an increment ``(6,)``, or that way as far as it goes."""
         gains = self._robot.gains
-        residual = se3.increment(here, target.T_world_ee)
-        motion: Array = np.where(gains > 0, share * residual / np.maximum(gains, 1e-9), 0.0)
+        motion: Array = np.where(gains > 0, increment / np.maximum(gains, 1e-9), 0.0)
         motion = motion / max(1.0, float(np.abs(motion).max()))
         return np.append(motion, self._robot.command(target.key_pose.closed))
 
@@ -197,13 +204,24 @@ class ClosedLoopTRC(ClosedLoop):
                 return self._push_outward(approach.outward, target, approach, hand)
         approach.late_steps += 1
         share = approach.speed * min(1.0, CORRECTION_SHARE * (approach.corrections + 1))
-        return self.toward(target, hand.T_world_ee, share)
+        return self._led(target, approach, hand, share)
 
     def _straight(self, target: Target, approach: Approach, hand: Hand) -> Array:
         """An action straight to the key pose at the demonstrated pace, slower where it is near."""
         left = max(float(se3.distance(hand.T_world_ee, target.T_world_ee)), 1e-9)
         share = approach.speed * min(ARRIVING_SHARE, self._robot.metres_per_step / left)
-        return self.toward(target, hand.T_world_ee, share)
+        return self._led(target, approach, hand, share)
+
+    def _led(self, target: Target, approach: Approach, hand: Hand, share: float) -> Array:
+        """An action straight to the key pose, ahead of an arm that lags.
+
+        An arm goes on for some steps as it was told before, and swings past corners. So what the hand did in
+        the last step, and was not meant to, is countered.
+        """
+        here = hand.T_world_ee
+        wanted = share * se3.increment(here, target.T_world_ee)
+        moved = wanted if approach.before is None else se3.increment(approach.before, here)
+        return self._action(wanted + LEAD * (wanted - moved), target)
 
     def _way_to_turn_back(self, target: Target, approach: Approach, hand: Hand) -> Array | None:
         """See :func:`way_to_turn_back`; None where the hand is near enough, or moves what it touches."""

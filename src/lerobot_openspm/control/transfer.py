@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from typing import Literal
 
 import numpy as np
@@ -19,6 +20,8 @@ from lerobot_openspm.types import Symmetry
 RETREAT_M = 0.06
 # A target that is only passed by is met within this distance and angle, metres and radians.
 PASSING_M, PASSING_RAD = 0.015, 0.15
+# It is passed within this share of the way on to the next one, where that is less; but not closer than this.
+PASSING_SHARE, LEAST_PASSING_M = 0.2, 0.005
 # A door or a drawer is pushed so much further than was shown, metres, until it stops the hand.
 SHUT_M = 0.02
 # Of the hand about its approach axis, the z axis of its frame.
@@ -156,7 +159,15 @@ def transfer(
         targets = _gone_on(targets, sub_task, amount)
     if targets and entry.key.sub_tasks[-1].operation == "put":
         targets += _release(targets)
-    return tuple(targets) + _retreat(targets, retreat_m)
+    return _passed_by(tuple(targets) + _retreat(targets, retreat_m))
+
+
+def _passed_by(targets: Sequence[Target]) -> tuple[Target, ...]:
+    """Key poses that are passed by the closer, the nearer the next one is: the hand must not cut corners."""
+    ways = [float(se3.distance(a.T_world_ee, b.T_world_ee)) for a, b in pairwise(targets)]
+    within = [float(np.clip(PASSING_SHARE * way, LEAST_PASSING_M, PASSING_M)) for way in ways]
+    passed = [replace(target, passing_m=m) for target, m in zip(targets, within, strict=False)]
+    return (*passed, *targets[len(passed) :])
 
 
 def _turned(targets: Sequence[Target], sub_task: int, turn: Turn, shown: Mapping[str, Array]) -> list[Target]:
