@@ -256,6 +256,9 @@ class Case:
     beside: Options | None = None
 
 
+# What is recorded here is a pick and place, on which "closed_loop_trc" goes straight.
+FLOW_EVERYWHERE = {"execution": "closed_loop"}
+
 CASES = {
     "cameras": Case(actions, str(CALIBRATION), "moved.json"),
     "state_layout": Case(numbers, NAMES, TURNED_NAMES),
@@ -281,11 +284,11 @@ CASES = {
     "judge.confidence": Case(judgement, 0.6, 0.8),
     "judge.timeout_s": Case(judgement, 60.0, 0.2),
     "chunk_size": Case(samples, 5, 7),
-    "n_action_steps": Case(actions, 5, 1),
+    "n_action_steps": Case(actions, 5, 1, FLOW_EVERYWHERE),
     "conditioning": Case(samples, "equivariant", "paper"),
-    "num_inference_steps": Case(actions, 8, 2),
+    "num_inference_steps": Case(actions, 8, 2, FLOW_EVERYWHERE),
     "samples_per_frame": Case(loss, 1, 2),
-    "noise_seed": Case(actions, 0, 1),
+    "noise_seed": Case(actions, 0, 1, FLOW_EVERYWHERE),
     "execution": Case(actions, "closed_loop_trc", "open_loop"),
     "reach_margin_m": Case(status_far_away, 0.1, 3.0),
     "min_clearance_m": Case(status_far_away, 0.01, 3.0),
