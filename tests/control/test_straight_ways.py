@@ -1,4 +1,4 @@
-"""The hand goes straight where mining has cut the demonstrated path at its corners, and lifts slowly."""
+"""In free space the hand goes straight from key pose to key pose, and lifts slowly."""
 
 import numpy as np
 import pytest

@@ -34,8 +34,8 @@ CORRECTION_SHARE, CORRECTION_STEPS = 0.2, 5
 ARRIVING_SHARE = 0.5
 # This share of a motion that was not meant is countered. From 1 on an arm without lag would swing.
 LEAD = 0.5
-# Phases whose way is one key pose long, whatever its shape.
-UNCUT_PHASES = ("push", "open", "turn")
+# Phases in which the hand moves what it does not carry.
+MOVING_PHASES = ("push", "open", "turn")
 # An elbow that is turned over turns back within so many steps of a push outwards.
 OUTWARD_STEPS = 14
 # A lift comes up to speed within so many steps: a jerk pulls what is held by its rim out of the fingers.
@@ -165,8 +165,8 @@ class OpenLoop(ClosedLoop):
 class ClosedLoopTRC(ClosedLoop):
     """Closed loop with the paper's terminal residual correction, and fingers that notice a lost grip.
 
-    The hand goes straight from key pose to key pose wherever mining has cut the demonstrated path at its
-    corners. The flow model is asked for the ways that were not cut: of a push, a drawer or a knob.
+    In free space the hand goes straight from key pose to key pose, since mining has cut the demonstrated
+    path there at its corners. The flow model is asked for the ways of a push, a drawer and a knob.
 
     The correction is the residual itself, so that the error contracts whatever the model has learned.
     """
@@ -186,7 +186,7 @@ class ClosedLoopTRC(ClosedLoop):
     def direct(self, target: Target, approach: Approach, hand: Hand) -> Array | None:
         """The next step of a straight way; once its time is up, what makes good what is left of the way."""
         if not approach.is_time_up:
-            return None if target.key_pose.phase in UNCUT_PHASES else self._straight(target, approach, hand)
+            return None if target.key_pose.phase in MOVING_PHASES else self._straight(target, approach, hand)
         if approach.outward is not None:
             return self._push_outward(approach.outward, target, approach, hand)
         if approach.late_steps % CORRECTION_STEPS == 0:
@@ -246,8 +246,7 @@ class ClosedLoopTRC(ClosedLoop):
     def _kept_on_way(self, action: Array, target: Target, approach: Approach, hand: Hand) -> Array:
         """An action whose motion across the straight way to the key pose leads back to that way.
 
-        Nothing holds what is pushed. A hand that strays by millimetres slips over or past it. What is put
-        down stays where it touches first, so it must not come down beside its place.
+        Nothing holds what is pushed. A hand that strays by millimetres slips over or past it.
         """
         here, end = hand.T_world_ee[:3, 3], target.T_world_ee[:3, 3]
         way = end - approach.start[:3, 3]
