@@ -157,7 +157,8 @@ class OpenSPMConfig(PreTrainedConfig):
             in the same form. A checkpoint keeps its contents here.
         judge: What says, beside motion and gripper, which phase ends at a key pose.
         chunk_size: Actions per chunk, the paper's H.
-        n_action_steps: Actions executed before the next chunk, 1 to ``chunk_size``.
+        n_action_steps: Actions executed before the next chunk, 1 to ``chunk_size``. Chunks are asked for on
+            every way, or by the default ``execution`` where something is pushed, pulled or turned.
         conditioning: "equivariant" gives the flow model the relative pose in the frame of the target key
             pose; "paper" gives it the poses in the world.
         num_inference_steps: Euler steps from noise to a chunk. More are slower and follow the flow closer.

@@ -118,6 +118,7 @@ class OpenSPMPolicy(PreTrainedPolicy):
         actions = np.empty((len(observations), n_actions, 7))
         for row, (episode, observation) in enumerate(zip(self.episodes, observations, strict=True)):
             controller, hand = episode.controller, observation.hand
+            robot = self.memories[episode.workplace].robot
             look = controller.advance(hand)
             while look is not None:  # twice where a part of the instruction ends and the next one begins
                 detections = episode.perception.detect(
@@ -126,12 +127,12 @@ class OpenSPMPolicy(PreTrainedPolicy):
                 )  # fmt: skip
                 look = controller.take_in(look, detections, hand)
             for i in range(n_actions):
-                action = controller.executor.next_action(hand)
-                if action is None:
+                while (action := controller.executor.next_action(hand)) is None:
                     chunk = self._chunk(controller, hand)
                     controller.executor.push_chunk(chunk[: n_kept or self.config.n_action_steps])
-                    action = controller.executor.next_action(hand)
                 actions[row, i] = action
+                # The next one begins where the hand should be by then.
+                hand = replace(hand, T_world_ee=robot.moved(hand.T_world_ee, action))
         return actions
 
     def _begin_episodes(self, observations: Sequence[Observation]) -> None:
@@ -149,7 +150,7 @@ class OpenSPMPolicy(PreTrainedPolicy):
 
     def workplace(self, observation: Observation) -> tuple[int, Memory, Sequence[MemoryEntry]]:
         """At which workplace an episode begins, from 0; its memory, and its entries with their index."""
-        memories = self.require_memory(), *self.elsewhere
+        memories = self.memories
         # Episodes share the index, which is made anew when the memory was replaced.
         for i, memory in enumerate(memories):
             if i not in self._entries or self._entries[i][0] is not memory.entries:
@@ -218,7 +219,7 @@ class OpenSPMPolicy(PreTrainedPolicy):
             if success is not None and not episode.is_reported:
                 episode.is_reported = True
                 counted[episode.workplace] += episode.controller.state.entry_successes(success)
-        memories = [self.require_memory(), *self.elsewhere]
+        memories = list(self.memories)
         for i, fared in counted.items():
             memories[i] = memories[i].with_successes(fared)
         self.memory, *elsewhere = memories
@@ -310,6 +311,11 @@ class OpenSPMPolicy(PreTrainedPolicy):
         if dataset_meta is not None:
             policy._learn(dataset_meta)  # the loaded action scale stays: the weights were trained with it
         return policy
+
+    @property
+    def memories(self) -> tuple[Memory, ...]:
+        """What was mined at each workplace."""
+        return (self.require_memory(), *self.elsewhere)
 
     def require_memory(self) -> Memory:
         """What was mined. Raises MemoryFormatError when nothing was."""

@@ -133,7 +133,7 @@ def test_a_drawer_that_does_not_open_is_named_with_the_hand_at_rest():
         watch(one, perception, Hand(T, max(target.key_pose.opening, 0.03)), 1)
         if one.state.status is Status.NO_PROGRESS:
             break
-    assert one.state.refusal.startswith("the cabinet does not open: it stays ")
+    assert one.state.refusal.startswith("the top drawer of the cabinet does not open: it stays ")
     assert one.executor.next_action(HAND)[:6].tolist() == [0.0] * 6
 
 

@@ -124,10 +124,10 @@ def test_a_part_without_experience_is_named():
     assert "open the top drawer of the cabinet; put the bowl in the top drawer of the cabinet" in message
 
 
-@pytest.mark.parametrize("instruction", ["put the mug on the plate", "dance"])
+@pytest.mark.parametrize("instruction", ["put the mug on the plate", "dance", "turn off the stove"])
 def test_a_single_instruction_without_experience_is_refused_as_ever(instruction):
     with pytest.raises(InstructionError, match=instruction):
-        planned(instruction, [PLATE])
+        planned(instruction, [PLATE, STOVE])
     with pytest.raises(InstructionError):
         planned("put the bowl on the plate and turn on the stove", [])
 

@@ -8,7 +8,9 @@ from lerobot.envs.utils import preprocess_observation
 from tests.policy.conftest import Frame, act, batch_of
 
 from lerobot_openspm.errors import ObservationError
+from lerobot_openspm.geometry import se3
 from lerobot_openspm.modeling_openspm import OpenSPMPolicy
+from lerobot_openspm.perception.observation import split_batch
 
 
 def test_what_is_loaded_acts_as_what_was_saved(
@@ -78,6 +80,20 @@ def test_every_execution_acts(
     chunk = policy.predict_action_chunk(batch_of([recorded[0][0], recorded[3][0]]))
     assert chunk.shape == (2, policy.config.chunk_size, 7)
     assert torch.isfinite(chunk).all()
+
+
+def test_a_chunk_goes_on_from_where_its_actions_take_the_hand(
+    policy: OpenSPMPolicy, recorded: list[list[Frame]]
+):
+    (observation,) = split_batch(batch_of([recorded[0][0]]), policy.config.layouts()[0])
+    actions = policy.act([observation], 5)[0]
+    robot, (episode,) = policy.require_memory().robot, policy.episodes
+    here, end = observation.hand.T_world_ee, episode.controller.executor.present.T_world_ee
+    for action in actions:
+        there = robot.moved(here, action)
+        assert float(se3.distance(here, there)) <= 1.01 * robot.metres_per_step
+        assert float(se3.distance(there, end)) < float(se3.distance(here, end))
+        here = there
 
 
 def test_a_chunk_is_predicted_without_changing_anything(policy: OpenSPMPolicy, recorded: list[list[Frame]]):

@@ -139,11 +139,15 @@ class Executor:
                 approach.travelled = max(approach.travelled, axis.travel(approach.start, hand.T_world_ee))
             if not self._is_met(hand):
                 return self._is_given_up(hand)
-            if self.state.index + 1 == len(self.targets):
-                self.stop(Status.DONE)
-            else:
-                self._enter(self.state.index + 1, hand)
+            self._go_on(hand)
         return False
+
+    def _go_on(self, hand: Hand) -> None:
+        """Turn to the next key pose; after the last one all is done."""
+        if self.state.index + 1 == len(self.targets):
+            self.stop(Status.DONE)
+        else:
+            self._enter(self.state.index + 1, hand)
 
     def _is_met(self, hand: Hand) -> bool:
         if self.present.key_pose.dwell:
@@ -155,21 +159,20 @@ class Executor:
         approach = self.approach
         is_used_up = approach.corrections > MAX_CORRECTIONS
         is_passed_by = not (self.present.precise or self.present.until_stopped)
-        has_next = self.state.index + 1 < len(self.targets)
         if is_passed_by and (is_used_up or approach.is_blocked):
             # A hand that is held up short of a key pose it only passes by goes on to the next one.
-            self._enter(self.state.index + 1, hand) if has_next else self.stop(Status.DONE)
+            self._go_on(hand)
             return False
         if self._is_held_up_from_below(hand):
             logger.info("letting go here: what is carried is held up from below")
-            self._enter(self.state.index + 1, hand)
+            self._go_on(hand)
             self._approach_target(replace(self.present, T_world_ee=hand.T_world_ee))
             return False
         is_kept_off = approach.is_blocked and approach.corrections > BLOCKED_CORRECTIONS
         if not (is_used_up or (is_kept_off and self.was_kept_from_grasping(hand))):
             return False
-        metres, radians = se3.distances(hand.T_world_ee, self.present.T_world_ee)
-        return self.try_again(f"it stays {1000 * metres:.1f} mm and {radians:.3f} rad away")
+        m, rad = se3.distances(hand.T_world_ee, self.present.T_world_ee)
+        return self.try_again(f"it stays {1000 * m:.1f} mm and {rad:.3f} rad away")
 
     def _is_held_up_from_below(self, hand: Hand) -> bool:
         """Whether what the hand carries to its place does not get lower, a little above that place."""
@@ -187,6 +190,7 @@ class Executor:
     def next_action(self, hand: Hand) -> Array | None:
         """The next canonical action ``(7,)``, or None when a chunk is needed (:meth:`query`)."""
         if self.state.status is not Status.RUNNING:
+            self.approach.before = None
             return self.hold()
         target, approach = self.present, self.approach
         if target.key_pose.dwell:
@@ -197,7 +201,7 @@ class Executor:
             return None
         approach.steps += 1
         approach.before = hand.T_world_ee
-        self._believed = se3.apply_increment(self._believed, action[:6] * self._robot.gains)
+        self._believed = self._robot.moved(self._believed, action)
         return action
 
     def hold(self) -> Array:
@@ -252,9 +256,8 @@ class Executor:
         before, now = self.targets[self.state.index - 1].key_pose, self.present.key_pose
         passed = [one.key_pose for one in self.targets[: self.state.index]]
         grasped = next((p for p in reversed(passed) if p.phase in ("grasp", "release", "push")), None)
-        if not (before.closed and now.closed) or now.phase == "push":
-            return None
-        if grasped is None or grasped.phase != "grasp":  # an empty hand, closed to push
+        is_closed = before.closed and now.closed and now.phase != "push"
+        if not is_closed or grasped is None or grasped.phase != "grasp":  # an empty hand, closed to push
             return None
         return None if grasped.opening < HOLDING_SHARE * self._robot.open_width else grasped.opening
 
@@ -272,12 +275,9 @@ class Executor:
     def followed_sub_tasks(self) -> set[int]:
         """The sub-tasks whose drawer or knob went all the way, once the plan is done.
 
-        The hand met the end of the way, and fingers that lose a handle are noticed. So where the fingers can
-        feel the handle, it came along.
+        The hand met the end of the way, and fingers that can feel the handle would have noticed its loss.
         """
-        if not self.strategy.feels_fingers:
-            return set()
-        ends = [i for i, target in enumerate(self.targets) if target.axis is not None]
+        ends = [i for i, one in enumerate(self.targets) if one.axis and self.strategy.feels_fingers]
         return {self.targets[i].key_pose.sub_task for i in ends if self.feels_handle(i)}
 
     def feels_handle(self, index: int) -> bool:
@@ -293,7 +293,8 @@ class Executor:
         phase = "close" if self.present.until_stopped else key_pose.phase
         if self.state.attempts == MAX_ATTEMPTS:
             self.stop(Status.NO_PROGRESS)
-            self.state.refusal = why if is_at_end else why_given_up(phase, key_pose.anchor.place, why)
+            entry = self.state.plan.entry
+            self.state.refusal = why if is_at_end else why_given_up(phase, key_pose, entry, why)
             logger.info("giving up at key pose %d: %s", self.state.index, self.state.refusal)
             return False
         self.state.attempts += 1

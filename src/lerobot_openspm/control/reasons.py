@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 
+from lerobot_openspm.memory.entry import MemoryEntry, MemoryKeyPose
 from lerobot_openspm.memory.robot import RobotModel
 from lerobot_openspm.perception.tracking.tracker import TrackerSettings
 from lerobot_openspm.types import Hand, PoseEstimate
@@ -58,14 +59,19 @@ def why_missing(
     return "; ".join(reasons)
 
 
-def why_given_up(phase: str, place: str, why: str) -> str:
+def why_given_up(phase: str, key_pose: MemoryKeyPose, entry: MemoryEntry, why: str) -> str:
     """What did not succeed although it was tried again.
 
     Args:
         phase: In which phase; "close" where a push shuts something.
-        place: The object that the key pose is relative to.
+        key_pose: The key pose that was not met.
+        entry: The entry that it is of.
         why: What was wrong at last.
     """
+    place = key_pose.anchor.place
+    for sub_task in entry.key.sub_tasks[key_pose.sub_task : key_pose.sub_task + 1]:
+        if sub_task.part and sub_task.target == place:
+            place = f"{sub_task.part} of the {place}"
     return f"{FAILS[phase].format(place)}: {why}" if phase in FAILS else why
 
 

@@ -11,6 +11,7 @@ from lerobot_openspm.control.joint_room import way_to_turn_back
 from lerobot_openspm.control.transfer import Target
 from lerobot_openspm.geometry import se3
 from lerobot_openspm.geometry.se3 import Array
+from lerobot_openspm.memory.entry import CONSTRAINED_PHASES
 from lerobot_openspm.memory.robot import RobotModel
 from lerobot_openspm.types import Execution, Hand
 
@@ -27,15 +28,13 @@ SWINGS_M = 0.003
 BLOCKED_SHARE = 3.0
 # What stops a closing hand this near to where it goes is shut; what stops it earlier is in the way, metres.
 SHUT_LEFT_M = 0.05
-# Each step of a correction makes good this share of the residual, and five steps are one correction. Every
-# further correction adds the same share again, because friction stops a hand that asks for millimetres.
+# Each step of a correction makes good twice this share of the residual, and five steps are one correction.
+# Every further one adds the share once more, because friction stops a hand that asks for millimetres.
 CORRECTION_SHARE, CORRECTION_STEPS = 0.2, 5
 # Near a key pose a straight way makes good this share of what is left in every step.
 ARRIVING_SHARE = 0.5
 # This share of a motion that was not meant is countered. From 1 on an arm without lag would swing.
 LEAD = 0.5
-# Phases in which the hand moves what it does not carry.
-MOVING_PHASES = ("push", "open", "turn")
 # An elbow that is turned over turns back within so many steps of a push outwards.
 OUTWARD_STEPS = 14
 # A lift comes up to speed within so many steps: a jerk pulls what is held by its rim out of the fingers.
@@ -57,7 +56,7 @@ class Approach:
         is_blocked: Whether that correction brought the hand no closer, and it stands still.
         outward: Unit vector ``(3,)`` of the push outwards for an elbow that is turned over, while it lasts.
         outward_steps: Steps of it taken so far.
-        before: Where the hand was a step ago, ``T_world_ee`` ``(4, 4)``.
+        before: Where the hand was a step ago, ``T_world_ee`` ``(4, 4)``; None after it held still.
         travelled: How far a drawer or a knob has followed the hand, metres or radians.
         lifted: Steps that the hand was on its way with what it has just taken hold of as this way began.
     """
@@ -186,7 +185,8 @@ class ClosedLoopTRC(ClosedLoop):
     def direct(self, target: Target, approach: Approach, hand: Hand) -> Array | None:
         """The next step of a straight way; once its time is up, what makes good what is left of the way."""
         if not approach.is_time_up:
-            return None if target.key_pose.phase in MOVING_PHASES else self._straight(target, approach, hand)
+            is_free = target.key_pose.phase not in CONSTRAINED_PHASES
+            return self._straight(target, approach, hand) if is_free else None
         if approach.outward is not None:
             return self._push_outward(approach.outward, target, approach, hand)
         if approach.late_steps % CORRECTION_STEPS == 0:
@@ -225,7 +225,7 @@ class ClosedLoopTRC(ClosedLoop):
 
     def _way_to_turn_back(self, target: Target, approach: Approach, hand: Hand) -> Array | None:
         """See :func:`way_to_turn_back`; None where the hand is near enough, or moves what it touches."""
-        is_moving = target.axis is not None or target.key_pose.phase == "push"
+        is_moving = target.key_pose.phase in CONSTRAINED_PHASES
         if self._robot.arm is None or is_moving or self.is_met(target, approach, hand):
             return None
         return way_to_turn_back(hand.T_world_ee, target.T_world_ee, self._robot.arm)

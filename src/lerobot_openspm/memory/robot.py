@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lerobot_openspm.errors import MemoryFormatError
+from lerobot_openspm.geometry import se3
 from lerobot_openspm.geometry.arm import Arm
 from lerobot_openspm.geometry.se3 import Array
 
@@ -63,6 +64,10 @@ class RobotModel:
     def gains(self) -> Array:
         """How far the hand moves per unit of each of the six numbers ``(6,)`` of an action."""
         return np.array([self.metres_per_action] * 3 + [self.radians_per_action] * 3)
+
+    def moved(self, T_world_ee: Array, action: Array) -> Array:
+        """Where an action ``(7,)`` takes a hand pose ``(4, 4)``."""
+        return se3.apply_increment(T_world_ee, action[:6] * self.gains)
 
     def command(self, closed: bool) -> float:
         """The gripper command that closes or opens."""
