@@ -18,7 +18,7 @@ from lerobot_openspm.errors import MemoryFormatError
 from lerobot_openspm.geometry import se3
 from lerobot_openspm.geometry.camera import project
 from lerobot_openspm.perception.objects import store
-from lerobot_openspm.perception.objects.base import Look, localise_all
+from lerobot_openspm.perception.objects.base import EarlierLook, Look, localise_all
 from lerobot_openspm.perception.objects.kinds import learn_objects
 from lerobot_openspm.perception.objects.patches.model import PatchModel
 from lerobot_openspm.perception.objects.surface import model as model_module
@@ -237,10 +237,13 @@ def test_what_was_taken_to_stand_too_high_or_too_low_on_something_is_found_at_it
     T = model.localise(Look(views_at(moved(0.12, 0.12, 0.3), looking_down(*HOME)))).T_world_obj
     scene = {"block": se3.from_yaw([0.12, 0.12, rise], 0.3)}
     expected = {"block": se3.from_yaw([0.0, 0.0, taken], 0.0) @ T}
-    again = model.localise(Look(views_at(scene, looking_down(0.12, 0.08, 0.3)), expected=expected))
-    assert again.status == "found"
+    first = Look(views_at(scene, looking_down(0.12, 0.16, 0.34)))
     true = T[:3, 3] + [0.0, 0.0, rise]
-    assert again.T_world_obj[:3, 3] == pytest.approx(true, abs=0.006)
+    for before in ((), (EarlierLook(first, expected),)):
+        views = views_at(scene, looking_down(0.12, 0.08, 0.3))
+        again = model.localise(Look(views, expected=expected, before=before))
+        assert again.status == "found"
+        assert again.T_world_obj[:3, 3] == pytest.approx(true, abs=0.006)
 
 
 def test_pictures_that_tell_a_place_vaguely_are_no_evidence(models):

@@ -54,7 +54,8 @@ ANOTHER_SHARE, TOLD_APART_SHARE = 0.85, 0.7
 FOLLOWED_M = 0.02
 # An object that is expected this much above the table is in the hand, metres.
 LIFTED_M = 0.02
-# One that is expected this much above the table stands on something, or does not, metres.
+# Expected this much above the table, but less than LIFTED_M, it may stand on something low: its height is
+# sought too. Metres.
 RAISED_M = 0.005
 # Of the typical agreement around where an object is expected: below this it is gone; from KEPT_SHARE on it is
 # seen there; in between something may hide it.
@@ -187,6 +188,9 @@ class SurfaceModel:
     def _is_lifted(self, T_expected: Array) -> bool:
         return bool(T_expected[2, 3] - self.height > LIFTED_M)
 
+    def _may_be_raised(self, T_expected: Array) -> bool:
+        return bool(RAISED_M < T_expected[2, 3] - self.height <= LIFTED_M)
+
     def _is_away(self, T_expected: Array) -> bool:
         """Whether its patches cannot show it where it is expected."""
         if self.near is None or self._is_lifted(T_expected):
@@ -200,10 +204,11 @@ class SurfaceModel:
         best place by that alone does: a look from nearby shows only a part, and tells the place badly.
         """
         sights = self._sights(look)
-        seen = self._refined(sights, T_expected)
+        freedom = replace(self._freedom, lifts=self._may_be_raised(T_expected))
+        seen = settle(self.surface, sights, _pose(T_expected), freedom)
         if before := sights_before(look, self.name, T_expected, self._sights):
             together = sights | before
-            still = refine(self.surface, together, _pose(T_expected), self._freedom, FINE_POINTS, FINE_STEPS)
+            still = refine(self.surface, together, _pose(T_expected), freedom, FINE_POINTS, FINE_STEPS)
             score = score_at(self.surface, sights, still.pose)
             if score >= STILL_SHARE * seen.score:
                 seen = replace(still, score=score)
@@ -276,12 +281,6 @@ class SurfaceModel:
     @property
     def _freedom(self) -> Freedom:
         return Freedom(not self.surface.is_round)
-
-    def _refined(self, sights: Mapping[str, Sight], T_world_obj: Array) -> Place:
-        # A look from afar tells badly on what it stands, if on anything.
-        is_raised = T_world_obj[2, 3] - self.height > RAISED_M and not self._is_lifted(T_world_obj)
-        freedom = replace(self._freedom, lifts=is_raised)
-        return settle(self.surface, sights, _pose(T_world_obj), freedom)
 
     def _estimate(
         self, look: Look, sights: Mapping[str, Sight], places: list[Place], told_apart: bool = False
