@@ -12,6 +12,7 @@ LIBERO stays as it is. Where its files are looked for is said by the error if th
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 from benchmarks.libero.accuracy import accuracy, found_errors
@@ -45,6 +46,13 @@ class ProConfig:
             raise ValueError(f"states must be 1 to {STATES}, got {self.states}")
         if self.tuning and self.suite != EXCHANGED:
             raise ValueError(f"tuning is for {EXCHANGED}, got {self.suite}")
+        self.evaluation(Path(), Path())
+
+    def evaluation(self, checkpoint: Path, output: Path) -> EvaluationConfig:
+        """What it asks of the evaluation. Raises ValueError where there is no such task."""
+        return EvaluationConfig(
+            str(checkpoint), str(output), self.task, self.suite, self.states, tuning=self.tuning
+        )
 
 
 def main(config: ProConfig) -> dict[str, Any]:
@@ -52,16 +60,7 @@ def main(config: ProConfig) -> dict[str, Any]:
     checkpoint, _ = policy(LIBERO)
     kind = "tuning" if config.tuning else "evaluation"
     folder = checkpoint.parents[2].with_name(f"{config.suite}_{kind}")
-    episodes = evaluate(
-        EvaluationConfig(
-            str(checkpoint),
-            str(folder),
-            config.task,
-            suite=config.suite,
-            episodes=config.states,
-            tuning=config.tuning,
-        )
-    )
+    episodes = evaluate(config.evaluation(checkpoint, folder))
     errors = found_errors(checkpoint, dataset(LIBERO), episodes)
     figures = summary(episodes, accuracy(episodes, errors)["found_off_mm"])
     if config.states == STATES and config.task == "all" and not config.tuning:

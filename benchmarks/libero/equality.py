@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 from benchmarks.episodes import load, run_episode
-from benchmarks.libero.evaluate import SEED
+from benchmarks.libero.evaluate import SEED, STATES
 from benchmarks.libero.run import learned
 from benchmarks.results import run, write
 from benchmarks.stages import LIBERO
@@ -37,6 +37,8 @@ class EqualityConfig:
     def __post_init__(self) -> None:
         if self.suite not in OBJECTS:
             raise ValueError(f"suite is {self.suite!r}, expected one of {', '.join(OBJECTS)}")
+        if not 1 <= self.states <= STATES:
+            raise ValueError(f"states must be 1 to {STATES}, got {self.states}")
 
 
 def main(config: EqualityConfig) -> dict[str, Any]:

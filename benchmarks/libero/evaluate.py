@@ -78,6 +78,17 @@ class EvaluationConfig:
         drawn = (*OBJECTS, EXCHANGED)
         if self.tuning and self.suite not in drawn:
             raise ValueError(f"tuning scenes are drawn for {', '.join(drawn)}, not for {self.suite}")
+        if self.episodes < 1 or (self.episodes > STATES and not self.tuning):
+            raise ValueError(f"episodes must be 1 to {STATES}, with tuning more, got {self.episodes}")
+        self.selected()
+
+    def selected(self) -> list[str]:
+        """The tasks."""
+        known = tasks(SUITE if self.suite in PRO_SUITES else self.suite)
+        wanted = list(known) if self.task == "all" else self.task.split(",")
+        if unknown := [task for task in wanted if task not in known]:
+            raise ValueError(f"{self.suite} has no tasks {unknown}, expected some of {', '.join(known)}")
+        return wanted
 
 
 def main(config: EvaluationConfig) -> dict[str, Any]:
@@ -90,15 +101,11 @@ def evaluate(config: EvaluationConfig) -> list[Row]:
 
     Episodes of another policy, other settings or other code are removed, not mixed in.
     """
-    known = tasks(SUITE if config.suite in PRO_SUITES else config.suite)
-    wanted = list(known) if config.task == "all" else config.task.split(",")
-    if unknown := [task for task in wanted if task not in known]:
-        raise ValueError(f"{config.suite} has no tasks {unknown}, expected some of {', '.join(known)}")
     settings = [f"{key}={getattr(config, key)}" for key in ("suite", "tuning", "tuning_seed", "execution")]
     code = [Path(str(module.__file__)) for module in (contacts, failures, pro_objects, variants)]
     files = [*checkpoint_files(Path(config.checkpoint)), *code]
     folder = measured_folder(Path(config.output), files, settings, __file__)
-    jobs = {f"{task} {i}": (config, task, i) for task in wanted for i in range(config.episodes)}
+    jobs = {f"{task} {i}": (config, task, i) for task in config.selected() for i in range(config.episodes)}
     return resume(folder / "episodes.jsonl", jobs, evaluate_one, config.workers)
 
 

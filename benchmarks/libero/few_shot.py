@@ -30,6 +30,10 @@ class FewShotConfig:
     def __post_init__(self) -> None:
         if self.suite not in OBJECTS:
             raise ValueError(f"suite is {self.suite!r}, expected one of {', '.join(OBJECTS)}")
+        if not (1 <= self.demos <= DEMOS and 1 <= self.states <= STATES):
+            raise ValueError(
+                f"demos must be 1 to {DEMOS} and states 1 to {STATES}, got {self.demos}, {self.states}"
+            )
 
 
 def main(config: FewShotConfig) -> dict[str, Any]:

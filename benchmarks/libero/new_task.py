@@ -14,6 +14,7 @@ from benchmarks.stages import DEMOS, LIBERO, dataset, first_episodes, policy, ru
 from benchmarks.teach import teach
 
 from lerobot_openspm.cli.pipeline import THREADS
+from lerobot_openspm.envs.libero.simulator import SUITE, tasks
 from lerobot_openspm.errors import OpenSPMError
 
 
@@ -24,6 +25,14 @@ class NewTaskConfig:
     task: str = "put_the_bowl_on_the_plate"
     demos: int = 3
     states: int = STATES
+
+    def __post_init__(self) -> None:
+        if self.task not in tasks(SUITE):
+            raise ValueError(f"task is {self.task!r}, expected one of {', '.join(tasks(SUITE))}")
+        if not (1 <= self.demos <= DEMOS and 1 <= self.states <= STATES):
+            raise ValueError(
+                f"demos must be 1 to {DEMOS} and states 1 to {STATES}, got {self.demos}, {self.states}"
+            )
 
 
 def main(config: NewTaskConfig) -> dict[str, Any]:

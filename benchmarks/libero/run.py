@@ -176,9 +176,10 @@ def main(config: RunConfig) -> dict[str, Any]:
         return {**told[config.suite], **spent, "checkpoint": str(checkpoint)}
     if config.demos == DEMOS and all(some == list(tasks(suite)) for suite, some in config.selected().items()):
         about = {"seed": SEED, "demonstrations": DEMOS, "n": sum(one["n"] for one in told.values())}
-        kept = ("success", "n", "interval", "mean_steps")
+        kept = ("success", "n", "interval", "mean_steps", "failures")
         rates = {suite: {key: one[key] for key in kept} for suite, one in told.items()}
-        write("libero_all", {**about, **spent, "per_suite": rates}, THREADS)
+        failed = [episode for one in told.values() for episode in one["failed"]]
+        write("libero_all", {**about, **spent, "per_suite": rates, "failed": failed}, THREADS)
     return {**told, **spent, "checkpoint": str(checkpoint)}
 
 
@@ -207,7 +208,8 @@ def _evaluated(config: RunConfig, suite: str, checkpoint: Path, parts: Sequence[
         # Which way round the other suites' things look alike is not known, so their yaw is not judged.
         if suite == SUITE:
             write("libero_accuracy", {**about, "n": figures["n"], **found}, THREADS)
-    told = {key: figures[key] for key in ("success", "n", "interval", "mean_steps")}
+    kept = ("success", "n", "interval", "mean_steps", "failures", "failed")
+    told = {key: figures[key] for key in kept}
     per_task = {task: row["success"] for task, row in figures["per_task"].items()}
     places = {key: found[key] for key in ("position_mm_mean", "position_mm_p95")}
     return {**told, "per_task": per_task, **places}

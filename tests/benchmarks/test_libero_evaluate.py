@@ -284,6 +284,8 @@ def test_of_all_suites_one_policy_is_published_with_the_rate_of_each(tmp_path, m
         "libero": 30,
         "libero_10": 30,
     }
+    per_suite, failed = written["libero_all"]["per_suite"], written["libero_all"]["failed"]
+    assert len(failed) == sum(sum(one["failures"].values()) for one in per_suite.values()) > 0
     run.main(run.RunConfig("all", states=10, tasks="0"))
     assert len(written) == 1
 

@@ -6,9 +6,13 @@ from types import SimpleNamespace
 from typing import Any
 
 import pytest
-from benchmarks.libero import few_shot, run
+from benchmarks.libero import evaluate, few_shot, new_task, run
+from benchmarks.libero.equality import EqualityConfig
+from benchmarks.libero.evaluate import EvaluationConfig
 from benchmarks.libero.few_shot import FewShotConfig
+from benchmarks.libero.new_task import NewTaskConfig
 from benchmarks.libero.run import ALL, Part, RunConfig, learning, scene, size
+from benchmarks.libero_pro import ProConfig
 from tests.memory.memories import a_memory
 
 from benchmarks import stages
@@ -47,6 +51,32 @@ def test_the_tasks_of_a_scene_are_learned_together():
 def test_what_is_asked_for_wrongly_is_refused(options, words):
     with pytest.raises(ValueError, match=words):
         RunConfig(**options)
+
+
+@pytest.mark.parametrize(
+    ("config", "options", "words"),
+    [
+        (FewShotConfig, {"demos": 0}, "demos must be 1 to 10 and states 1 to 50, got 0, 50"),
+        (FewShotConfig, {"demos": 11}, "got 11, 50"),
+        (FewShotConfig, {"states": 51}, "got 3, 51"),
+        (EqualityConfig, {"states": 0}, "states must be 1 to 50, got 0"),
+        (NewTaskConfig, {"task": "dance"}, "task is 'dance', expected one of libero_goal_0, libero_goal_1"),
+        (NewTaskConfig, {"task": "libero_goal_0", "demos": 0}, "got 0, 50"),
+        (
+            EvaluationConfig,
+            {"task": "dance"},
+            r"libero_goal has no tasks \['dance'\], expected some of",
+        ),
+        (EvaluationConfig, {"episodes": 51}, "episodes must be 1 to 50, with tuning more, got 51"),
+        (ProConfig, {"task": "dance"}, r"libero_goal_swap has no tasks \['dance'\]"),
+    ],
+)
+def test_what_cannot_be_evaluated_is_refused_before_anything_is_learned(config, options, words, monkeypatch):
+    for module in (new_task, evaluate):
+        monkeypatch.setattr(module, "tasks", lambda suite: {f"{suite}_{i}": "" for i in range(10)})
+    paths = {"checkpoint": "c", "output": "o"} if config is EvaluationConfig else {}
+    with pytest.raises(ValueError, match=words):
+        config(**paths, **options)
 
 
 def test_a_checkpoint_holds_what_all_its_workplaces_do(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):

@@ -32,6 +32,7 @@ FILMED = (
     "libero_spatial",
     "libero_object",
     "libero_10",
+    "libero_all",
     "libero_goal_swap",
     "libero_goal_lan",
     "libero_goal_task",
@@ -195,11 +196,12 @@ def test_one_policy_for_all_is_told_suite_by_suite_beside_the_policy_of_each_and
         failures=FAILURES,
     )
     assert "One policy for all four" not in tables.results_page()
-    per_suite = {"libero_object": RATE, "libero_10": RATE}
+    per_suite = {suite: {**RATE, "failures": FAILURES} for suite in ("libero_object", "libero_10")}
     put(results, "libero_all", **LEARNED, n=8, demonstrations=10, per_suite=per_suite)
     text = tables.results_page().partition("## One policy for all four")[2]
     assert "| libero object | 50.0 % | 15.0 to 85.0 % | 4 | 100.0 | 60.0 % | -10.0 |" in text
     assert "| libero 10 | 50.0 % | 15.0 to 85.0 % | 4 | 100.0 | - | - |" in text
+    assert "| libero 10 | 0 | 1 | 0 | 1 | 0 |" in text
     took = "took 200 s (3 min), the largest process 870 MB of memory. The checkpoint holds 80 entries and 12"
     assert f"{took} objects, and has 3.5 MB." in text
     marks = {("libero_all", "peak_mb"), ("libero_all", "checkpoint_mb"), ("libero_object", "success")}
