@@ -37,6 +37,7 @@ def main() -> None:
     with noted(learning):
         policy = mined_policy()
     batch = first_observation(policy)
+    policy.config.execution = "closed_loop"  # asks the flow model at once, the default not before a push
     policy.reset()
     with noted(acting):
         policy.select_action(batch)
